@@ -1,13 +1,14 @@
-# make demo | make test | make lint | make benchmark: each sets itself up in .venv first. PYTHON=python3.12 picks another.
+# make demo | make test | make lint | make benchmark. Each installs its packages in .venv first. PYTHON=python3.12 selects
+# another Python.
 PYTHON ?= python3
 VENV ?= .venv
-# Which tests test-fast runs, as pytest's -m; TESTS= runs all of them, as CI does.
+# Tests that test-fast runs, as for pytest's -m. TESTS= selects all tests, as in CI.
 TESTS ?= not slow
-# Files and folders whose tests test-fast runs; default: all.
+# Files and folders of the tests that test-fast runs. Default: all.
 PATHS ?=
-# CI leaves out the PSM's collection, which is the MTM's again with another arm.
+# CI omits the collection of the PSM, since it only repeats that of the MTM with another arm.
 RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/udp/test_collect_psm_udp.py
-# What `make mutants` changes: a module or a folder of the package.
+# Module or folder of the package that `make mutants` changes.
 MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
 
@@ -18,7 +19,7 @@ demo: $(VENV)/.installed
 
 test: test-fast test-udp
 
-# No test may depend on what else the computer does: the same beside two processes that never wait.
+# Runs the tests while two busy processes run. No test may depend on the load of the computer.
 test-busy:
 	@set -e; busy() { while :; do :; done; }; \
 	  busy & first=$$!; busy & trap "kill $$first $$! 2>/dev/null || :" EXIT INT TERM; $(MAKE) test
@@ -26,15 +27,15 @@ test-busy:
 test-fast: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --ignore-glob='*_udp.py' -m '$(TESTS)' $(PATHS)
 
-# One after the other: each runs several processes at 1 kHz, and wants the cores for itself.
+# Tests run one after the other, since each runs several processes at 1 kHz and needs all cores.
 test-udp: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/udp/test_lcm_udp.py
 
-# Recordings over UDP, and collections of both arms from the first pose to the release: minutes.
+# Recordings over UDP and complete collections of both arms. They take minutes.
 test-recordings: $(VENV)/.installed-test
 	$(BIN)/python -m pytest $(RECORDINGS)
 
-# Mutation testing: which changes of the code no test detects. Not part of CI, since it takes many minutes.
+# Mutation testing: lists changes of the code that no test detects. Not part of CI, since it takes many minutes.
 mutants: $(VENV)/.installed-test
 	nice -n 10 $(BIN)/python tools/mutants.py $(MUTATE)
 
@@ -51,14 +52,14 @@ benchmark: $(VENV)/.installed-benchmark
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "needs Python 3.11 or newer; name one: make PYTHON=python3.12"; exit 2; }
+	  { echo "Python 3.11 or newer is required. Select one, e.g.: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
 	touch $@
 
-# Each extra has a stamp of its own, so that a user of the demo need not wait for the linters.
+# Each extra has its own stamp file, so that the demo does not install the linters.
 $(VENV)/.installed-%: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
 	touch $@

@@ -1,26 +1,33 @@
-"""Rate of a simulated arm, and its control, while another process floods its command channel.
+"""Measures the step rate and the control of a simulated arm while another process floods its command channel.
 
     python benchmarks/command_flood.py [--seconds 5] [--kinds garbage,session,...] [--no-key]
 
-`dvrk-drake arm` runs at 1 kHz, a small controller answers each status with efforts, and a third process publishes
-foreign messages on the command channel as fast as it can. The rate is that of the arm's own clock to the wall clock,
-without and with the flood in turn. Kinds of flood:
+`dvrk-drake arm` runs at 1 kHz. A small controller answers each status with efforts. A third process publishes foreign
+messages on the command channel as fast as possible. Each kind of message is measured without and with the flood:
 
     garbage     300 random bytes
-    session     a good command of another session
-    sender      a good command of another sender
-    copy        a good command that copies the sender's id, with a sequence far beyond
+    session     a valid command of another session
+    sender      a valid command of another sender
+    copy        a valid command that copies the sender's id, with a much higher sequence number
 
-"acting" is the share of the statuses in which the controller's efforts act, "expired" how often they expired; the guard
-resumes automatically here. Arm,
-controller and what measures have real-time scheduling where it is permitted, and the flood has the rest.
+Columns of the table:
 
-It needs a multicast route:
+    flood       foreign messages per second
+    rate        steps of the arm per second of wall-clock time
+    ratio       rate divided by the rate without the flood
+    acting      share of the statuses in which the controller's efforts act
+    expired     number of expirations of the efforts; the guard resumes automatically in this benchmark
+    accepted    accepted commands per second
+    ignored     ignored and refused commands per second
+
+The arm, the controller and the measuring process use real-time scheduling if the system permits it. The flood does not.
+
+The benchmark requires a multicast route:
 
     unshare -rn sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
                        exec python benchmarks/command_flood.py'
 
-As root, `unshare -n`: the root of `unshare -r` has no right to real-time scheduling.
+As root, use `unshare -n`. A root user made by `unshare -r` is not permitted to use real-time scheduling.
 """
 
 from __future__ import annotations
@@ -51,7 +58,7 @@ SENDER, OTHER = 5, 6
 
 
 def answer_to(status: lcmt_dvrk_status, effort: list[float]) -> lcmt_dvrk_command:
-    """A good command for `effort` (n,) [N m] that answers `status`."""
+    """Returns a valid command with `effort` (n,) [N m, N] that answers `status`."""
     command = lcmt_dvrk_command()
     command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, status.sequence, SENDER
     command.status_utime, command.session_id = status.utime, status.session_id
@@ -62,13 +69,13 @@ def answer_to(status: lcmt_dvrk_status, effort: list[float]) -> lcmt_dvrk_comman
 
 
 def control(file: Path | None) -> None:
-    """Holds the pose of the first received status until the process ends; signs with the key in `file`."""
+    """Regulates the pose of the first received status until the process ends. Signs with the key in `file`, if any."""
     key = MessageKey.load(file) if file else None
     make_realtime()
     network, held = lcm.LCM(), []
     kp, kd = np.array(ARM.gains.kp), np.array(ARM.gains.kd)
 
-    def hear(channel, data):
+    def answer(channel, data):
         status = lcmt_dvrk_status.decode(data)
         q, v = np.array(status.position), np.array(status.velocity)
         if not held:
@@ -76,13 +83,13 @@ def control(file: Path | None) -> None:
         data = answer_to(status, (held[1] + kp * (held[0] - q) - kd * v).tolist()).encode()
         network.publish(command_channel(ARM), key.sign(data) if key else data)
 
-    network.subscribe(status_channel(ARM), hear)
+    network.subscribe(status_channel(ARM), answer)
     while True:
         network.handle()
 
 
 def flood(kind: str, data: bytes, count: multiprocessing.Value) -> None:
-    """Publishes one message as fast as it can, until it is ended; counts."""
+    """Publishes one message as fast as possible until the process ends; writes the number of messages to `count`."""
     network = lcm.LCM()
     status = lcmt_dvrk_status.decode(data)
     command = answer_to(status, [0.0] * status.num_joints)
@@ -101,20 +108,20 @@ def flood(kind: str, data: bytes, count: multiprocessing.Value) -> None:
 
 
 class Observer:
-    """Reads the arm's statuses."""
+    """Receives the statuses of the arm and stores their guard states."""
 
     def __init__(self) -> None:
         self.network, self.data = lcm.LCM(), lcmt_dvrk_status().encode()
-        self.network.subscribe(status_channel(ARM), self.hear).set_queue_capacity(0)
+        self.network.subscribe(status_channel(ARM), self.receive).set_queue_capacity(0)
         self.states: list[int] = []
 
-    def hear(self, channel: str, data: bytes) -> None:
-        """Keeps a status."""
+    def receive(self, channel: str, data: bytes) -> None:
+        """Stores a status."""
         self.data = data
         self.states.append(lcmt_dvrk_status.decode(data).guard_state)
 
     def listen(self, seconds: float) -> tuple[lcmt_dvrk_status, float]:
-        """The last status that comes within that time, and when it came [s]."""
+        """Returns the last status after receiving for this time, and the current time [s]."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             handle_message(self.network, left)
@@ -123,7 +130,7 @@ class Observer:
 
 @contextlib.contextmanager
 def running(target, *arguments) -> Iterator[multiprocessing.Process]:
-    """A process of `target` that ends with the block."""
+    """Runs `target` in a process that ends with the block."""
     process = multiprocessing.Process(target=target, args=arguments, daemon=True)
     process.start()
     try:
@@ -133,8 +140,8 @@ def running(target, *arguments) -> Iterator[multiprocessing.Process]:
         process.join()
 
 
-def measured(observer: Observer, seconds: float) -> dict[str, float]:
-    """Rate of the arm [Hz] and what its guard counted in that time."""
+def measure(observer: Observer, seconds: float) -> dict[str, float]:
+    """Returns the measured columns of the table, see the module."""
     observer.listen(0.5)
     observer.states.clear()
     before, begin = observer.listen(0.02)
@@ -150,11 +157,13 @@ def measured(observer: Observer, seconds: float) -> dict[str, float]:
 
 
 def main() -> None:
-    """Prints a row for each kind of flood, without and with it."""
-    parser = argparse.ArgumentParser(description="Rate of a simulated arm while its command channel is flooded.")
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--kinds", default=",".join(KINDS))
-    parser.add_argument("--no-key", action="store_true", help="messages are not authenticated")
+    """Prints two rows per kind of flood: without and with the flood."""
+    parser = argparse.ArgumentParser(
+        description="Measures the rate of a simulated arm while its command channel is flooded."
+    )
+    parser.add_argument("--seconds", type=float, default=5.0, help="duration of each measurement [s]; default: 5")
+    parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of flood, separated by commas; default: all")
+    parser.add_argument("--no-key", action="store_true", help="do not authenticate messages")
     options = parser.parse_args()
     multiprocessing.set_start_method("spawn")
     with tempfile.TemporaryDirectory() as folder:
@@ -184,7 +193,7 @@ def main() -> None:
 
 
 def run(file: Path | None, options: argparse.Namespace) -> None:
-    """Measures and prints, with the key in `file`."""
+    """Measures all kinds of flood and prints the table. `file` contains the key, or is None for no key."""
     make_realtime()
     observer = Observer()
     while not observer.listen(0.1)[0].session_id:
@@ -196,15 +205,15 @@ def run(file: Path | None, options: argparse.Namespace) -> None:
         while observer.listen(0.2)[0].guard_state != lcmt_dvrk_status.STATE_EFFORT and time.monotonic() < deadline:
             pass
         for kind in options.kinds.split(","):
-            alone = measured(observer, options.seconds)
+            alone = measure(observer, options.seconds)
             count = multiprocessing.Value("q", 0)
             with running(flood, kind, observer.data, count):
                 while not count.value:
                     time.sleep(0.05)
                 first, begin = count.value, time.monotonic()
-                beside = measured(observer, options.seconds)
+                flooded = measure(observer, options.seconds)
                 rate = (count.value - first) / (time.monotonic() - begin)
-            for name, hertz, row in (("-", 0.0, alone), (kind, rate, beside)):
+            for name, hertz, row in (("-", 0.0, alone), (kind, rate, flooded)):
                 print(
                     f"{name:10}{hertz:14.0f}{row['rate']:14.1f}{row['rate'] / alone['rate']:14.3f}{row['acting']:14.3f}"
                     f"{row['expired']:14.0f}{row['accepted']:14.0f}{row['ignored']:14.0f}",

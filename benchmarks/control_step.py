@@ -1,25 +1,23 @@
-"""Time of one simulated millisecond under control: our GravityPidController against Drake's own C++ blocks.
+"""Compares the computing time of GravityPidController with that of Drake's C++ controllers.
 
     python benchmarks/control_step.py [--json FILE] [--repetitions N] [--seconds S]
 
-All rows simulate the same ArmStation (10 joints, 3 of them coupled; 1 ms SAP steps), publish nothing and run
-as fast as they can. Each repetition starts from the same pose and steps all joints by 0.1 rad: a moving arm
-is the same work for the solver in all controlled rows. Repetitions are interleaved, so that a busy machine
-slows all rows alike. Times are CPU time of this process, medians over the repetitions.
+All rows simulate the same ArmStation (10 joints, 3 of them coupled) with SAP and a time step of 1 ms. Each repetition
+starts from the same pose and steps all joints by 0.1 rad. The repetitions of the rows alternate, so that other
+processes slow all rows equally. Times are CPU times of this process per simulated millisecond, medians over the
+repetitions.
 
 Rows:
-    python      GravityPidController: Python LeafSystem, one compiled update per millisecond.
-    cpp         Drake's InverseDynamics (gravity compensation) on a controller plant, PidController, Adder.
-                InverseDynamics ignores couplers, so it runs on the whole tree and a MatrixGain projects with
-                G': the only way in which stock blocks give this arm's true gravity. The goal is set against
-                this row.
-    cpp_serial  The same on a plant of the seven independent joints alone, without projection. Its gravity is
-                wrong here (the counterweight is on the linkage), but it is what stock blocks cost without a
-                linkage: a lower bound.
-    none        No control: the constant effort that balances the start pose. The solver has less to do.
+    python      GravityPidController: Python LeafSystem with one compiled update per millisecond.
+    cpp         Drake's InverseDynamics (gravity compensation) on a controller plant, PidController, and Adder.
+                InverseDynamics ignores couplers. Therefore it uses the whole tree, and a MatrixGain multiplies its
+                output by G' (transposed linkage matrix). This row is the reference.
+    cpp_serial  The same on a plant of the seven independent joints, without the MatrixGain. Its gravity is wrong,
+                since the counterweight is on the linkage. The row is a lower bound of the time without a linkage.
+    none        No control, but the constant effort that balances the start pose.
 
-PidController's integral is a continuous state: the cpp rows run with the cheapest integrator for it, explicit
-Euler at 1 ms. Both blocks feed through, so the cpp rows act without the period of delay of the python row.
+The column `control` is the time of a row minus the time of row `none`. The integral of PidController is a continuous
+state. The cpp rows integrate it with explicit Euler at 1 ms. They have no delay, unlike the python row.
 """
 
 from __future__ import annotations
@@ -75,7 +73,7 @@ def tree_state_order(station: ArmStation, plant: MultibodyPlant) -> bool:
 
 
 def build(row: str, arm: Arm) -> tuple[Diagram, ArmStation, System, list[object]]:
-    """The diagram, its station, what puts out the command, and objects that must outlive it."""
+    """Returns the diagram, its station, the system that outputs the effort, and objects to keep alive."""
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(arm))
     state = station.GetOutputPort("mtml.state_estimated")
@@ -139,17 +137,17 @@ def effort(source: System, context: Context) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", metavar="FILE", help="write the numbers there too")
-    parser.add_argument("--repetitions", type=int, default=15)
+    parser.add_argument("--json", metavar="FILE", help="write the results to this file")
+    parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
     parser.add_argument("--seconds", type=float, default=0.5, help="simulated time of one repetition")
     arguments = parser.parse_args()
     arm = load_arm("mtml")
     rows = {row: start(row, arm) for row in ("python", "cpp", "cpp_serial", "none")}
 
-    # Only fair if both compute the same: compare the first commands, as they reach the motors.
+    # The comparison requires equal efforts. Compare the first efforts after the limits.
     ours, theirs = (effort(rows[row][2], rows[row][0].get_context()) for row in ("python", "cpp"))
     difference = np.abs(ours - np.clip(theirs, -arm.effort_limits, arm.effort_limits)).max()
-    assert difference < 1e-9, f"efforts differ by {difference} N m"
+    assert difference < 1e-9, f"The efforts of python and cpp differ by {difference:.2g} N m."
 
     times = measured_times(
         {row: partial(simulator.AdvanceTo, arguments.seconds) for row, (simulator, *_) in rows.items()},
@@ -159,13 +157,13 @@ def main() -> None:
     for row in ("python", "cpp"):
         simulator, station = rows[row][:2]
         q = station.GetPositions(station.GetMyContextFromRoot(simulator.get_context()))
-        assert np.abs(q - GOAL).max() < 0.02, f"{row} is not where it should be: {q}"
+        assert np.abs(q - GOAL).max() < 0.02, f"Row {row} did not reach the goal; final positions: {q}"
 
     median = {row: 1e3 * float(np.median(values)) / arguments.seconds for row, values in times.items()}
     ratio = {row: median_ratio(times, "python", row) for row in rows}
     print_table(
-        f"drake {version('drake')}; CPU time per simulated ms, median of {arguments.repetitions}",
-        ["us", "control [us]", "python / this"],
+        f"MTML, drake {version('drake')}: CPU time per simulated ms, median of {arguments.repetitions} repetitions",
+        ["total [us]", "control [us]", "time of python / time of this row"],
         {row: (f"{us:.1f}", f"{us - median['none']:.1f}", f"{ratio[row]:.3f}") for row, us in median.items()},
     )
     result = {"drake": version("drake"), "us_per_simulated_ms": median, "ratio_python_to": ratio}

@@ -1,10 +1,19 @@
-"""Outcomes of `identify` on damaged recordings: `python benchmarks/damaged_recordings.py FOLDER [NAME ...]`.
+"""Evaluates how `check` and `identify` handle damaged recordings.
 
-Every damage is made on its own in mtm_one.csv (MTMR) and psm_one.csv (PSM) of FOLDER, see docs/public_recordings.md, or
-in the NAMEd motions. Without a refusal or a warning, the model is identified from it and compared with the undamaged
-motion. The outcome is "harmless" unless the error of an actuator rises by more than half and by five percent of its
-effort. It is "undetectable" if it does, and a note of the check names this joint among those whose offset or scale does
-not show. The undamaged recordings of the folder must be accepted without a warning about their channels.
+    python benchmarks/damaged_recordings.py FOLDER [NAME ...]
+
+FOLDER contains the public recordings (docs/public_recordings.md). NAME is a motion, by default mtm_one (MTMR) and
+psm_one (PSM). Each damage is applied separately to each motion. Outcomes:
+
+    refused         the check or the identification refuses the recording
+    warned          there is a new warning, or the cross-validated error of an actuator exceeds half of its effort
+    harmless        the error on the undamaged motion does not rise, for any actuator, both by more than half and by
+                    more than 5 % of the actuator's effort
+    undetectable    the error rises, and a note of the check names this joint as one whose offset or scale cannot be
+                    checked
+    undetected      the error rises without such a note
+
+The script also prints the findings about the channels of the undamaged recordings. There should be none.
 """
 
 from __future__ import annotations
@@ -36,12 +45,12 @@ from dvrk_drake.recordings.recording import Recording, read_recording
 DEFAULT = ("mtm_one", "psm_one")
 PSM_MOTIONS = ("psm_one", "psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion")
 MOTIONS = {"mtm_one": "mtmr", **dict.fromkeys(PSM_MOTIONS, "psm")}
-COLUMNS = ("refused", "warned", "harmless", "undetectable", "silent and bad")
+COLUMNS = ("refused", "warned", "harmless", "undetectable", "undetected")
 CHANNEL_KINDS = ("exchanged channels", "effort sign", "effort scale", "position offset")
 
 
 def damages(recording: Recording, arm: Arm) -> Iterator[tuple[str, str, Recording]]:
-    """(kind, channels, damaged recording)."""
+    """Yields the kind of each damage, its channels, and the damaged recording."""
     n, tau, qd = arm.num_joints, recording.measured_effort(), np.asarray(recording.qd)
     for i, j in combinations(range(n), 2):
         order = np.arange(n)
@@ -65,7 +74,7 @@ def damages(recording: Recording, arm: Arm) -> Iterator[tuple[str, str, Recordin
 
 @cache
 def undamaged(folder: Path, name: str) -> tuple[Recording, Arm, set[tuple[str, str]], list[tuple[str, str, Recording]]]:
-    """The recording, its arm, what the check finds in it (kind, where), and all damages."""
+    """Returns the recording, its arm, the findings of its check as (kind, where), and all damages."""
     arm = load_arm(MOTIONS[name])
     recording = read_recording(folder / f"{name}.csv", arm, "actuator")
     usual = {(finding.kind, finding.where) for finding in check_with_channels(recording, arm).findings}
@@ -74,18 +83,18 @@ def undamaged(folder: Path, name: str) -> tuple[Recording, Arm, set[tuple[str, s
 
 @cache
 def errors_of_undamaged(folder: Path, name: str) -> np.ndarray:
-    """(n,) relative errors of the model of the undamaged recording, on itself."""
+    """Returns the relative errors (n,) of a model identified from the undamaged recording, on the same recording."""
     recording, arm, *_ = undamaged(folder, name)
     return relative_errors(identify_dynamic(recording, arm).model, recording)
 
 
 def relative_errors(model: IdentifiedModel, recording: Recording) -> np.ndarray:
-    """(n,) of the actuators' efforts."""
+    """Returns the relative errors (n,) of the actuators' efforts."""
     return np.array([a.relative_error for a in validate_motion(model, recording).actuators])
 
 
 def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
-    """(kind, channels, outcome, detail) of one damage."""
+    """Returns kind, channels, outcome and detail of one damage."""
     recording, arm, usual, all_damages = undamaged(folder, name)
     kind, channels, damaged = all_damages[number]
     findings = check_with_channels(damaged, arm).findings
@@ -108,20 +117,22 @@ def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
         return kind, channels, "harmless", detail
     note = "undetectable offset" if kind.startswith("position") else "uncertain effort scale"
     listed = any(f.kind == note and int(channels.split()[0]) - 1 in f.joints for f in findings)
-    return kind, channels, "undetectable" if listed else "silent and bad", detail
+    return kind, channels, "undetectable" if listed else "undetected", detail
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("name", nargs="*", default=DEFAULT, help=f"of {', '.join(MOTIONS)}")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
+    parser.add_argument("name", nargs="*", default=DEFAULT, help=f"motions; allowed: {', '.join(MOTIONS)}")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count(), help="number of worker processes; default: %(default)s"
+    )
     options = parser.parse_args()
     for name, arm_name in MOTIONS.items():
         arm = load_arm(arm_name)
         report = check_with_channels(read_recording(options.folder / f"{name}.csv", arm, "actuator"), arm)
         bad = [str(f) for f in report.findings if f.kind in CHANNEL_KINDS]
-        print(f"{name} as recorded: {'; '.join(bad) or 'no finding about its channels'}", flush=True)
+        print(f"{name}, undamaged: {'; '.join(bad) or 'no findings about the channels'}", flush=True)
     for name in options.name:
         count = len(undamaged(options.folder, name)[-1])
         outcomes: dict[str, Counter] = {}

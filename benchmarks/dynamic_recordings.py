@@ -1,17 +1,22 @@
-"""Our identification of the full dynamics beside the published one, on the public recordings of a real MTM and PSM.
+"""Compares the identified dynamics with published models on the public recordings of a real MTM and PSM.
 
     python benchmarks/dynamic_recordings.py FOLDER
 
-FOLDER holds mtm_one.csv, psm_one.csv and, if it is to be judged, psm_one_no_weight.csv: the public recordings in their
-own coordinates, those of the actuators, with a header and times (docs/public_recordings.md says how to obtain them).
+FOLDER contains mtm_one.csv and psm_one.csv in actuator coordinates, with a header and times
+(docs/public_recordings.md). Optional files are mtm_two.csv and psm_two.csv (other motions), and psm_one_no_weight.csv
+(another day).
 
-Errors are |tau - tau_hat| / |tau| of the actuators, both behind a zero-phase Butterworth low-pass of order 6 (5.65 Hz
-for the MTM, 16.96 Hz for the PSM), without the ends. "Published" are those of Wang et al., "A Convex Optimization-based
-Dynamic Model Identification Package for the da Vinci Research Kit", RA-L 2019: fitted to the same motion, and on a
-second one. Ours are of the fit, of phases that are predicted from the other phases, and of other recordings, those that
-FOLDER holds of mtm_two.csv and psm_two.csv (other motions) and psm_one_no_weight.csv (another day), before and after
-friction is refitted to the other half of its phases. The repeatability of the motion itself is what no function of q, v
-and vd can be below on all of its periods.
+Errors are |tau - tau_hat| / |tau| of each actuator, without the ends of the motion. Both efforts are low-pass filtered
+with a zero-phase Butterworth filter of order 6 (5.65 Hz for the MTM, 16.96 Hz for the PSM). Rows:
+
+    published                    models of Wang et al., "A Convex Optimization-based Dynamic Model Identification
+                                 Package for the da Vinci Research Kit", RA-L 2019, on the motion of the fit and on
+                                 another one
+    ours, fit                    model identified by `dvrk-drake identify`, on the motion of the fit
+    ours, cross-validated        prediction of phases of the motion that were not used for the fit
+    repeatability of the motion  smallest possible error of any function of q, v and vd over all periods
+    ours on FILE                 model identified from the first motion, on another recording
+    FILE, refitted friction      the same after refitting friction to the other half of the phases
 """
 
 from __future__ import annotations
@@ -29,14 +34,14 @@ from rich.table import Table
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration import predict_other_phases
+from dvrk_drake.analysis.recalibration import cross_validated_errors
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.recordings.recording import Recording, read_recording
 
-#: Percent: fitted to the motion, and on another motion.
+#: Published errors [%] per joint: on the motion of the fit, and on another motion.
 PUBLISHED = {
     "mtmr": ([7.95, 15.63, 11.79, 18.56, 24.22, 18.25, 28.00], [8.18, 16.31, 19.06, 20.90, 26.30, 23.48, 33.96]),
     "psm": ([6.59, 15.56, 17.73, 13.61, 21.07, 20.96, 25.56], [10.28, 18.28, 19.76, 13.44, 23.99, 21.11, 26.62]),
@@ -44,10 +49,12 @@ PUBLISHED = {
 
 
 def main() -> None:
-    """One table an arm."""
+    """Prints one table per arm."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--poses", type=int, default=2000, help="random poses at which M(q) is looked at")
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
+    parser.add_argument(
+        "--poses", type=int, default=2000, help="number of random poses at which the eigenvalues of M(q) are computed"
+    )
     options = parser.parse_args()
     for name, file, others in (
         ("mtmr", "mtm_one.csv", ["mtm_two.csv"]),
@@ -68,7 +75,7 @@ def main() -> None:
             "published, fit": PUBLISHED[name][0],
             "published, another motion": PUBLISHED[name][1],
             "ours, fit": percent("rms_fit"),
-            "ours, phases from other phases": percent("rms_cross_validation"),
+            "ours, cross-validated": percent("rms_cross_validation"),
             "repeatability of the motion": percent("rms_repeatability"),
         }
         for other in others:
@@ -76,19 +83,19 @@ def main() -> None:
                 recording = read_public(options.folder / other, arm)
                 errors = validate_motion(model, recording).actuators
                 rows[f"ours on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
-                rows[f"{other}, friction from other phases"] = 100 * predict_other_phases(model, recording, 2)[1]
-        print_table(f"{arm.name}: error of the actuators' effort [%]", arm, rows)
+                rows[f"{other}, refitted friction"] = 100 * cross_validated_errors(model, recording, 2)[1]
+        print_table(f"{arm.name}: relative RMS effort error of the actuators [%]", arm, rows)
         box = (arm.position_lower, arm.position_upper)
         q = np.random.default_rng(0).uniform(*box, (options.poses, arm.num_joints))
         least = float(np.linalg.eigvalsh(DynamicModel(arm, dynamics).mass_matrix(q)).min())
-        print(f"least eigenvalue of a pseudo-inertia {min(e.least_eigenvalue for e in dynamics.links):.1e}")
-        print(f"least eigenvalue of M(q) at {len(q)} poses of the joint box {least:.1e}")
+        print(f"smallest eigenvalue of all pseudo-inertias: {min(e.least_eigenvalue for e in dynamics.links):.1e}")
+        print(f"smallest eigenvalue of M(q) at {len(q)} random poses: {least:.1e}")
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"identified in {seconds:.1f} s; peak memory of this process so far {peak:.0f} MB\n")
+        print(f"identification time: {seconds:.1f} s; peak memory of this process: {peak:.0f} MB\n")
 
 
 def read_public(path: Path, arm: Arm) -> Recording:
-    """Reads a recording in actuator coordinates; ends the program if it cannot be one."""
+    """Reads a recording in actuator coordinates; exits with a message if the check refuses it."""
     try:
         recording = read_recording(path, arm, "actuator")
     except RecordingError as error:
@@ -96,14 +103,14 @@ def read_public(path: Path, arm: Arm) -> Recording:
     refusals = [f for f in check_recording(recording, arm).findings if f.severity == "refusal"]
     if refusals:
         sys.exit(
-            f"{path}: {refusals[0].where}: {refusals[0].what}. This benchmark reads actuator coordinates: convert the "
-            "public file without --arm"
+            f"{path}: {refusals[0].where}: {refusals[0].what}. This benchmark requires actuator coordinates. Convert "
+            "the public file without --arm."
         )
     return recording
 
 
 def print_table(title: str, arm: Arm, rows: dict) -> None:
-    """One row a model, one column a joint, and the mean."""
+    """Prints one row per model, with one column per joint and the mean."""
     table = Table(title=title)
     for heading in ("", *(f"J{j + 1}" for j in range(arm.num_joints)), "mean"):
         table.add_column(heading, justify="left" if not heading else "right")

@@ -1,11 +1,11 @@
-"""Our dynamic regressor beside Pinocchio's computeJointTorqueRegressor, same arm, same links, same run.
-
-Pinocchio's model has linkage and instrument as a tree; its torques must equal ours (projected through the linkage)
-before anything is timed. It is called sample by sample in a Python loop, for it has no batch, and each sample
-overwrites the last. Ours keeps the regressor of all samples. It is timed writing to the same memory each time, as
-Pinocchio does ("ours"), and to new memory. Run:
+"""Compares the computing time of our dynamic regressor with that of Pinocchio's computeJointTorqueRegressor.
 
     make benchmark        or        pip install '.[benchmark]' && python benchmarks/dynamic_regressor.py [--json FILE]
+
+Pinocchio's model contains the linkage and the instrument as a tree. Before the timing, the script checks that both
+libraries compute equal torques; Pinocchio's are multiplied by the linkage matrix. Pinocchio has no batch function, so
+a Python loop calls it for each sample, and each sample overwrites the previous regressor. Our function returns the
+regressors of all samples. It is timed with preallocated memory ("ours") and with new memory in each call.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dvrk_drake.models.plant import make_arm_plant
 
 
 def tree_motion(arm: Arm, model: pinocchio.Model, motion: list[NDArray]) -> tuple[list[NDArray], NDArray]:
-    """q, v, vd (m, t) in the order of Pinocchio's joints, and G (t, n) in that order."""
+    """Returns q, v, vd (m, t) and the linkage matrix G (t, n) in the order of Pinocchio's joints."""
     order = [arm.tree_joint_names.index(name) for name in model.names[1:]]
     q, v, vd = motion
     linkage = arm.linkage
@@ -63,7 +63,7 @@ def benchmark(name: str, samples: int, repetitions: int) -> dict[str, float]:
     }
     driven = {plant.GetJointByName(joint).child_body().name() for joint in arm.joint_names}
     bases = {plant.GetJointByName(joint).parent_body().name() for joint in arm.joint_names}
-    if bases <= driven | {"base_link"}:  # the independent joints are a chain, as on an MTM: fewer links, less to do
+    if bases <= driven | {"base_link"}:  # the independent joints are a serial chain, as in an MTM
         chain = build_pinocchio(arm, plant, arm.joint_names)
         functions["Pinocchio, chain without linkage"] = regressor_loop(chain, motion)
     times = measured_times(functions, repetitions)
@@ -73,9 +73,9 @@ def benchmark(name: str, samples: int, repetitions: int) -> dict[str, float]:
         result[f"{what}_ratio"] = median_ratio(times, what, "Pinocchio, all links")
         rows[what] = (f"{result[f'{what}_us']:.3f}", f"{result[f'{what}_ratio']:.3f}")
     print_table(
-        f"{arm.name}: {len(ours.links)} links, {len(ours.names)} columns, {samples} samples; first call "
-        f"{result['first_call_s']:.2f} s (compiled code is kept on disk)",
-        ["us per sample", "to Pinocchio, all links"],
+        f"{arm.name}: CPU time of the dynamic regressor ({len(ours.links)} links, {len(ours.names)} columns, {samples} "
+        f"samples); time of the first call {result['first_call_s']:.2f} s",
+        ["us per sample", "ratio to Pinocchio, all links"],
         rows,
     )
     return result
@@ -83,9 +83,9 @@ def benchmark(name: str, samples: int, repetitions: int) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE")
-    parser.add_argument("--samples", type=int, default=6000)
-    parser.add_argument("--repetitions", type=int, default=15)
+    parser.add_argument("--json", metavar="FILE", help="write the results to this file")
+    parser.add_argument("--samples", type=int, default=6000, help="number of samples; default: %(default)s")
+    parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
     write_json(options.json, {name: benchmark(name, options.samples, options.repetitions) for name in ("mtml", "psm")})
 

@@ -1,9 +1,9 @@
-"""Half an hour of normal use on simulated arms with all effects of their files: the guard must not interfere.
+"""Counts false alarms of the guard during normal use of simulated arms with all effects of their files.
 
     python benchmarks/false_alarms.py [--minutes 30] [--processes 2]
 
-Each line is one use, and what the guard reported if it took over or found a fault. Collections run the Collector of
-`dvrk-drake collect`; in teleoperation a hand moves an MTML that leads a PSM.
+Each line is one use, with the reason if the guard held the arm or reported a fault. Collections use the Collector of
+`dvrk-drake collect`. In teleoperation a simulated hand moves an MTML, and a PSM follows.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from dvrk_drake.processes.collector import CollectionSettings, Collector
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.teleoperation import Teleoperation
 
-#: Use -> arm, control, speed [rad/s; a tenth in m/s], reach, whether a hand moves it, and weight in the whole time.
+#: By use: arm, control, maximum speed [rad/s; 0.1 m/s], amplitude as a share of half of each range, whether a hand
+#: moves the arm, and weight in the total time.
 USES = {
     "hold, no commands": ("mtml", "hold", 0.5, 0.35, False, 1),
     "gravity compensation, hand at 0.5 rad/s": ("mtml", "gravity", 0.5, 0.35, True, 4),
@@ -44,17 +45,17 @@ USES = {
     "teleoperation, hand at 0.3 rad/s": ("mtml", "teleoperation", 0.3, 0.2, True, 4),
 }
 
-#: Part of the effort limits that poses of a collection may need. At some, a wrist pitch needs more than its limit.
-STRENGTH = 0.7
+#: Maximum holding effort in poses of a collection, as a share of the effort limit.
+MAX_HOLDING_SHARE = 0.7
 
 
-def interference(guard):
-    """Returns the reason of a fault or a watchdog hold, or ""."""
+def alarm(guard):
+    """Returns the reason of a fault or of a watchdog hold; "" for neither."""
     return guard.fault_text or guard.hold_reason
 
 
 def run(use, seconds):
-    """Simulates one use; returns the simulated time [s] and what went wrong, or ""."""
+    """Simulates one use; returns the simulated time [s] and the reason of an alarm, "" for none."""
     name, kind, speed, reach, hand, _ = USES[use]
     arm = load_arm(name)
     if kind == "collect":
@@ -66,24 +67,24 @@ def run(use, seconds):
     return step(simulated, seconds)
 
 
-def step(arm, seconds, also=lambda: "", until=lambda: False):
-    """Steps an arm until the guard interferes or the time has passed."""
+def step(arm, seconds, check=lambda: "", until=lambda: False):
+    """Simulates an arm for `seconds` or until an alarm of its guard, a reason from `check`, or `until`; see `run`."""
     acted = False
     while arm.ticks * PERIOD < seconds and not until():
         arm.step()
         acted |= arm.guard.state in (lcmt_dvrk_status.STATE_EFFORT, lcmt_dvrk_status.STATE_POSITION)
-        if problem := interference(arm.guard) or also():
+        if problem := alarm(arm.guard) or check():
             return arm.ticks * PERIOD, problem
     idle = arm.controller is not None and not acted
-    return arm.ticks * PERIOD, "no command acted" if idle else ""
+    return arm.ticks * PERIOD, "no effort or position command was accepted" if idle else ""
 
 
 def collect(arm, seconds):
-    """A collection of random poses, those that the motors can hold."""
+    """Simulates a collection of random poses with low holding efforts; see `run`."""
     simulated = FaultyArm(arm.name.lower(), "effort")
     poses = arm.sample_poses(400, np.random.default_rng(1), margin=0.1)
     needed = np.abs(simulated.model.holding_torque(poses)) + arm.dry_friction()
-    poses = poses[(needed < STRENGTH * arm.effort_limits).all(axis=1)]
+    poses = poses[(needed < MAX_HOLDING_SHARE * arm.effort_limits).all(axis=1)]
     with tempfile.TemporaryDirectory() as folder:
         collector = Collector(
             poses,
@@ -91,22 +92,22 @@ def collect(arm, seconds):
             CollectionFile(Path(folder) / "poses.csv", arm, True),
             CollectionSettings(),
         )
-        simulated.lead = collector.lead
-        result = step(simulated, seconds, also=lambda: str(collector.problem or ""), until=lambda: collector.finished)
+        simulated.on_status = collector.update
+        result = step(simulated, seconds, check=lambda: str(collector.problem or ""), until=lambda: collector.finished)
         collector.close()
     print(f"{arm.name}: {np.count_nonzero(collector.done)} poses measured", flush=True)
     return result
 
 
 def teleoperate(path, seconds):
-    """An MTML in a hand leads a PSM by position commands."""
+    """Simulates teleoperation: a hand moves an MTML, and a PSM follows with position commands; see `run`."""
     master, follower = FaultyArm("mtml", "gravity", path=path, hand=True), FaultyArm("psm", "position")
     law = Teleoperation(master.arm, follower.arm)
     context = law.CreateDefaultContext()
     desired = np.concatenate([follower.start, np.zeros(follower.arm.num_joints)])
     follower.desired = lambda time: desired
 
-    def also():
+    def step_follower():
         nonlocal desired
         now = master.ticks * PERIOD
         inputs = {
@@ -118,32 +119,33 @@ def teleoperate(path, seconds):
         for port, value in inputs.items():
             law.GetInputPort(port).FixValue(context, value)
         context.get_mutable_discrete_state().SetFrom(law.EvalUniquePeriodicDiscreteUpdate(context))
-        wanted = law.GetOutputPort("desired_state").Eval(context)
-        if now > 2.0 and np.all(np.isfinite(wanted)):
-            desired = wanted.copy()
+        follower_desired = law.GetOutputPort("desired_state").Eval(context)
+        if now > 2.0 and np.all(np.isfinite(follower_desired)):
+            desired = follower_desired.copy()
         follower.step()
-        return interference(follower.guard)
+        return alarm(follower.guard)
 
-    return step(master, seconds, also)
+    return step(master, seconds, step_follower)
 
 
 def task(arguments):
-    """Runs one use in a process of its own."""
+    """Runs one use in a separate process and prints its line."""
     use, seconds = arguments
     start = time.monotonic()
     simulated, problem = run(use, seconds)
     print(
-        f"{use:44} {simulated:7.1f} s in {time.monotonic() - start:6.1f} s  {problem or 'no interference'}", flush=True
+        f"{use:44} {simulated:7.1f} s simulated in {time.monotonic() - start:6.1f} s: {problem or 'no alarm'}",
+        flush=True,
     )
     return simulated, problem
 
 
 def main():
-    """Prints a line for each use, and the sum."""
+    """Prints one line per use, and the number of alarms."""
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--uses", nargs="+", default=list(USES))
+    parser.add_argument("--minutes", type=float, default=30.0, help="total simulated time [min]; default: 30")
+    parser.add_argument("--processes", type=int, default=2, help="number of parallel processes; default: %(default)s")
+    parser.add_argument("--uses", nargs="+", default=list(USES), help="uses to simulate")
     arguments = parser.parse_args()
     weight = sum(USES[use][-1] for use in arguments.uses)
     tasks = [(use, 60.0 * arguments.minutes * USES[use][-1] / weight) for use in arguments.uses]
@@ -151,7 +153,7 @@ def main():
         results = pool.map(task, tasks, chunksize=1)
     alarms = sum(bool(problem) for _, problem in results)
     minutes = sum(seconds for seconds, _ in results) / 60
-    print(f"{minutes:.1f} simulated minutes, {alarms} uses in which the guard interfered")
+    print(f"{minutes:.1f} simulated minutes; uses with a false alarm: {alarms}")
     return int(alarms > 0)
 
 

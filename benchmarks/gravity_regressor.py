@@ -1,9 +1,9 @@
-"""Our compiled gravity regressor and torque beside Pinocchio's, same arm, same run.
-
-Pinocchio's model is the serial chain of the independent joints; crank and coupler hang on the linkage, which it has
-not. The torques of both must agree before anything is timed. Run:
+"""Compares the computing times of our gravity regressor and gravity torque with those of Pinocchio.
 
     make benchmark        or        pip install '.[benchmark]' && python benchmarks/gravity_regressor.py [--json FILE]
+
+Pinocchio's model is the serial chain of the independent joints, without the linkage. Before the timing, the script
+checks that the torques of the serial chain are equal.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ CALLS = 20_000
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE")
-    parser.add_argument("--poses", type=int, default=10_000)
-    parser.add_argument("--repetitions", type=int, default=15)
+    parser.add_argument("--json", metavar="FILE", help="write the results to this file")
+    parser.add_argument("--poses", type=int, default=10_000, help="number of poses; default: %(default)s")
+    parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
 
     arm = load_arm("mtml")
@@ -50,7 +50,7 @@ def main() -> None:
     reference = np.array([pinocchio.computeGeneralizedGravity(pin_model, pin_data, pose) for pose in q[:200]])
     ours = model.torque(q[:200], serial.base_values)
     rotor = plant.GetBodyByName("motor_4_link").default_mass() * np.linalg.norm(arm.gravity)
-    # Pinocchio's tree has no rotor of 1 g on the platform: that is all they may differ by.
+    # Pinocchio's chain lacks the rotor on the platform. The torques may differ only by the weight of the rotor.
     assert np.abs(ours - reference).max() < rotor * 0.7, np.abs(ours - reference).max()
 
     beta, out = model.gravity.base_values, np.empty(arm.num_joints)
@@ -64,7 +64,7 @@ def main() -> None:
         for _ in range(CALLS):
             pinocchio.computeGeneralizedGravity(pin_model, pin_data, pose)
 
-    works = {
+    cases = {
         f"regressor, {options.poses} poses": (
             {"ours": lambda: model.regressor(q), "Pinocchio": regressor_loop(pin_model, [q, zero, zero])},
             options.poses,
@@ -72,17 +72,17 @@ def main() -> None:
         "torque, one call": ({"ours": single_ours, "Pinocchio": single_pinocchio}, CALLS),
     }
     result, rows = {"derivation_s": derivation, "compilation_s": compilation}, {}
-    for work, (functions, count) in works.items():
+    for case, (functions, count) in cases.items():
         times = measured_times(functions, options.repetitions)
         us, ratio = (
             {k: 1e6 * float(np.median(v)) / count for k, v in times.items()},
             median_ratio(times, "ours", "Pinocchio"),
         )
-        result[work] = {**us, "ratio": ratio}
-        rows[work] = (f"{us['ours']:.3f}", f"{us['Pinocchio']:.3f}", f"{ratio:.3f}")
+        result[case] = {**us, "ratio": ratio}
+        rows[case] = (f"{us['ours']:.3f}", f"{us['Pinocchio']:.3f}", f"{ratio:.3f}")
     print_table(
-        f"{arm.name}: gravity; derivation {derivation:.2f} s and compilation {compilation:.2f} s, once, do not count",
-        ["ours [us]", "Pinocchio [us]", "ratio"],
+        f"{arm.name}: CPU time per pose, without derivation ({derivation:.2f} s) and compilation ({compilation:.2f} s)",
+        ["ours [us]", "Pinocchio [us]", "ratio ours / Pinocchio"],
         rows,
     )
     write_json(options.json, result)

@@ -1,10 +1,10 @@
-"""Cost of the command guard per tick: one command received and one step, while efforts act.
+"""Measures the computing time of the command guard per period: one received command and one step in effort mode.
 
     python benchmarks/guard_step.py [--other CHECKOUT]
 
-The reference is what any driver does per tick: encode and decode the command. With another checkout of this repository,
-e.g. an older commit, both are measured in turn. Times are of the process, and the least of many batches counts, since
-other programs only make them longer.
+The reference is the time to encode and decode the command. With another checkout of this repository, e.g. of an older
+commit, both versions are measured alternately. Times are CPU times, and the minimum over many batches, since other
+processes can only increase them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from pathlib import Path
 from timing import print_table
 
 ROOT = Path(__file__).resolve().parents[1]
-NUM_TILT_ITERATIONS = 5
+#: Number of alternating measurements of both checkouts.
+REPETITIONS = 5
 
 WORKER = """
 import sys, time
@@ -58,27 +59,28 @@ print(1e6 * min(times), 1e6 * min(messages))
 
 
 def cost(checkout: Path, arm: str) -> tuple[float, float]:
-    """Returns the least times of a tick and of encoding and decoding its command [us]."""
+    """Returns the minimum times of a period and of encoding and decoding its command [us]."""
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-c", WORKER, arm]
     output = subprocess.run(command, cwd=checkout, env=environment, check=True, capture_output=True).stdout
-    tick, message = map(float, output.split())
-    return tick, message
+    guard, message = map(float, output.split())
+    return guard, message
 
 
 def main() -> None:
-    """Prints a line for each arm."""
+    """Prints one row per arm."""
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--other", type=Path)
+    parser.add_argument("--other", type=Path, help="folder of the other checkout")
     other = parser.parse_args().other
     rows = {}
     for arm in ("mtml", "psm"):
-        turns = [(*cost(ROOT, arm), cost(other, arm)[0] if other else float("nan")) for _ in range(NUM_TILT_ITERATIONS)]
-        tick, message, theirs = (min(turn[i] for turn in turns) for i in range(3))
-        compared = [f"{theirs:.1f}", f"{tick / theirs:.2f}"] if other else []
-        rows[arm] = [f"{tick:.1f}", f"{message:.1f}", f"{tick / message:.2f}", *compared]
-    headings = ["tick [us]", "message [us]", "tick / message", *(["other checkout [us]", "ratio"] if other else [])]
-    print_table("Command guard", headings, rows)
+        measurements = [(*cost(ROOT, arm), cost(other, arm)[0] if other else float("nan")) for _ in range(REPETITIONS)]
+        guard, message, other_guard = (min(times[i] for times in measurements) for i in range(3))
+        compared = [f"{other_guard:.1f}", f"{guard / other_guard:.2f}"] if other else []
+        rows[arm] = [f"{guard:.1f}", f"{message:.1f}", f"{guard / message:.2f}", *compared]
+    compared = ["guard of the other checkout [us]", "ratio this / other"] if other else []
+    headings = ["guard [us]", "encode and decode [us]", "ratio", *compared]
+    print_table("CPU time per command and step", headings, rows)
 
 
 if __name__ == "__main__":

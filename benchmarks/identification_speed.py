@@ -1,10 +1,11 @@
-"""Times of `dvrk-drake identify` and `derive_gravity` beside those of another checkout, in turns.
+"""Compares the times of `dvrk-drake identify` and `derive_gravity` with those of another checkout.
 
     python benchmarks/identification_speed.py --base CHECKOUT [--recordings FOLDER] [--repetitions N]
 
-CHECKOUT is a folder with another version of dvrk_drake, such as that of `git worktree add ../before COMMIT`. FOLDER
-holds mtm_one.csv and psm_one.csv, the public recordings (docs/public_recordings.md); without it only `derive_gravity`
-is measured. Each run is a process of its own with one thread of BLAS. Times are medians; a ratio below 1 means faster.
+CHECKOUT is a folder with another version of dvrk_drake, e.g. made by `git worktree add ../before COMMIT`. FOLDER
+contains the public recordings mtm_one.csv and psm_one.csv (docs/public_recordings.md). Without FOLDER, only
+`derive_gravity` is measured. Each run is a separate process with one BLAS thread, and the checkouts alternate. Times
+are medians. A ratio below 1 means that this checkout is faster.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ import yaml
 HERE = Path(__file__).resolve().parents[1]
 RECORDINGS = {"mtm_one": "mtmr", "psm_one": "psm"}
 ARMS = ("mtml", "psm")
-#: Arguments of the command in this checkout, and in the other one, whose options may have other names.
+#: Arguments of the command in this checkout and in the other one. Edit the latter if its options have other names.
 IDENTIFY = ("identify", "{recording}", "--arm", "{arm}", "--coordinates", "actuator", "--output", "model.yaml")
 IDENTIFY_BASE = IDENTIFY
-#: Prints the formulas, and the processor and wall time of the derivation alone at the end.
+#: Prints the formulas. The last line is the CPU time and the wall time of the derivation.
 DERIVE = """
 import sys, time
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
@@ -45,7 +46,7 @@ print(*times)
 
 
 class Run(NamedTuple):
-    """Processor and wall time [s], what was printed, and the errors in the model that was written."""
+    """CPU time and wall time [s] of a run, its output, and the errors of the written model."""
 
     cpu: float
     wall: float
@@ -54,7 +55,7 @@ class Run(NamedTuple):
 
 
 def run(checkout: Path, arguments: Sequence[str]) -> Run:
-    """One process of a checkout's Python, in an empty folder."""
+    """Runs Python with the package of a checkout in an empty folder; exits with a message if the process fails."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         before, start = os.times(), time.perf_counter()
@@ -71,53 +72,53 @@ def run(checkout: Path, arguments: Sequence[str]) -> Run:
 
 
 def derive(checkout: Path, arm: str) -> Run:
-    """`derive_gravity` in a new process, without its imports."""
+    """Runs `derive_gravity` in a new process; the times exclude the imports."""
     *formulas, times = run(checkout, ["-c", DERIVE, arm]).output.splitlines()
     cpu, wall = map(float, times.split())
     return Run(cpu, wall, "\n".join(formulas))
 
 
 def identify(checkout: Path, command: Sequence[str], recording: Path, arm: str) -> Run:
-    """The command, from its start to its end."""
+    """Runs the command `dvrk-drake identify`; the times include the start of the process."""
     arguments = [part.format(recording=recording, arm=arm) for part in command]
     return run(checkout, ["-m", "dvrk_drake.cli", *arguments])
 
 
 def _errors(model: dict) -> tuple[float, ...]:
-    """RMS errors of the actuators, of the fit and cross-validated, as shares of their efforts."""
+    """Returns the relative RMS errors of the actuators, each of the fit and cross-validated."""
     kinds = ("rms_fit", "rms_cross_validation")
     return tuple(a[kind] / a["rms_effort"] for a in model["dynamics"]["actuators"] for kind in kinds)
 
 
 def show(what: str, runs: list[tuple[Run, Run]]) -> None:
-    """One line: before, after, ratio, and whether the results are the same."""
-    (cpu_before, wall_before), (cpu, wall) = (
+    """Prints one row: times of the other checkout and of this one, ratios, and the difference between the results."""
+    (cpu_other, wall_other), (cpu, wall) = (
         np.median([(pair[k].cpu, pair[k].wall) for pair in runs], axis=0) for k in range(2)
     )
-    before, after = runs[0]
-    if before.errors:
-        difference = np.max(np.abs(np.subtract(before.errors, after.errors)))
+    other, this = runs[0]
+    if other.errors:
+        difference = np.max(np.abs(np.subtract(other.errors, this.errors)))
         same = f"errors differ by at most {100 * difference:.1g} percentage points"
     else:
-        same = "same formulas" if before.output == after.output else "other formulas"
+        same = "equal formulas" if other.output == this.output else "different formulas"
     print(
-        f"{what:24} {cpu_before:7.2f} {cpu:7.2f} {cpu / cpu_before:6.2f}   "
-        f"{wall_before:7.2f} {wall:7.2f} {wall / wall_before:6.2f}   {same}",
+        f"{what:24} {cpu_other:7.2f} {cpu:7.2f} {cpu / cpu_other:6.2f}   "
+        f"{wall_other:7.2f} {wall:7.2f} {wall / wall_other:6.2f}   {same}",
         flush=True,
     )
 
 
 def main() -> None:
-    """A line for each arm and each recording."""
+    """Prints one row per arm and recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--base", type=Path, required=True, help="folder of the other checkout")
-    parser.add_argument("--recordings", type=Path, help="folder of mtm_one.csv and psm_one.csv")
-    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--recordings", type=Path, help="folder that contains mtm_one.csv and psm_one.csv")
+    parser.add_argument("--repetitions", type=int, default=5, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
     base = options.base.resolve()
-    columns = f"{'before':>7} {'after':>7} {'ratio':>6}"
-    print(f"{'':24} {'processor time [s]':^22}   {'wall time [s]':^22}")
-    print(f"{'':24} {columns}   {columns}   output")
+    columns = f"{'other':>7} {'this':>7} {'ratio':>6}"
+    print(f"{'':24} {'CPU time [s]':^22}   {'wall time [s]':^22}")
+    print(f"{'':24} {columns}   {columns}   results")
     for arm in ARMS:
         show(f"derive_gravity {arm}", [(derive(base, arm), derive(HERE, arm)) for _ in range(options.repetitions)])
     for name, arm in RECORDINGS.items() if options.recordings else ():

@@ -1,8 +1,9 @@
-"""Coverage of the 95 % intervals of `identify`, and share of selected effects that are not in the arm.
+"""Measures the coverage of the 95 % intervals of `identify` and the number of wrongly selected effects.
 
     python benchmarks/interval_coverage.py [--recordings 30] [--poses 40] [--noise 0.02]
 
-Simulated recordings of an arm with two springs; noise is Gaussian, a share of each joint's effort limit.
+The recordings are simulated static poses of an arm with two cable torques. The noise is Gaussian. Its standard
+deviation is a share of each joint's effort limit.
 """
 
 from __future__ import annotations
@@ -27,22 +28,29 @@ TRUE_EFFECTS = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recordings", type=int, default=30)
-    parser.add_argument("--poses", type=int, default=40)
-    parser.add_argument("--noise", type=float, default=0.02)
+    parser.add_argument(
+        "--recordings", type=int, default=30, help="number of simulated recordings; default: %(default)s"
+    )
+    parser.add_argument("--poses", type=int, default=40, help="number of poses per recording; default: %(default)s")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.02,
+        help="standard deviation of the noise, as a share of the effort limits; default: %(default)s",
+    )
     options = parser.parse_args()
     arm = load_arm("mtmr")
     truth = compile_static_model(arm, tuple(TRUE_EFFECTS))
     beta = truth.gravity.base_values
     theta = np.array([*beta, *TRUE_EFFECTS.values()])
-    base, effects, given, spurious = [], [], [], 0
+    base, effects, correct, spurious = [], [], [], 0
     for seed in range(options.recordings):
         generator = np.random.default_rng(seed)
         q = arm.sample_poses(options.poses, generator, margin=0.05)
         tau = truth.torque(q, [*beta, *TRUE_EFFECTS.values()])
         tau += options.noise * arm.effort_limits * generator.normal(size=q.shape)
-        right = StaticProblem(arm, q, tau, np.ones(q.shape, dtype=bool)).fit(tuple(TRUE_EFFECTS)).fit
-        given.append(np.abs(right.theta - theta) < 1.96 * np.sqrt(np.diag(right.covariance)))
+        fit = StaticProblem(arm, q, tau, np.ones(q.shape, dtype=bool)).fit(tuple(TRUE_EFFECTS)).fit
+        correct.append(np.abs(fit.theta - theta) < 1.96 * np.sqrt(np.diag(fit.covariance)))
         model = identify_static(Recording(q=q, tau=tau, source=f"seed {seed}"), arm).model
         for estimate, value in zip(model.base_parameters, beta, strict=True):
             base.append(abs(estimate.value - value) < 1.96 * estimate.standard_error)
@@ -50,11 +58,13 @@ def main() -> int:
             value = TRUE_EFFECTS.get(ActuatorEffect.of(e))
             spurious += value is None
             effects.append(abs(e.coefficient - (value or 0.0)) < 1.96 * e.standard_error)
-    print(f"{options.recordings} recordings of {options.poses} poses, noise {options.noise:g} of the effort limit")
-    print(f"95 % intervals hold the truth: base parameters {np.mean(base):.0%}, chosen effects {np.mean(effects):.0%}")
-    of_base, of_effects = np.mean(np.array(given)[:, : len(beta)]), np.mean(np.array(given)[:, len(beta) :])
-    print(f"the same, given which effects there are: base parameters {of_base:.0%}, effects {of_effects:.0%}")
-    print(f"effects chosen that are not there: {spurious / options.recordings:.1f} a recording")
+    print(f"{options.recordings} recordings of {options.poses} poses, noise {100 * options.noise:g} % of the limits")
+    print("coverage of the 95 % intervals:")
+    base_given, effects_given = np.array(correct)[:, : len(beta)], np.array(correct)[:, len(beta) :]
+    print(f"    selected effects: base parameters {100 * np.mean(base):.0f} %, effects {100 * np.mean(effects):.0f} %")
+    shares = [100 * np.mean(values) for values in (base_given, effects_given)]
+    print(f"    true effects given: base parameters {shares[0]:.0f} %, effects {shares[1]:.0f} %")
+    print(f"wrongly selected effects per recording: {spurious / options.recordings:.1f}")
     return 0
 
 

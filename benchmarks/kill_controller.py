@@ -1,24 +1,24 @@
-"""Time from `kill -9` of a controller until the guard of the simulated arm holds, over LCM.
+"""Measures the time from `kill -9` of a controller until the guard of the simulated arm holds, over LCM.
 
     python benchmarks/kill_controller.py [--kills 10] [--realtime]
 
-It starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold`, each as a process, and kills the controller
-when its efforts have acted for 0.3 s to 0.6 s. Then an operator resumes (`run --reset`), and the next kill follows. It
-does so alone, and beside two processes that never wait.
+The script starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold` as separate processes. It kills the
+controller after its efforts have acted for 0.3 s to 0.6 s. Then it starts a new controller with `run --reset` for the
+next kill. It does this on an otherwise idle computer, and with two busy processes.
 
-The end is the time that the guard read from its wall clock when it decided to hold; the arm's process prints it after
-that tick. That clock is the monotonic one, the same in all processes. So neither the network nor a process that
-observes adds to the figure. It begins just before the system is asked to send the signal.
+The measurement starts just before the call that sends the signal. It ends at the time that the guard read from its
+clock in the step in which it decided to hold. All processes use the same monotonic clock. Therefore the result does not
+include the network or a measuring process.
 
-A busy computer may stop the controller for longer than a command lasts. The watchdog then takes over before the kill;
-such an attempt is counted and repeated.
+A busy computer may suspend the controller for longer than its command is valid. The watchdog then holds the arm before
+the kill. The script counts such an attempt and repeats it.
 
-It needs a multicast route:
+The benchmark requires a multicast route:
 
     unshare -rn sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
                        exec python benchmarks/kill_controller.py'
 
-As root, `unshare -n`: the root of `unshare -r` has no right to real-time scheduling.
+As root, use `unshare -n`. A root user made by `unshare -r` is not permitted to use real-time scheduling.
 """
 
 import argparse
@@ -47,16 +47,16 @@ from dvrk_drake.processes.simulated_arm import SimulatedArm, monotonic_utime, st
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 CONDITIONS = {"alone": 0, "two busy processes": 2}
-#: The controller is killed when its efforts have acted for so long [s].
+#: Minimum and maximum time for which efforts act before the kill [s].
 ACTING = (0.3, 0.6)
-#: Attempts without a kill before it is given up.
-MAX_TAKEOVERS = 50
+#: Maximum number of watchdog holds before the kill.
+MAX_EARLY_HOLDS = 50
 EFFORT = describe_state(lcmt_dvrk_status.STATE_EFFORT)
 HOLD = describe_state(lcmt_dvrk_status.STATE_HOLD)
 
 
 class Arm:
-    """The changes of state that an arm's process prints."""
+    """Reader of the state changes that the process of an arm prints."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._changes: queue.Queue[tuple[int, str]] = queue.Queue()
@@ -68,7 +68,12 @@ class Arm:
             self._changes.put((int(time_ns), state))
 
     def until(self, state: str, seconds: float, process: BaseProcess | None = None) -> tuple[int, str] | None:
-        """The next change to a state that begins so [ns]; None if none comes in time, or `process` ends before."""
+        """Waits for a state change.
+
+        Returns:
+            Time [ns] and text of the next state that starts with `state`, or None if there is none within `seconds` or
+            until `process` ends.
+        """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and (process is None or process.is_alive()):
             with contextlib.suppress(queue.Empty):
@@ -78,8 +83,8 @@ class Arm:
         return None
 
 
-def be_the_arm(name: str, realtime: bool) -> None:
-    """As `dvrk-drake arm`; its changes of state have the time that the guard read last from its wall clock [ns]."""
+def run_arm(name: str, realtime: bool) -> None:
+    """Runs an arm like `dvrk-drake arm`; prints state changes with the last clock reading of the guard [ns]."""
     arm = load_arm(name)
     read = [0]
 
@@ -94,14 +99,14 @@ def be_the_arm(name: str, realtime: bool) -> None:
             print(f"warning: {warning}", file=sys.stderr)
     settle_memory()
 
-    def tell(line: str) -> None:
+    def print_change(line: str) -> None:
         print(1000 * read[0], line.partition(" s  ")[2], flush=True)
 
-    simulated.run(stopped, tell)
+    simulated.run(stopped, print_change)
 
 
-def be_the_controller(arguments: list[str]) -> None:
-    """`dvrk-drake` with these arguments, in a process that was forked from one that has compiled the controller."""
+def run_controller(arguments: list[str]) -> None:
+    """Runs `dvrk-drake` with these arguments and without output, in a forked process with a compiled controller."""
     silence = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silence, 1)
     os.dup2(silence, 2)
@@ -110,7 +115,7 @@ def be_the_controller(arguments: list[str]) -> None:
 
 @contextlib.contextmanager
 def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subprocess.Popen]:
-    """A Python process of these arguments that ends with the block."""
+    """Runs Python with these arguments in a process that ends with the block."""
     process = subprocess.Popen([sys.executable, *arguments], stdout=stdout, stderr=subprocess.DEVNULL, text=True)
     try:
         yield process
@@ -120,72 +125,68 @@ def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subpr
 
 
 def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[float], list[str], int]:
-    """Times from the kill to HOLD [s], why the guard took over, and how often it did so before the kill."""
+    """Returns the times from the kill to HOLD [s], the reasons of the guard, and the number of holds before a kill."""
     options = ["--realtime"] if realtime else []
     run = ["run", "--arm", name, "--mode", "hold", "--reset", *options]
     forkserver = multiprocessing.get_context("forkserver")
     times: list[float] = []
     reasons: list[str] = []
-    before = 0
+    early_holds = 0
     with contextlib.ExitStack() as stack:
-        process = stack.enter_context(
-            started(__file__, "--be-the-arm", "--arm", name, *options, stdout=subprocess.PIPE)
-        )
+        process = stack.enter_context(started(__file__, "--run-arm", "--arm", name, *options, stdout=subprocess.PIPE))
         arm = Arm(process.stdout)  # type: ignore[arg-type]
         for _ in range(busy):
             stack.enter_context(started("-c", "while True: pass"))
         while len(times) < kills:
-            controller = forkserver.Process(target=be_the_controller, args=(run,), daemon=True)
+            controller = forkserver.Process(target=run_controller, args=(run,), daemon=True)
             controller.start()
             acts = arm.until(EFFORT, 60.0, controller)
             if acts is None or arm.until(HOLD, random.uniform(*ACTING)):
-                before += 1
-                print("the watchdog took over before the kill", file=sys.stderr, flush=True)
+                early_holds += 1
+                print("The watchdog held the arm before the kill. Repeating.", file=sys.stderr, flush=True)
                 controller.kill()
                 controller.join()
-                if process.poll() is not None or before > MAX_TAKEOVERS:
-                    raise SystemExit("the controller's efforts do not act for long enough")
+                if process.poll() is not None or early_holds > MAX_EARLY_HOLDS:
+                    raise SystemExit("The controller's efforts do not act for long enough. Stop other programs.")
                 continue
-            killed = time.monotonic_ns()
+            kill_time = time.monotonic_ns()
             controller.kill()
             held = arm.until(HOLD, 10.0)
             controller.join()
             if held is None:
-                raise SystemExit("the arm does not hold within 10 s")
-            times.append(1e-9 * (held[0] - killed))
+                raise SystemExit("The arm did not hold within 10 s.")
+            times.append(1e-9 * (held[0] - kill_time))
             reasons.append(held[1])
             print(f"kill {len(times)}: {1e3 * times[-1]:.1f} ms, {held[1]}", file=sys.stderr, flush=True)
-    return times, reasons, before
+    return times, reasons, early_holds
 
 
 def main() -> None:
-    """One line per condition."""
+    """Prints one row per condition."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--kills", type=int, default=10, help="for each line of the table; default: 10")
-    parser.add_argument("--arm", default="mtml", help="default: mtml")
-    parser.add_argument("--condition", choices=CONDITIONS, help="only this one")
-    parser.add_argument("--realtime", action="store_true", help="real-time scheduling of arm and controller")
-    parser.add_argument("--be-the-arm", action="store_true", help="be the arm's process")
+    parser.add_argument("--kills", type=int, default=10, help="number of kills per condition; default: 10")
+    parser.add_argument("--arm", default="mtml", help="name of the arm; default: mtml")
+    parser.add_argument("--condition", choices=CONDITIONS, help="measure only this condition")
+    parser.add_argument("--realtime", action="store_true", help="use real-time scheduling for arm and controller")
+    parser.add_argument("--run-arm", action="store_true", help="run the process of the arm; used internally")
     options = parser.parse_args()
-    if options.be_the_arm:
-        be_the_arm(options.arm, options.realtime)
+    if options.run_arm:
+        run_arm(options.arm, options.realtime)
         return
     print(f"load average at the start: {os.getloadavg()[0]:.2f} on {os.cpu_count()} cores")
-    print(f"{options.arm}, {'real-time' if options.realtime else 'normal'} scheduling; kill -9 to HOLD [ms]")
-    print(f"| {'condition':20} | kills | p50 | max | by the wall clock | took over before the kill |")
+    print(f"{options.arm}, {'real-time' if options.realtime else 'normal'} scheduling: time from kill -9 to HOLD [ms]")
+    print(f"| {'condition':20} | kills | p50 | max | detected by the wall clock | held before the kill |")
     print("|---|---|---|---|---|---|")
     for condition, busy in CONDITIONS.items():
         if options.condition in (None, condition):
-            times, reasons, before = measure(options.arm, options.kills, busy, options.realtime)
+            times, reasons, early_holds = measure(options.arm, options.kills, busy, options.realtime)
             p50, by_wall = sorted(times)[len(times) // 2], sum("wall clock" in reason for reason in reasons)
-            print(
-                f"| {condition:20} | {len(times)} | {1e3 * p50:.1f} | {1e3 * max(times):.1f} | {by_wall} | {before} |",
-                flush=True,
-            )
+            cells = (f"{condition:20}", len(times), f"{1e3 * p50:.1f}", f"{1e3 * max(times):.1f}", by_wall, early_holds)
+            print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 
 if __name__ == "__main__":
     main()
 elif __name__ == "__mp_main__":
-    # Once, in the process from which the controllers are forked: it compiles the controller.
+    # Compile the controller once, in the process from which the controllers are forked.
     ArmController(load_arm("mtml"), IdentifiedModel.from_arm(load_arm("mtml")), "hold", 1e-3)

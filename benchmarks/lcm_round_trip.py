@@ -1,25 +1,27 @@
-"""Round trip of `dvrk-drake run` over LCM at 1 kHz, status out to command back, beside a raw Python echo's.
+"""Measures the round-trip time of `dvrk-drake run` over LCM at 1 kHz, in comparison with a minimal Python echo.
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-The time is measured in the process of the arm, from sending a status to receiving the command that answers it. There
-are two arms. "standing" is a bridge that sends the messages of a driver at 1 kHz without physics, to time the
-controller.
-"simulated" is `dvrk-drake arm`, which receives an answer when it has computed its next state.
+The process of the arm measures the time from sending a status to receiving the command that answers it. There are two
+arms:
 
-Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that decodes a status and encodes a
-command and does nothing else. Each is measured quiet, with `dvrk-drake view --live` and a client of its page, and with
-a busy process on every core; without and with real-time scheduling (`--realtime` of both commands, a core each).
+    standing    bridge that sends the messages of a driver at 1 kHz without physics, to time the controller
+    simulated   arm of `dvrk-drake arm`, which receives a command after it has computed its next state
 
-A tick without a fresh command is a status that was not answered when the next one went out. The echo's lines show how
-many of them are the machine's.
+The controllers are separate processes: `dvrk-drake run --mode hold`, and an echo, which only decodes a status and
+encodes a command. Each is measured on an otherwise idle computer, with `dvrk-drake view --live` and a client of its
+page, and with a busy process on every core. Each condition is measured without and with real-time scheduling
+(`--realtime`, with one core each for arm and controller).
 
-It needs a multicast route:
+A period without a fresh command is one in which no answer to the last status arrived. The rows of the echo show how
+often the computer itself causes this.
+
+The benchmark requires a multicast route:
 
     unshare -rn sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
                        exec python benchmarks/lcm_round_trip.py'
 
-As root, `unshare -n`: the root of `unshare -r` has no right to real-time scheduling.
+As root, use `unshare -n`. A root user made by `unshare -r` is not permitted to use real-time scheduling.
 """
 
 import argparse
@@ -55,31 +57,31 @@ RUN = ["-m", "dvrk_drake.cli", "run", "--arm", ARM.name.lower(), "--mode", "hold
 
 
 class Times:
-    """When each status went out and the first command that answers it was received [s]."""
+    """Times at which statuses were sent, and at which their first answers were received [s]."""
 
     def __init__(self) -> None:
-        self.out: list[float] = []
-        self.back: dict[int, float] = {}
+        self.sent: list[float] = []
+        self.answered: dict[int, float] = {}
 
-    def went_out(self) -> None:
-        """To be called before publishing: after it is too late, a woken peer may come first on this core."""
-        self.out.append(time.monotonic())
+    def start_trip(self) -> None:
+        """Stores the current time. Call this before publishing, since publishing may let another process run first."""
+        self.sent.append(time.monotonic())
 
-    def received(self, data: bytes, first: int) -> lcmt_dvrk_command:
-        """A command, which counts if it answers the last status; `first` is the sequence number of the first one."""
+    def store_answer(self, data: bytes, first: int) -> lcmt_dvrk_command:
+        """Decodes a command and stores the time if it answers the last status. `first` is the first sequence number."""
         now, command = time.monotonic(), lcmt_dvrk_command.decode(data)
-        if command.sequence == first + len(self.out) - 1:
-            self.back.setdefault(len(self.out) - 1, now)
+        if command.sequence == first + len(self.sent) - 1:
+            self.answered.setdefault(len(self.sent) - 1, now)
         return command
 
     def trips(self, begin: int) -> np.ndarray:
-        """Round trips [s] of the statuses from `begin` on, NaN where no command was received."""
-        # The last one may still be on its way.
-        return np.array([self.back.get(k, np.nan) - out for k, out in enumerate(self.out)][begin:-1])
+        """Returns the round-trip times [s] from status number `begin` on, NaN for a status without an answer."""
+        # The answer to the last status may not have arrived yet.
+        return np.array([self.answered.get(k, np.nan) - sent for k, sent in enumerate(self.sent)][begin:-1])
 
 
 class StandingArm:
-    """The bridge of an arm that stands still: the messages of a driver at 1 kHz, and no physics in its loop."""
+    """Bridge of an arm at rest, which exchanges the messages of a driver at 1 kHz without physics."""
 
     def __init__(self) -> None:
         self.times = Times()
@@ -100,30 +102,30 @@ class StandingArm:
         return self.sender_id != 0
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """A status each millisecond by the wall clock until `stopped`; a command that asks for efforts gets them."""
+        """Sends a status every millisecond of wall-clock time until `stopped`."""
         network = lcm.LCM()
-        network.subscribe(command_channel(ARM), self.hear)
+        network.subscribe(command_channel(ARM), self.receive)
         pace = Pace(1e-3, sleep=lambda seconds: listen(network, seconds))
         begin = time.time_ns() // 1000
         while not stopped():
             pace.wait()
             while handle_message(network, 0.0):
                 pass
-            self.status.sequence = len(self.times.out)
+            self.status.sequence = len(self.times.sent)
             self.status.utime = begin + 1000 * self.status.sequence
-            self.times.went_out()
+            self.times.start_trip()
             network.publish(status_channel(ARM), self.status.encode())
 
-    def hear(self, channel: str, data: bytes) -> None:
-        """Takes a command, and makes its sender the one that acts."""
-        command = self.times.received(data, first=0)
+    def receive(self, channel: str, data: bytes) -> None:
+        """Receives a command; the next statuses report it as the accepted command."""
+        command = self.times.store_answer(data, first=0)
         self.sender_id = command.sender_id
         self.status.command_sender_id, self.status.command_sequence = command.sender_id, command.sequence
         self.status.command_utime, self.status.guard_state = command.utime, lcmt_dvrk_status.STATE_EFFORT
 
 
 class TimedSimulatedArm(SimulatedArm):
-    """The simulated arm of `dvrk-drake arm`."""
+    """Simulated arm of `dvrk-drake arm` that stores the times of its messages."""
 
     def __init__(self) -> None:
         self.times = Times()
@@ -131,22 +133,22 @@ class TimedSimulatedArm(SimulatedArm):
 
     @property
     def acts(self) -> bool:
-        """Returns whether commands act; an echo asks for none."""
-        return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.back)
+        """Returns whether commands act. The echo sends no efforts, so for the echo any answer is enough."""
+        return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.answered)
 
-    def hear(self, channel: str, data: bytes) -> None:
-        """As the arm does, noting when."""
-        self.times.received(data, first=1)
-        super().hear(channel, data)
+    def receive(self, channel: str, data: bytes) -> None:
+        """Stores the time, then receives a command."""
+        self.times.store_answer(data, first=1)
+        super().receive(channel, data)
 
     def send(self, network: lcm.LCM) -> None:
-        """As the arm does, noting when."""
-        self.times.went_out()
+        """Stores the time, then sends a status."""
+        self.times.start_trip()
         super().send(network)
 
 
 def echo(realtime: bool) -> None:
-    """The peer to compare with: decodes a status, encodes a HOLD command, nothing else."""
+    """Answers each status with a HOLD command, without any other computation."""
     if realtime:
         make_realtime()
     network = lcm.LCM()
@@ -166,7 +168,7 @@ def echo(realtime: bool) -> None:
 
 
 def watch(port: int) -> None:
-    """A Meshcat client: a WebSocket that reads everything, as a browser does that has a GPU of its own to draw."""
+    """Receives all data of a Meshcat server over a WebSocket, like a browser, but without drawing."""
     while True:
         with contextlib.suppress(ConnectionRefusedError), socket.create_connection(("localhost", port)) as connection:
             key = base64.b64encode(secrets.token_bytes(16)).decode()
@@ -183,7 +185,7 @@ def watch(port: int) -> None:
 
 
 def free_port() -> int:
-    """A port that nobody listens to now."""
+    """Returns a free TCP port."""
     with socket.socket() as listener:
         listener.bind(("localhost", 0))
         return listener.getsockname()[1]
@@ -191,7 +193,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subprocess.Popen]:
-    """A Python process of these arguments that ends with the block."""
+    """Runs Python with these arguments in a process that ends with the block."""
     process = subprocess.Popen([sys.executable, *arguments], stdout=stdout)
     try:
         yield process
@@ -201,13 +203,21 @@ def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subpr
 
 
 def measure(peer: list[str], simulated: bool, condition: str, seconds: float, realtime: bool) -> np.ndarray:
-    """As `be_the_arm`, in a process of its own: real-time scheduling is not given back."""
+    """Calls `run_arm` in a separate process, since real-time scheduling cannot be disabled again."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
-        return process.submit(be_the_arm, peer, simulated, condition, seconds, realtime).result()
+        return process.submit(run_arm, peer, simulated, condition, seconds, realtime).result()
 
 
-def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float, realtime: bool) -> np.ndarray:
-    """Round trips [s] of `peer` for so long, from 2 s after its commands act, NaN where none was received in time."""
+def run_arm(peer: list[str], simulated: bool, condition: str, seconds: float, realtime: bool) -> np.ndarray:
+    """Runs an arm and a controller; returns the round-trip times [s], NaN for a status without an answer in time.
+
+    Args:
+        peer: Arguments of Python for the process of the controller.
+        simulated: True for the simulated arm, False for the standing arm.
+        condition: Additional load, one of `CONDITIONS`.
+        seconds: Duration of the measurement [s], which starts 2 s after commands first act.
+        realtime: True for real-time scheduling.
+    """
     arm = TimedSimulatedArm() if simulated else StandingArm()
     settle_memory()
     load: list[list[str]] = []
@@ -221,8 +231,8 @@ def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float,
 
     def stopped() -> bool:
         if not begins and arm.acts:
-            begins.append(len(times.out) + 2000)
-        return bool(begins) and len(times.out) > begins[0] + 1000 * seconds
+            begins.append(len(times.sent) + 2000)
+        return bool(begins) and len(times.sent) > begins[0] + 1000 * seconds
 
     cores = os.sched_getaffinity(0)
     with contextlib.ExitStack() as stack:
@@ -232,7 +242,7 @@ def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float,
         if condition == "Meshcat client":
             client = stack.enter_context(started(__file__, "--watch", port, stdout=subprocess.PIPE))
         if realtime:
-            # The peer inherits its core.
+            # The process of the controller inherits this core.
             os.sched_setaffinity(0, {max(cores)})
         stack.enter_context(started(*peer, *(["--realtime"] if realtime else [])))
         if realtime:
@@ -243,12 +253,12 @@ def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float,
         if client:
             client.kill()
             if not client.communicate()[0]:
-                raise SystemExit("the Meshcat client was sent nothing")
+                raise SystemExit("The Meshcat client received no data.")
     return times.trips(begins[0])
 
 
 def report(name: str, trips: np.ndarray) -> float:
-    """Prints the percentiles [us]; returns the median. A command that never came counts as one that came late."""
+    """Prints the percentiles [us] and returns the median. A missing answer counts as an infinite time."""
     p50, p99, p999 = 1e6 * np.percentile(np.nan_to_num(trips, nan=np.inf), [50, 99, 99.9], method="higher")
     missed = np.count_nonzero(np.isnan(trips))
     print(f"| {name:58} | {p50:6.0f} | {p99:6.0f} | {p999:6.0f} | {missed:4} of {len(trips)} |", end="", flush=True)
@@ -256,15 +266,15 @@ def report(name: str, trips: np.ndarray) -> float:
 
 
 def main() -> None:
-    """One table; the ratio is that of the medians."""
+    """Prints the table. Its ratio is that of the median to the median of the echo."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--seconds", type=float, default=60.0, help="for each line of the table")
-    parser.add_argument("--arm", choices=ARMS, help="only with this arm")
-    parser.add_argument("--condition", choices=CONDITIONS, help="only this one")
-    parser.add_argument("--scheduling", choices=SCHEDULINGS, help="only this one")
-    parser.add_argument("--echo", action="store_true", help="be the echo")
-    parser.add_argument("--realtime", action="store_true", help="of the echo")
-    parser.add_argument("--watch", type=int, metavar="PORT", help="be the Meshcat client")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of each measurement [s]; default: 60")
+    parser.add_argument("--arm", choices=ARMS, help="measure only this arm")
+    parser.add_argument("--condition", choices=CONDITIONS, help="measure only this condition")
+    parser.add_argument("--scheduling", choices=SCHEDULINGS, help="measure only this kind of scheduling")
+    parser.add_argument("--echo", action="store_true", help="run the echo; used internally")
+    parser.add_argument("--realtime", action="store_true", help="use real-time scheduling for the echo")
+    parser.add_argument("--watch", type=int, metavar="PORT", help="run a client of Meshcat; used internally")
     options = parser.parse_args()
     if options.watch:
         watch(options.watch)
@@ -275,21 +285,21 @@ def main() -> None:
 
 
 def table(options: argparse.Namespace) -> None:
-    """Measures and prints all lines."""
+    """Measures all selected conditions and prints one row for each controller."""
     print(f"load average at the start: {os.getloadavg()[0]:.2f} on {os.cpu_count()} cores")
-    print(f"| {'round trip [us]':58} |    p50 |    p99 |  p99.9 | without a fresh command | ratio |")
+    print(f"| {'round trip [us]':58} |    p50 |    p99 |  p99.9 | no fresh command | ratio to echo |")
     print("|---|---|---|---|---|---|")
     for arm in ARMS if options.arm is None else [options.arm]:
         for condition in CONDITIONS if options.condition is None else [options.condition]:
             for scheduling in SCHEDULINGS if options.scheduling is None else [options.scheduling]:
                 name, realtime = f"{arm} arm, {condition}, {scheduling}", SCHEDULINGS[scheduling]
                 simulated = arm == "simulated"
-                raw = report(
+                reference = report(
                     f"{name}: echo", measure([__file__, "--echo"], simulated, condition, options.seconds, realtime)
                 )
                 print("  1.00 |")
                 ours = report(f"{name}: dvrk-drake run", measure(RUN, simulated, condition, options.seconds, realtime))
-                print(f" {ours / raw:5.2f} |")
+                print(f" {ours / reference:5.2f} |")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
-"""Cost per period of authenticated messages, beside the same work without a key in the same run.
+"""Measures the computing time of message authentication per period.
 
     python benchmarks/message_key.py [--repetitions 20000]
 
-Rows, with the median time and the ratio to the row without a key:
+The same work is timed without and with a key. Rows:
 
-    arm         the arm's side of a period: one command from its bytes into the guard, one status into bytes
-    controller  the controller's side of a period: one status from its bytes, one command into bytes
-    foreign     a message that the arm's inbox drops: of another session; with the key, signed with another one
+    arm         work of the arm: decode one command, pass it to the guard, encode one status
+    controller  work of the controller: decode one status, encode one command
+    foreign     rejection of one message by the arm: of another session, or signed with another key
 
-Nothing is sent.
+No messages are sent.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ KEY = MessageKey(bytes(range(32)))
 
 
 class Arm:
-    """A guard with its inbox, and its status; the arm stands still."""
+    """Guard, inbox and status of an arm at rest."""
 
     def __init__(self, key: MessageKey | None) -> None:
         self.key, self.utime = key, 10**15
@@ -51,12 +51,12 @@ class Arm:
         self.step()
 
     def signed(self, message: lcmt_dvrk_command | lcmt_dvrk_status) -> bytes:
-        """The message as it goes over the wire."""
+        """Returns the encoded message, signed if there is a key."""
         data: bytes = message.encode()
         return data if self.key is None else self.key.sign(data)
 
     def step(self) -> None:
-        """A step of the guard, and the next command; not in the table."""
+        """Steps the guard and prepares the next command. This time is not in the table."""
         self.utime += 1000
         self.guard.step(self.utime, self.utime, self.q, self.zero, self.zero)
         self.command.utime = self.command.status_utime = self.utime
@@ -64,7 +64,7 @@ class Arm:
         self.data = self.signed(self.command)
 
     def period(self) -> None:
-        """A command in, a status out."""
+        """Receives a command and encodes a status."""
         self.inbox.put(self.data)
         self.inbox.deliver(self.guard, self.utime)
         self.status.utime, self.status.sequence = self.utime, self.status.sequence + 1
@@ -73,22 +73,22 @@ class Arm:
 
 
 class Controller:
-    """The other side of an `Arm`."""
+    """Controller that exchanges messages with an `Arm`."""
 
     def __init__(self, arm: Arm) -> None:
         self.arm, self.statuses, self.time = arm, StatusFilter(ARM.name, N, arm.key), 0.0
 
     def period(self) -> None:
-        """A status in, a command out."""
+        """Receives a status and encodes a command."""
         self.time += 1e-3
-        self.statuses.take(self.arm.status_data, self.time)
+        self.statuses.accept(self.arm.status_data, self.time)
         self.arm.signed(self.arm.command)
 
 
 def main() -> None:
-    """Prints a row for each kind of work."""
-    parser = argparse.ArgumentParser(description="Cost per period of authenticated messages.")
-    parser.add_argument("--repetitions", type=int, default=20_000)
+    """Prints one row per kind of work."""
+    parser = argparse.ArgumentParser(description="Measures the computing time of message authentication per period.")
+    parser.add_argument("--repetitions", type=int, default=20_000, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
     bare, keyed = Arm(None), Arm(KEY)
     bare_controller, keyed_controller = Controller(bare), Controller(keyed)
@@ -106,7 +106,7 @@ def main() -> None:
         "foreign, key": lambda: keyed.inbox.put(spoofed),
     }
     times = measured_times(functions, options.repetitions, clock=time.perf_counter)
-    count = options.repetitions + 1  # with the one that does not count
+    count = options.repetitions + 1  # including the call that is not timed
     assert bare.guard.counts.refused == keyed.guard.counts.refused == 0
     assert bare.guard.counts.accepted == keyed.guard.counts.accepted == count
     assert bare_controller.statuses.last.sequence == keyed_controller.statuses.last.sequence == count
@@ -117,7 +117,7 @@ def main() -> None:
         ]
         for name in ("arm", "controller", "foreign")
     }
-    print_table("Messages of one period", ["no key [us]", "key [us]", "ratio"], rows)
+    print_table("Computing time per period, median", ["no key [us]", "key [us]", "ratio key / no key"], rows)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Coverage of the 95 % intervals of `identify` on motions of simulated arms, with the right effects.
+"""Measures the coverage of the 95 % intervals of `identify` on simulated motions, with the true effects given.
 
     python benchmarks/motion_coverage.py [--arms 16] [--noise 0.05] [--spread 0.15]
 
-Every arm has links and rotors of its own: the SDF's, sheared and shifted by `spread` of their size, but inside of their
-boxes. At 0.15 the masses differ from the SDF's by 30 % (1 sigma), as the prior of `identify` expects. The drives have
-viscous, Coulomb and presliding friction. The motion has a period of 10 s and is recorded for 20 s at 200 Hz. Noise of
-the efforts is white, a share of each one's RMS. Takes some minutes.
+Each arm has different links and rotors. They are those of the SDF, sheared and shifted by the share `spread` of their
+size, but inside their bounding boxes. At 0.15 the masses differ from those of the SDF by 30 % (1 sigma), which is the
+prior of `identify`. The drives have viscous, Coulomb and presliding friction. The motion has a period of 10 s and is
+recorded for 20 s at 200 Hz. The efforts have white noise, given as a share of their RMS. The script takes some minutes.
 """
 
 from __future__ import annotations
@@ -30,34 +30,47 @@ RATE = 1000.0
 
 
 def main() -> int:
-    """A few lines an arm."""
+    """Prints the coverage for each arm."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=16)
-    parser.add_argument("--noise", type=float, default=0.05)
-    parser.add_argument("--spread", type=float, default=0.15)
+    parser.add_argument("--arms", type=int, default=16, help="number of simulated arms; default: %(default)s")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.05,
+        help="standard deviation of the noise, as a share of the efforts; default: %(default)s",
+    )
+    parser.add_argument(
+        "--spread", type=float, default=0.15, help="size of the changes of the links, see above; default: %(default)s"
+    )
     options = parser.parse_args()
-    print("95 % intervals that hold the truth, and RMS errors in standard errors:")
+    print("coverage of the 95 % intervals, number of intervals, RMS error / standard error:")
     for name in ("mtmr", "psm"):
         arm = load_arm(name)
-        z, share, of_effects = map(
+        z, share, z_effects = map(
             np.concatenate,
             zip(*(errors(arm, seed, options.noise, options.spread) for seed in range(options.arms)), strict=True),
         )
         report(f"{arm.name}, base parameters", z)
         for lower, upper in zip((0.0, 0.1, 0.5), (0.1, 0.5, np.inf), strict=True):
             which = (share >= lower) & (share < upper)
-            report(f"    standard error {lower:g} to {upper:g} of what the prior alone leaves", z[which])
-        report(f"{arm.name}, effects", of_effects)
+            report(f"    standard error {lower:g} to {upper:g} times that of the prior", z[which])
+        report(f"{arm.name}, effects", z_effects)
     return 0
 
 
 def report(what: str, z: np.ndarray) -> None:
-    """One line."""
-    print(f"{what:70} {np.mean(np.abs(z) < 1.96):6.1%} of {len(z):4d}, {np.sqrt(np.mean(z**2)):.2f}", flush=True)
+    """Prints one row; z (k,) are errors divided by their standard errors."""
+    coverage = 100 * np.mean(np.abs(z) < 1.96)
+    print(f"{what:70} {coverage:5.1f} % of {len(z):4d}, {np.sqrt(np.mean(z**2)):.2f}", flush=True)
 
 
 def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors of base parameters in standard errors, these as shares of the prior's, and errors of the effects."""
+    """Simulates and identifies one arm.
+
+    Returns:
+        Errors of the base parameters divided by their standard errors, ratios of these standard errors to those of the
+        prior, and errors of the effects divided by their standard errors.
+    """
     generator = np.random.default_rng(seed)
     motion = fourier_motion(arm, generator, 10.0, 20.0, RATE)
     truth = true_dynamics(arm, generator, friction_everywhere(arm, motion), spread)
@@ -69,16 +82,16 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     selection = problem.selection()
     selection.fit(chosen)
     fit = problem.consistent(chosen, selection.weights)
-    left = residuals(problem, chosen, fit)
+    residual = residuals(problem, chosen, fit)
     cut_off = grid.settings.effort_cut_off
-    covariance = parameter_covariance(problem, fit, left, grid.rate, cut_off, period)
+    covariance = parameter_covariance(problem, fit, residual, grid.rate, cut_off, period)
     p = problem.num_rigid
     B = derive_base_parameters(problem.regressor).combination[:, :p]
     B = B[np.any(B, axis=1)]
-    spread = np.sqrt(np.diag(B @ covariance[:p, :p] @ B.T))
-    before = np.sqrt(np.diag(B @ np.diag(problem.deviation**2) @ B.T))
-    z = B @ (fit.x[:p] - truth.parameters[:p]) / spread
-    return z, spread / before, (fit.x[p:] - truth.coefficients) / np.sqrt(np.diag(covariance))[p:]
+    standard_error = np.sqrt(np.diag(B @ covariance[:p, :p] @ B.T))
+    prior_error = np.sqrt(np.diag(B @ np.diag(problem.deviation**2) @ B.T))
+    z = B @ (fit.x[:p] - truth.parameters[:p]) / standard_error
+    return z, standard_error / prior_error, (fit.x[p:] - truth.coefficients) / np.sqrt(np.diag(covariance))[p:]
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Phases of a motion predicted by models that know nothing of them: neither parameters nor the choice of effects.
+"""Computes nested cross-validation errors of a motion directly, to check the faster method of `identify`.
 
     python benchmarks/nested_cross_validation.py MOTION.csv --arm mtmr [--coordinates actuator]
 
-What `identify` prints as cross-validated, computed the long way: the rows of two twelfths of the phases are left out,
-with the neighbouring tenths of a second, and everything is made anew from the others. `identify` takes the sums of
-squares of its first pass apart instead, and turns gravity to first order; the figures shall agree.
+For each fold, the script removes the rows of two twelfths of the phases and of the neighbouring tenths of a second. It
+then selects the effects and estimates all parameters from the other rows. `identify` subtracts the sums of squares of
+the fold instead, and linearises the base tilt. Both results should be equal.
 """
 
 from __future__ import annotations
@@ -23,11 +23,16 @@ from dvrk_drake.recordings.recording import read_recording
 
 
 def main() -> None:
-    """One line a part, then all of them together."""
+    """Prints one row per fold, and the error over all folds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("motion")
-    parser.add_argument("--arm", required=True)
-    parser.add_argument("--coordinates", choices=("joint", "actuator"), default="joint")
+    parser.add_argument("motion", help="recording of the motion")
+    parser.add_argument("--arm", required=True, help="name of the arm")
+    parser.add_argument(
+        "--coordinates",
+        choices=("joint", "actuator"),
+        default="joint",
+        help="coordinates of the recording; default: %(default)s",
+    )
     options = parser.parse_args()
     arm = load_arm(options.arm)
     recording = read_recording(options.motion, arm, options.coordinates)
@@ -35,22 +40,22 @@ def main() -> None:
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     problem = motion_problem(grid, tau, period_of(grid))
     squares = np.zeros(arm.num_joints)
-    print("error of the actuators' efforts [%], mean last")
+    print("relative RMS effort error of each actuator and mean [%], 6-fold cross-validation over the phase")
     for first in range(0, FOLDS, NUM_HELD_OUT_FOLDS):
-        left_out = (problem.fold >= first) & (problem.fold < first + NUM_HELD_OUT_FOLDS)
+        held_out = (problem.fold >= first) & (problem.fold < first + NUM_HELD_OUT_FOLDS)
         before = (problem.fold == (first - 1) % FOLDS) & problem.edge[:, 1]
         after = (problem.fold == (first + NUM_HELD_OUT_FOLDS) % FOLDS) & problem.edge[:, 0]
-        choice = select_effects(problem.subset(~(left_out | before | after)))
-        fit = choice.problem.consistent(choice.chosen, choice.weights)
-        part = replace(problem.subset(left_out), tilt=choice.problem.tilt)
-        errors = np.sum(residuals(part, choice.chosen, fit) ** 2, axis=0)
+        selection = select_effects(problem.subset(~(held_out | before | after)))
+        fit = selection.problem.consistent(selection.effects, selection.weights)
+        part = replace(problem.subset(held_out), tilt=selection.problem.tilt)
+        errors = np.sum(residuals(part, selection.effects, fit) ** 2, axis=0)
         squares += errors
         show(f"phases {first}-{first + NUM_HELD_OUT_FOLDS - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))
-    show("all of them", squares, np.sum(problem.columns.tau**2, axis=0))
+    show("all phases", squares, np.sum(problem.columns.tau**2, axis=0))
 
 
 def show(name: str, errors: np.ndarray, efforts: np.ndarray) -> None:
-    """Relative errors in percent, from sums of squares."""
+    """Prints one row of relative errors [%], from sums (n,) of squared errors and squared efforts."""
     percent = 100 * np.sqrt(errors / efforts)
     print(f"{name:20}", " ".join(f"{p:5.1f}" for p in percent), f" {percent.mean():5.1f}", flush=True)
 

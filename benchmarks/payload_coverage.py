@@ -1,8 +1,8 @@
-"""Coverage of the 95 % intervals of `payload` on simulated arms whose drives changed between two days.
+"""Measures the coverage of the 95 % intervals of `payload` on simulated arms whose drives change between two days.
 
     python benchmarks/payload_coverage.py [--seeds 40]
 
-Every arm has links, friction, springs and cables of its own (tests/support/loaded_arm.py says how large).
+Each arm has different links, friction, springs and cables; see tests/support/loaded_arm.py for their sizes.
 """
 
 from __future__ import annotations
@@ -28,23 +28,26 @@ CASES = [
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--seeds", type=int, default=40, help="number of simulated arms per case; default: %(default)s")
     options = parser.parse_args()
     inside = []
-    for name, link, mass, place in CASES:
+    for name, link, mass, position in CASES:
         errors, sizes = [], []
         for seed in range(options.seeds):
-            model, reference, loaded = two_days(name, link, mass, place, seed)
+            model, reference, loaded = two_days(name, link, mass, position, seed)
             (payload,) = estimate_payload(reference, loaded, model, [link])
             known = np.append(True, payload.body.determined)
-            difference = np.append(payload.body.mass - mass, payload.body.place - place)[known]
-            spread = np.append(payload.mass_error, payload.place_error)[known]
+            difference = np.append(payload.body.mass - mass, payload.body.position - position)[known]
+            spread = np.append(payload.mass_error, payload.position_error)[known]
             errors.append(difference / spread)
             inside += list(np.abs(difference) < payload.quantile * spread)
             sizes.append(payload.mass_error)
         rms = ", ".join(f"{x:.2f}" for x in np.sqrt(np.mean(np.square(errors), axis=0)))
-        print(f"{name} {link}, {mass:.2f} kg: +- {np.median(sizes):.4f}; RMS errors in standard errors: {rms}")
-    print(f"95 % intervals that hold the truth: {np.mean(inside):.1%} of {len(inside)}")
+        print(
+            f"{name} {link}, {mass:.2f} kg: median standard error {np.median(sizes):.4f} kg; "
+            f"RMS error / standard error of mass and position: {rms}"
+        )
+    print(f"coverage of the 95 % intervals: {100 * np.mean(inside):.1f} % of {len(inside)}")
     return 0
 
 

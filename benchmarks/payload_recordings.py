@@ -1,10 +1,12 @@
-"""The known weights of the public PSM recordings as `payload` finds them, and what a recalibration gains: how short it
-may be, and on the same phases of a motion or on others.
+"""Estimates the known payloads of the public PSM recordings, and the effect of refitting friction.
 
     python benchmarks/payload_recordings.py FOLDER
 
-FOLDER holds psm_one.csv, psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in actuator
-coordinates, with a header and times (docs/public_recordings.md says where they come from).
+FOLDER contains psm_one.csv, psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in actuator
+coordinates, with a header and times (docs/public_recordings.md).
+
+The first table has the estimated payloads. The second one shows how the error depends on the duration of the recording
+to which friction is refitted. The third one compares refitting on the same phases of the motion and on other phases.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.recalibration import predict_other_phases, refit_friction
+from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -28,7 +30,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.recordings.recording import Recording, read_recording
 
-#: File, link, mass [kg], place in the link's frame [m]; docs/payload.md says how the places are read.
+#: File, link, mass [kg], and position in the link's frame [m]; see docs/payload.md for the source of the positions.
 WEIGHTS = [
     ("psm_one_105g_parallel", "bottom_bar_link", 0.105, [0.0, 0.165, 0.0563]),
     ("psm_one_205g_insertion", "end_link", 0.205, [0.0, 0.023, 0.3913]),
@@ -38,7 +40,7 @@ SECONDS = (5.5, 6.0, 7.0, 8.0, 10.0)
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
     options = parser.parse_args()
     arm = load_arm("psm")
 
@@ -47,78 +49,82 @@ def main() -> int:
 
     models = {name: identify_dynamic(read(name), arm).model for name in ("psm_one_no_weight", "psm_one")}
     for reference, model in models.items():
-        for name, link, mass, place in WEIGHTS:
+        for name, link, mass, position in WEIGHTS:
             (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])
-            _print_payload(arm, read(name), reference, name, payload, mass, np.array(place))
-    # The arm without payload on the other day, and the torque of a payload that is known exactly.
+            _print_payload(arm, read(name), reference, name, payload, mass, np.array(position))
+    # Add the torque of an exactly known payload to the recording without payload of the other day.
     for reference, other in (("psm_one_no_weight", "psm_one"), ("psm_one", "psm_one_no_weight")):
         model = models[reference].dynamic_model
-        for _, link, mass, place in WEIGHTS:
-            loaded = _with_payload(read(other), model, link, mass, np.array(place))
+        for _, link, mass, position in WEIGHTS:
+            loaded = _with_payload(read(other), model, link, mass, np.array(position))
             (payload,) = estimate_payload(read(reference), loaded, model, [link])
-            name = f"{other} with {1000 * mass:.0f} g added to its efforts"
-            _print_payload(arm, loaded, reference, name, payload, mass, np.array(place))
+            name = f"{other} with the torque of {1000 * mass:.0f} g added"
+            _print_payload(arm, loaded, reference, name, payload, mass, np.array(position))
     _print_seconds(models["psm_one"], read("psm_one_no_weight"))
     _print_phases(models["psm_one"], read("psm_one_no_weight"))
     return 0
 
 
-def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: float, place: np.ndarray) -> Recording:
-    """The recording with the efforts that a point mass on a link would have added."""
+def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: float, position: np.ndarray) -> Recording:
+    """Returns the recording plus the efforts of a point mass on a link."""
     arm = model.arm
     recording = recording.in_actuator_coordinates(arm)
     grid = motion_grid(recording, arm, model.section.signals)
     k = [link.link for link in model.regressor.links].index(link)
     Y = model.regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
-    added = Y @ point_mass_parameters(mass, place) @ arm.transmission.inverse.matrix
+    added = Y @ point_mass_parameters(mass, position) @ arm.transmission.inverse.matrix
     return dataclasses.replace(recording, tau=recording.measured_effort() + grid.efforts_at_rows(added))
 
 
 def _print_payload(
-    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, place: np.ndarray
+    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, position: np.ndarray
 ) -> None:
-    body, offset = payload.body, payload.place_in_base - payload.body.place
-    print(f"{name} against {reference}, {payload.link}")
+    body, offset = payload.body, payload.position_in_base - payload.body.position
+    print(f"{name}, reference {reference}, payload on {payload.link}")
     print(f"  mass {1000 * body.mass:.0f} +- {1000 * payload.mass_error:.0f} g (true {1000 * mass:.0f})")
     for axis in range(3):
         estimate = "not determined"
         if body.determined[axis]:
-            estimate = f"{100 * payload.place_in_base[axis]:+.1f} +- {100 * payload.place_error[axis]:.1f} cm"
-        print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (place + offset)[axis]:+.1f})")
+            estimate = f"{100 * payload.position_in_base[axis]:+.1f} +- {100 * payload.position_error[axis]:.1f} cm"
+        print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (position + offset)[axis]:+.1f})")
     regressor = DynamicRegressor(arm)
     grid = motion_grid(recording, arm, default_settings(arm))
     k = [link.link for link in regressor.links].index(payload.link)
     Y = regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
-    # Without their means, which no recording tells from an offset of the drive.
-    ours, true = (tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, place)))
+    # Subtract the means, which are not identifiable separately from the offset of the drive.
+    ours, true = (
+        tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, position))
+    )
     share = np.sum(ours * true, axis=0)[:2] / np.sum(true**2, axis=0)[:2]
-    print(f"  its torque along the true one: yaw {share[0]:.0%}, pitch {share[1]:.0%}")
+    print(f"  estimated torque, projected on the true torque: yaw {100 * share[0]:.0f} %, pitch {100 * share[1]:.0f} %")
 
 
 def _print_seconds(model: IdentifiedModel, whole: Recording) -> None:
-    """Errors on the last two thirds after recalibration on the first seconds."""
-    rest = _rows(whole, slice(len(whole) // 3, None))
+    """Prints the errors on the last two thirds after refitting friction to the first seconds."""
+    evaluation = _rows(whole, slice(len(whole) // 3, None))
 
     def percent(which: IdentifiedModel) -> str:
-        validation = validate_motion(which, rest)
+        validation = validate_motion(which, evaluation)
         return "  ".join(f"{100 * (a.relative_error or 0):5.1f}" for a in validation.actuators)
 
+    print("\nrelative RMS effort error of each actuator [%], by the duration of the recording for refitting friction")
     print(f"before    {percent(model)}")
     for seconds in SECONDS:
         assert whole.t is not None
         result = refit_friction(model, _rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))))
-        left = [a.name for a in result.actuators if not a.kept]
-        print(f"{seconds:5.1f} s   {percent(result.model)}   left alone: {', '.join(left) or 'none'}")
+        not_refitted = [a.name for a in result.actuators if not a.kept]
+        print(f"{seconds:5.1f} s   {percent(result.model)}   not refitted: {', '.join(not_refitted) or 'none'}")
 
 
 def _print_phases(model: IdentifiedModel, whole: Recording) -> None:
-    """Errors with friction refitted to the same phases at another time, and to the other half of the phases."""
+    """Prints the errors after refitting friction to the same phases at another time, and to the other phases."""
     first, second = (_rows(whole, rows) for rows in (slice(0, len(whole) // 2), slice(len(whole) // 2, None)))
 
     def errors(which: IdentifiedModel) -> list[float]:
         return [a.relative_error or 0.0 for a in validate_motion(which, second).actuators]
 
-    before, after = predict_other_phases(model, whole, 2)
+    before, after = cross_validated_errors(model, whole, 2)
+    print("\nrelative RMS effort error of each actuator and mean [%]")
     for name, values in (
         ("same phases, second half of the time: before", errors(model)),
         ("same phases, refitted to the first half of the time", errors(refit_friction(model, first).model)),

@@ -1,4 +1,4 @@
-"""An arm as a model of Pinocchio, the peer of the regressors: built from the Drake plant's own joints and inertias."""
+"""Converts an arm to a Pinocchio model, with the joints and inertias of the Drake plant."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ JOINT_MODELS = {
 
 
 def build_pinocchio(arm: Arm, plant: MultibodyPlant, joint_names: Sequence[str]) -> pinocchio.Model:
-    """Pinocchio's model of the links that these joints move; each link's frame is its joint's, parallel to the base."""
+    """Returns a Pinocchio model of the links that these joints move.
+
+    The frame of each link is at its joint and parallel to the base frame.
+    """
     context = plant.CreateDefaultContext()
     model = pinocchio.Model()
     model.gravity.linear = arm.gravity
@@ -42,7 +45,10 @@ def build_pinocchio(arm: Arm, plant: MultibodyPlant, joint_names: Sequence[str])
 
 
 def regressor_loop(model: pinocchio.Model, motion: Sequence[NDArray]) -> Callable[[], None]:
-    """computeJointTorqueRegressor of each sample of q, v, vd (m, t); it has no batch, each overwrites the last."""
+    """Returns a function that calls computeJointTorqueRegressor for each sample of q, v, vd (m, t).
+
+    Pinocchio has no batch function. Each call overwrites the previous regressor.
+    """
     data = model.createData()
 
     def run() -> None:

@@ -1,30 +1,30 @@
-"""Time of a simulated millisecond of the PSM under control, its loops closed, beside its open tree in the same run.
+"""Compares the computing times of the PSM with closed loops and of its open tree in simulation.
 
     python benchmarks/psm_simulation.py [--json FILE] [--repetitions N] [--seconds S]
 
-All rows are the same arm under GravityPidController at 1 kHz, which moves all joints along one smooth motion. Nothing
-is published and it runs as fast as it can. Times are CPU time of this process, and ratios are medians over the
-repetitions, which are interleaved. `closure` is the largest distance between the two halves of a cut pin, `remote
-centre` that of the end link's remote centre from where it belongs, both at 50 instants of the motion.
+In all controlled rows a GravityPidController at 1 kHz moves all joints along the same smooth motion. Times are CPU
+times of this process. The repetitions of the rows alternate, and ratios are medians over the repetitions.
 
 Rows:
-    open         The reference: the seven joints alone, without any constraint. The end link is hinged on the yaw link
-                 at the remote centre, there is no linkage and counterweight, and the fingers are one; the controller's
-                 gravity is not its.
-    ball         ArmStation with both loops pinned; SAP at 1 ms.
-    mimic        The same station as a tree whose joints are coupled.
-    cenic_mimic  A continuous plant with couplings under Drake's error-controlled CENIC, accuracy 1e-4; the controller's
-    cenic_ball   samples bound its steps, so that none is longer than 1 ms. The second has its loops pinned.
-    fixed_mimic  The same without error control: one step per millisecond, as SAP takes them.
-    fixed_ball
-    free_mimic   CENIC with couplings and no controller: the arm falls, and CENIC chooses its steps. For its steps only.
+    open         Reference without constraints: the seven joints in series. There is no linkage and no counterweight,
+                 the end link is hinged on the yaw link at the remote centre, and both fingers are one body. The
+                 controller's gravity model is that of the arm with the linkage.
+    ball         ArmStation with both loops closed by ball constraints; SAP with a time step of 1 ms.
+    mimic        ArmStation as a tree with coupled joints; SAP with a time step of 1 ms.
+    cenic_mimic  Continuous plant with coupled joints and Drake's error-controlled integrator CENIC, accuracy 1e-4.
+                 The samples of the controller limit its steps to 1 ms.
+    cenic_ball   The same with ball constraints.
+    fixed_mimic  Row cenic_mimic with fixed steps of 1 ms, without error control.
+    fixed_ball   Row cenic_ball with fixed steps of 1 ms, without error control.
+    free_mimic   CENIC with coupled joints and without controller, while the arm falls. It shows the steps that CENIC
+                 selects.
 
-Rows that this version of drake cannot run are left out, with its reason: CENIC supports pins from 1.56 on.
+Columns:
+    closure        largest distance between the two halves of a cut pin, at 50 times of the motion
+    remote centre  largest distance of the end link's remote centre from its nominal position, at the same times
 
-Where the time of `ball` goes (perf, drake 1.51.1): SAP's problem and solution take half, of which its Context, made and
-destroyed twice per step, takes a third. One Newton iteration solves each step. A tree without constraints skips all of
-that, so the first constraint costs more than the other five. Memory allocation takes a quarter, in all of these parts:
-a faster allocator (docs/simulated_effects.md) takes a sixth off `ball` and `mimic`, and nothing off `open`.
+The script omits rows that the installed version of Drake cannot run, and prints the reason. CENIC supports ball
+constraints since Drake 1.56.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ N = ARM.num_joints
 
 
 def motion(seconds: float) -> PiecewisePolynomial:
-    """Between two opposite poses of the box, half a second each way."""
+    """Returns a motion between two opposite poses of the joint box, with 0.5 s per direction."""
     center, half = (ARM.position_lower + ARM.position_upper) / 2, (ARM.position_upper - ARM.position_lower) / 2
     times = np.arange(0.0, seconds + 0.6, 0.5)
     knots = [center + 0.2 * (-1) ** i * half for i in range(len(times))]
@@ -66,7 +66,7 @@ def motion(seconds: float) -> PiecewisePolynomial:
 
 
 def open_arm(folder: Path) -> Arm:
-    """The PSM without linkage, as a file of its own in `folder`."""
+    """Returns the PSM without linkage; writes its SDF into `folder`."""
     root = compose_sdf(ARM.sdf, ARM.mirrored_links)
     model = root.find("model")
     joints = {joint.get("name"): joint for joint in model.findall("joint")}
@@ -96,7 +96,7 @@ def open_arm(folder: Path) -> Arm:
 
 
 class StationRow:
-    """A station under control."""
+    """ArmStation with a controller."""
 
     def __init__(self, trajectory: PiecewisePolynomial, plant_arm: Arm, closure: str):
         builder = DiagramBuilder()
@@ -108,16 +108,16 @@ class StationRow:
         self.simulator = Simulator(self.diagram)
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
-        """Puts the arm at q, at rest."""
+        """Sets the arm to q (n,), at rest."""
         self.station.SetPositions(self.station.GetMyMutableContextFromRoot(root), q)
 
     def get_positions(self, root: Context) -> np.ndarray:
-        """Pose of the seven joints."""
+        """Returns the positions (7,) of the independent joints."""
         return self.station.GetPositions(self.station.GetMyContextFromRoot(root))
 
 
 class CenicRow:
-    """A continuous plant under control, or without it, with CENIC."""
+    """Continuous plant with CENIC, with or without a controller."""
 
     def __init__(
         self, trajectory: PiecewisePolynomial, closure: str, controlled: bool = True, fixed_step: bool = False
@@ -150,11 +150,11 @@ class CenicRow:
             integrator.set_fixed_step_mode(True)
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
-        """Puts the arm at q, at rest."""
+        """Sets the arm to q (n,), at rest."""
         set_arm_positions(self.plant, self.plant.GetMyMutableContextFromRoot(root), ARM, q)
 
     def get_positions(self, root: Context) -> np.ndarray:
-        """Pose of the seven joints."""
+        """Returns the positions (7,) of the independent joints."""
         context = self.plant.GetMyContextFromRoot(root)
         return np.array([self.plant.GetJointByName(name).GetOnePosition(context) for name in ARM.joint_names])
 
@@ -168,7 +168,7 @@ def add_control(builder: DiagramBuilder, trajectory: PiecewisePolynomial, state,
 
 
 def restart(row: StationRow | CenicRow, q: np.ndarray) -> None:
-    """Puts the arm at q and at rest, at time 0."""
+    """Sets the arm to q, at rest, and the time to 0."""
     root = row.simulator.get_mutable_context()
     root.SetTime(0.0)
     row.diagram.SetDefaultContext(root)
@@ -177,7 +177,7 @@ def restart(row: StationRow | CenicRow, q: np.ndarray) -> None:
 
 
 def steps_per_second(row: StationRow | CenicRow, start: np.ndarray, seconds: float) -> int:
-    """Simulates for so long; returns the number of the solver's steps per simulated second."""
+    """Simulates the motion and returns the number of solver steps per simulated second."""
     restart(row, start)
     before = row.simulator.get_integrator().get_num_steps_taken()
     row.simulator.AdvanceTo(seconds)
@@ -187,7 +187,7 @@ def steps_per_second(row: StationRow | CenicRow, start: np.ndarray, seconds: flo
 
 
 def closure_errors(row: StationRow | CenicRow, seconds: float) -> tuple[float, float]:
-    """Largest distances between the halves of a pin and of the remote centre from the base's origin [m]."""
+    """Returns the largest distances between the halves of a pin, and of the remote centre from the origin [m]."""
     plant, root = row.plant, row.simulator.get_context()
     pins, centre = 0.0, 0.0
     for time in np.linspace(0.0, seconds, 51)[1:]:
@@ -205,14 +205,14 @@ def closure_errors(row: StationRow | CenicRow, seconds: float) -> tuple[float, f
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE", help="write the numbers there too")
-    parser.add_argument("--repetitions", type=int, default=11)
+    parser.add_argument("--json", metavar="FILE", help="write the results to this file")
+    parser.add_argument("--repetitions", type=int, default=11, help="number of repetitions; default: %(default)s")
     parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of one repetition")
     arguments = parser.parse_args()
     trajectory = motion(arguments.seconds)
     start, end = (trajectory.value(time)[:, 0] for time in (0.0, arguments.seconds))
     rows: dict[str, StationRow | CenicRow] = {}
-    left_out: dict[str, str] = {}
+    omitted: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder:
         makers = {
             "open": lambda: StationRow(trajectory, open_arm(Path(folder)), "mimic"),
@@ -231,18 +231,18 @@ def main() -> None:
                 row.simulator.AdvanceTo(1e-3)
                 rows[name] = row
             except RuntimeError as error:
-                left_out[name] = str(error).splitlines()[0][:120]
+                omitted[name] = str(error).splitlines()[0][:120]
 
     errors, steps = {}, {}
     for name, row in rows.items():
         steps[name] = steps_per_second(row, start, arguments.seconds)
         if name not in ("open", "free_mimic"):
             off = np.abs(row.get_positions(row.simulator.get_context()) - end)
-            assert np.all(off < ARM.per_joint(0.02, 0.002)), f"{name} is not where it should be: {off}"
+            assert np.all(off < ARM.per_joint(0.02, 0.002)), f"Row {name} did not reach the end pose; errors: {off}"
             restart(row, start)
             errors[name] = closure_errors(row, arguments.seconds)
     for name in ("ball", "mimic"):
-        assert max(errors[name]) < 5e-8, f"{name} does not hold the linkage: {errors[name]} m"
+        assert max(errors[name]) < 5e-8, f"Row {name}: the closure errors are too large: {errors[name]} m"
 
     times = measured_times(
         {name: partial(row.simulator.AdvanceTo, arguments.seconds) for name, row in rows.items()},
@@ -252,8 +252,8 @@ def main() -> None:
     us = {name: 1e3 * float(np.median(values)) / arguments.seconds for name, values in times.items()}
     ratio = {name: median_ratio(times, name, "open") for name in rows}
     print_table(
-        f"drake {version('drake')}; PSM at 1 kHz, median of {arguments.repetitions}",
-        ["us per ms", "real-time factor", "time / open", "steps per s", "closure [m]", "remote centre [m]"],
+        f"PSM, drake {version('drake')}: CPU time per simulated ms, median of {arguments.repetitions} repetitions",
+        ["time [us]", "real-time factor", "ratio to open", "steps per s", "closure [m]", "remote centre [m]"],
         {
             name: (
                 f"{us[name]:.1f}",
@@ -266,8 +266,8 @@ def main() -> None:
             for name in rows
         },
     )
-    for name, reason in left_out.items():
-        print(f"  {name} left out: {reason}")
+    for name, reason in omitted.items():
+        print(f"  {name} omitted: {reason}")
     result = {
         "drake": version("drake"),
         "us_per_simulated_ms": us,

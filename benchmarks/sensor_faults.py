@@ -1,10 +1,18 @@
-"""Time until the guard detects wrong sensor data, and motion of the arm before and after the detection.
+"""Measures the time until the guard detects a sensor fault, and the motion of the arm before and after the detection.
 
     python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort position hold] [--processes 2]
 
-Each fault of tests/support/faulty_arm.py begins on each joint of a simulated arm with all effects of its file, while
-the joints move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or stand. Each fault begins at three
-instants of two motions; the largest values are printed.
+Each fault of tests/support/faulty_arm.py is simulated for each joint of an arm with all effects of its file. The joints
+move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or are at rest. Each fault begins at three times of
+two motions. The table has the largest values. Its columns are:
+
+    found       trials in which the guard detected the fault, and all trials
+    ms          largest time from the fault to its detection [ms]
+    before      largest motion of the joint from the fault to its detection [rad, dm]
+    after       largest motion of the joint after the detection [rad, dm]
+    speed       largest speed of any joint, from 50 ms after the detection on [rad/s, dm/s]
+    effort      largest effort of any joint after the detection, as a share of its limit
+    guard       message of the guard
 """
 
 from __future__ import annotations
@@ -22,12 +30,12 @@ from faulty_arm import FAULTS, PERIOD, FaultyArm
 
 from dvrk_drake.models.arm import load_arm
 
-#: When the fault begins [s] and the seed of the motion and the noise; all joints move then.
+#: Start time of the fault [s], at which all joints move, and seed of the motion and the noise.
 TRIALS = ((2.6, 0), (3.2, 1), (3.8, 0))
 
 
 class Trial:
-    """An arm in motion, at the instant before a fault."""
+    """Simulated arm at the time before a fault."""
 
     def __init__(self, name, use, begin, seed):
         self.begin, self.arm = begin, FaultyArm(name, use, seed=seed)
@@ -35,14 +43,14 @@ class Trial:
             self.arm.step()
 
     def outcome(self, task):
-        """Outcome of one (fault, joint); for a process of its own, which is a copy of the arm that moves."""
+        """Returns the outcome of one (fault, joint). Call this in a forked process, since it changes the arm."""
         return self.arm.fail(*task, self.begin)
 
 
 def print_table(title, arm, tasks, trials):
-    """Prints the worst values of each fault on each joint, and the counts; trials[k][i] is the outcome of tasks[i]."""
-    print(f"\n{title}. Largest of {len(trials)}. Movement in rad, of prismatic joints in dm; speed in rad/s, dm/s;")
-    print("effort / limit. `before`: from the fault to its detection; `after`: from then on.")
+    """Prints the largest values of each fault and joint, and a summary; trials[k][i] is the outcome of tasks[i]."""
+    print(f"\n{title}: largest values of {len(trials)} trials. Motion before and after the detection [rad, dm], speed")
+    print("[rad/s, dm/s] and effort as a share of the limit after the detection.")
     print(
         f"{'fault':18} {'joint':16} {'found':>5} {'ms':>5} {'before':>7} {'after':>6} {'speed':>6} {'effort':>6}  guard"
     )
@@ -61,22 +69,22 @@ def print_table(title, arm, tasks, trials):
     found = [(scale, o) for scale, o in flat if np.isfinite(o.detected)]
     median = 1e3 * np.median([o.detected for _, o in found])
     print(
-        f"{len(found)} of {len(flat)} detected, after {median:.0f} ms (median); of these "
-        f"{sum(scale * o.before <= 0.05 for scale, o in found)} moved at most 0.05 before, "
-        f"{sum(o.speed <= 0.5 for _, o in found)} at most 0.5/s after, "
-        f"{sum(o.effort <= 0.4 for _, o in found)} with at most 0.4 of the effort. "
-        f"{sum(scale * o.before > 0.05 for scale, o in flat if np.isinf(o.detected))} undetected moved more than 0.05",
+        f"{len(found)} of {len(flat)} faults detected, median time {median:.0f} ms. Of the detected faults, "
+        f"{sum(scale * o.before <= 0.05 for scale, o in found)} had before <= 0.05, "
+        f"{sum(o.speed <= 0.5 for _, o in found)} had speed <= 0.5, "
+        f"and {sum(o.effort <= 0.4 for _, o in found)} had effort <= 0.4. Of the undetected faults, "
+        f"{sum(scale * o.before > 0.05 for scale, o in flat if np.isinf(o.detected))} had before > 0.05.",
         flush=True,
     )
 
 
 def main():
-    """Prints the tables."""
+    """Prints one table per arm and use."""
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--arms", nargs="+", default=["mtml", "psm"])
-    parser.add_argument("--uses", nargs="+", default=["effort", "position", "hold"])
-    parser.add_argument("--faults", nargs="+", default=list(FAULTS))
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--arms", nargs="+", default=["mtml", "psm"], help="names of the arms; default: %(default)s")
+    parser.add_argument("--uses", nargs="+", default=["effort", "position", "hold"], help="uses to simulate")
+    parser.add_argument("--faults", nargs="+", default=list(FAULTS), help="sensor faults to simulate")
+    parser.add_argument("--processes", type=int, default=2, help="number of parallel processes; default: %(default)s")
     arguments = parser.parse_args()
     for name in arguments.arms:
         for use in arguments.uses:
@@ -84,19 +92,19 @@ def main():
             tasks = [(fault, joint) for fault in arguments.faults for joint in range(arm.num_joints)]
             outcomes = []
             for begin, seed in TRIALS[:1] if use == "hold" else TRIALS:
-                LAST.append(Trial(name, use, begin, seed))
+                TRIAL_HISTORY.append(Trial(name, use, begin, seed))
                 with multiprocessing.get_context("fork").Pool(arguments.processes, maxtasksperchild=1) as pool:
                     outcomes.append(pool.map(last_outcome, tasks, chunksize=1))
             print_table(f"{name}, {use}", arm, tasks, outcomes)
 
 
-#: The trials so far; a forked process takes the last one.
-LAST = []
+#: Trials so far. A forked process uses the last one.
+TRIAL_HISTORY = []
 
 
 def last_outcome(task):
-    """Outcome of a task in the last trial."""
-    return LAST[-1].outcome(task)
+    """Returns the outcome of a task in the last trial."""
+    return TRIAL_HISTORY[-1].outcome(task)
 
 
 if __name__ == "__main__":

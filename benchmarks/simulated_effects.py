@@ -1,16 +1,20 @@
-"""Time of a simulated step with each effect, as a ratio to the arm without effects.
+"""Measures the computing time of a simulation step with each effect of a real arm.
 
     python benchmarks/simulated_effects.py [--arm NAME] [--closure mimic|ball] [--repetitions N] [--json FILE]
 
-All rows simulate the same ArmStation at 1 kHz under GravityPidController ("hold"), which follows one slow cubic in all
-joints, so that friction slips and sticks. Rows: the ideal arm, the machinery of effects without any, each part alone,
-all that the arm's file states, and these with cables that stretch. No file states any of those, so here each actuator
-that can have one has one that gives STRETCH under the motor's largest effort. Repetitions are interleaved, so that a
-busy machine slows all rows alike; times are CPU time of this process, the least over the repetitions. `real time` is
-simulated time over CPU time.
+All rows simulate the same ArmStation at 1 kHz. A GravityPidController in mode "hold" moves all joints along a slow
+cubic trajectory, so that friction sticks and slips. Rows:
 
-A third of a step is memory allocation in Drake. A faster allocator is selected by LD_PRELOAD or GLIBC_TUNABLES, see
-docs/simulated_effects.md.
+    ideal               arm without effects
+    none                computation of effects without any effect
+    friction, ...       one effect of the arm's file
+    N cables stretch    elastic cables at N actuators; the files of the arms do not contain elastic cables
+    all                 all effects of the arm's file, without and with the elastic cables
+
+The repetitions of the rows alternate, so that other processes slow all rows equally. Times are CPU times of this
+process, minima over the repetitions. The real-time factor is simulated time divided by CPU time.
+
+The result depends on the memory allocator. To select a faster one, see docs/simulated_effects.md.
 """
 
 from __future__ import annotations
@@ -36,12 +40,12 @@ from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 SECONDS = 0.5
-#: Of a cable under the motor's largest effort [rad], and its damping over its stiffness [s].
+#: Elongation of a cable at the maximum effort of its motor [rad], and ratio of its damping to its stiffness [s].
 STRETCH, RELAXATION = 5e-3, 1e-3
 
 
 def with_cables(arm: Arm) -> ArmEffects:
-    """The arm's effects, and a cable that stretches at each actuator that turns one joint alone."""
+    """Returns the effects of the arm plus an elastic cable for each actuator that moves only one joint."""
     cables = {}
     for i, name in enumerate(arm.joint_names):
         if not arm.prismatic[i] and np.array_equal(joint_row(arm, f"actuator.{name}"), np.eye(arm.num_joints)[i]):
@@ -67,10 +71,15 @@ def start(arm: Arm, effects: ArmEffects | None, closure: Closure) -> Simulator:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arm", default="mtml")
-    parser.add_argument("--closure", default="mimic", choices=["mimic", "ball"])
-    parser.add_argument("--repetitions", type=int, default=7)
-    parser.add_argument("--json", default="")
+    parser.add_argument("--arm", default="mtml", help="name of the arm; default: %(default)s")
+    parser.add_argument(
+        "--closure",
+        default="mimic",
+        choices=["mimic", "ball"],
+        help="method for closing the loops of the linkage; default: %(default)s",
+    )
+    parser.add_argument("--repetitions", type=int, default=7, help="number of repetitions; default: %(default)s")
+    parser.add_argument("--json", default="", help="write the results to this file")
     args = parser.parse_args()
     arm = load_arm(args.arm)
     effects, stretching = arm.effects, with_cables(arm)
@@ -90,12 +99,12 @@ def main() -> None:
         prepare=lambda row: ready.update({row: start(arm, rows[row], args.closure)}),
     )
     best = {row: float(np.min(seconds)) for row, seconds in times.items()}
-    allocator = os.environ.get("LD_PRELOAD") or os.environ.get("GLIBC_TUNABLES") or "the system's"
+    allocator = os.environ.get("LD_PRELOAD") or os.environ.get("GLIBC_TUNABLES") or "of the system"
     print_table(
-        f"{arm.name}, {args.closure}; allocator: {allocator}",
-        ["us per step", "to ideal", "real time"],
+        f"{arm.name}, closure {args.closure}, allocator {allocator}: CPU time per step of 1 ms",
+        ["time [us]", "ratio to ideal", "real-time factor"],
         {
-            row: (f"{1e3 * seconds / SECONDS:.1f}", f"{seconds / best['ideal']:.2f}", f"{SECONDS / seconds:.1f} x")
+            row: (f"{1e3 * seconds / SECONDS:.1f}", f"{seconds / best['ideal']:.2f}", f"{SECONDS / seconds:.1f}")
             for row, seconds in best.items()
         },
     )

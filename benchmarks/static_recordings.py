@@ -1,9 +1,10 @@
-"""Our identification, the paper's and zero torque on the real static recordings: left-out poses and other recordings.
+"""Compares `identify`, the paper's method and zero torque on the static recordings of a real arm.
 
     python benchmarks/static_recordings.py FOLDER [--arm mtmr]
 
-FOLDER holds CSVs with q1..q7, tau1..tau7 (docs/public_recordings.md says where they come from); every one is used to
-identify, and all others to judge.
+FOLDER contains CSV files with q1..q7 and tau1..tau7 (docs/public_recordings.md). The script prints one table per file.
+The models are identified from this file and evaluated on its left-out poses and on all other files. "Zero" is the
+prediction of zero torque.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from dvrk_drake.recordings.recording import Recording, read_recording
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--arm", default="mtmr")
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
+    parser.add_argument("--arm", default="mtmr", help="name of the arm; default: mtmr")
     options = parser.parse_args()
     arm = load_arm(options.arm)
     recordings: dict[str, Recording] = {}
@@ -38,47 +39,45 @@ def main() -> int:
             recording.measured_effort()
             recordings[path.stem] = recording
         except RecordingError as error:
-            print(f"left out: {error}")
+            print(f"not evaluated: {error}")
     console = Console(width=130, highlight=False)
     for name, raw in recordings.items():
         ours = identify_static(raw, arm)
-        recording = ours.recording  # repeated poses averaged: both methods get the same
+        recording = ours.recording  # repeated poses are averaged, for both methods
         paper = identify_static(recording, arm, "paper")
         excluded = np.zeros(recording.q.shape, dtype=bool)
         for measurement in ours.excluded:
             excluded[measurement.row, list(measurement.joints)] = True
         table = Table(
-            title=escape(
-                f"from {name}, {len(raw)} rows, {len(recording)} poses: RMS error [N m] without excluded measurements"
-            ),
+            title=escape(f"identified from {name} ({len(raw)} rows, {len(recording)} poses): RMS torque error [N m]"),
             title_justify="left",
         )
-        for column in ("judged on", "by", *(f"J{i + 1}" for i in range(arm.num_joints))):
+        for column in ("evaluated on", "method", *(f"J{i + 1}" for i in range(arm.num_joints))):
             table.add_column(column, justify="right")
         tau = recording.measured_effort()
 
         def rms(values: np.ndarray, use: np.ndarray) -> list[str]:
             return [f"{np.sqrt(np.mean(values[use[:, j], j] ** 2)):.4f}" for j in range(values.shape[1])]
 
-        table.add_row("left-out poses", "zero", *rms(tau, ~excluded))
+        table.add_row("leave-one-out, without excluded", "zero", *rms(tau, ~excluded))
         table.add_row("", "paper", *rms(paper.leave_one_out_residuals, ~excluded))
         table.add_row("", "ours", *rms(ours.leave_one_out_residuals, ~excluded))
-        table.add_row("", "ours, ten-fold", *(f"{j.rms_cross_validation_included:.4f}" for j in ours.model.joints))
+        table.add_row("", "ours, 10-fold", *(f"{j.rms_cross_validation_included:.4f}" for j in ours.model.joints))
         everything = np.ones_like(excluded)
-        table.add_row("left-out, all", "zero", *rms(tau, everything))
+        table.add_row("leave-one-out, all", "zero", *rms(tau, everything))
         table.add_row("", "paper", *rms(paper.leave_one_out_residuals, everything))
         table.add_row("", "ours", *rms(ours.leave_one_out_residuals, everything))
         for other_name, other in recordings.items():
             if other_name == name:
                 continue
             by_ours, by_paper = validate_static(ours.model, other).joints, validate_static(paper.model, other).joints
-            table.add_row(other_name, "zero", *(f"{j.rms_torque_included:.4f}" for j in by_ours))
+            table.add_row(f"{other_name}, without excluded", "zero", *(f"{j.rms_torque_included:.4f}" for j in by_ours))
             table.add_row("", "paper", *(f"{j.rms_error_included:.4f}" for j in by_paper))
             table.add_row("", "ours", *(f"{j.rms_error_included:.4f}" for j in by_ours))
         console.print(table)
         effects = ", ".join(f"{ActuatorEffect.of(e)} {e.coefficient:+.3f}" for e in ours.model.effects)
         scales = ", ".join(f"{j.name} {j.feedforward_scale:.2f}" for j in ours.model.joints if j.feedforward_scale < 1)
-        console.print(f"effects chosen: {effects or 'none'}; feedforward scale below 1: {scales or 'none'}\n")
+        console.print(f"selected effects: {effects or 'none'}; feedforward scales below 1: {scales or 'none'}\n")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Times of functions side by side, and the tables and files in which the benchmarks give them."""
+"""Measures the times of functions alternately, and prints and writes the results of the benchmarks."""
 
 from __future__ import annotations
 
@@ -17,16 +17,19 @@ def measured_times(
     prepare: Callable[[str], object] | None = None,
     clock: Callable[[], float] = time.process_time,
 ) -> dict[str, NDArray[np.float64]]:
-    """Seconds (repetitions,) of each function, called in turn: a change of the machine's speed hits all alike.
+    """Calls all functions alternately, so that a change of the computer's speed affects all of them.
 
-    One call of each comes before, which fills caches and does not count.
+    Each function is called once before the measurement, to fill caches.
 
     Args:
-        functions: what to measure, by name.
-        repetitions: of all of them.
-        prepare: called with the name before each call; its time does not count.
-        clock: CPU time of this process, which other processes do not make longer; `time.perf_counter` is cheaper, for
-            functions of some microseconds.
+        functions: Functions by name.
+        repetitions: Number of measured calls of each function.
+        prepare: Function called with the name before each call. Its time is not included.
+        clock: Clock [s]. Default: CPU time of this process. `time.perf_counter` has a lower overhead and suits
+            functions that take some microseconds.
+
+    Returns:
+        Times (repetitions,) of each function [s], by name.
     """
     times: dict[str, list[float]] = {name: [] for name in functions}
     for repetition in range(repetitions + 1):
@@ -41,12 +44,12 @@ def measured_times(
 
 
 def median_ratio(times: Mapping[str, NDArray[np.float64]], name: str, reference: str) -> float:
-    """Median of the ratios within a repetition: what slows the machine for a moment slows both."""
+    """Returns the median over the repetitions of the time of `name` divided by the time of `reference`."""
     return float(np.median(times[name] / times[reference]))
 
 
 def print_table(title: str, headings: Sequence[str], rows: Mapping[str, Sequence[object]]) -> None:
-    """Prints a row for each name; numbers are printed as they are formatted by the caller."""
+    """Prints a title, the headings, and one row per name. The caller formats the numbers."""
     cells = [["", *headings], *([name, *map(str, row)] for name, row in rows.items())]
     widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
     print(title)
@@ -56,6 +59,6 @@ def print_table(title: str, headings: Sequence[str], rows: Mapping[str, Sequence
 
 
 def write_json(path: str | None, result: object) -> None:
-    """Writes the numbers there too, if a path is given."""
+    """Writes the result to a JSON file if a path is given."""
     if path:
         Path(path).write_text(json.dumps(result, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""Hold a simulated master arm at a pose: gravity feedforward + PID in a Drake Diagram, shown in Meshcat."""
+"""Regulates the pose of a simulated master arm with gravity feedforward and PID, and shows it in Meshcat."""
 
 import sys
 
@@ -16,8 +16,8 @@ station = dvrk.ArmStation(arm, meshcat=meshcat)
 dvrk.add_closed_loop(builder, station, dvrk.GravityPidController(model))
 simulator = Simulator(builder.Build())
 context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-station.SetPositions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
+station.SetPositions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # the controller regulates this pose
 simulator.AdvanceTo(2.0)
-print("holds", np.round(station.GetPositions(context), 4))
-if sys.stdin.isatty():  # the page ends with this script
-    input(f"{meshcat.web_url()} shows the arm; press Enter to end ")
+print("final positions [rad]", np.round(station.GetPositions(context), 4))
+if sys.stdin.isatty():  # the page exists only while this script runs
+    input(f"{meshcat.web_url()} shows the arm. Press Enter to end. ")

@@ -1,6 +1,6 @@
-"""Identify a real right master arm from a recording, as `dvrk-drake identify` does.
+"""Identifies a real right master arm from a recording, like `dvrk-drake identify`.
 
-python real_recording.py FILE.csv [MODEL.yaml]: without MODEL.yaml nothing is written.
+python real_recording.py FILE.csv [MODEL.yaml]: writes the model only if MODEL.yaml is given.
 """
 
 import sys
@@ -16,7 +16,7 @@ try:
         print(warning)
     for joint in result.model.joints:
         error, zero = joint.rms_leave_one_out_included, joint.rms_zero_torque_included
-        print(f"{joint.name:15} left-out error {error:.4f} N m, zero torque {zero:.4f} N m")
+        print(f"{joint.name:15} leave-one-out error {error:.4f} N m, without model {zero:.4f} N m")
     if len(sys.argv) == 3:
         result.save(sys.argv[2])
 except dvrk.DvrkDrakeError as error:

@@ -1,4 +1,4 @@
-"""A hand pulls the handle of a master arm that carries its own weight; the patient side arm follows, at a third."""
+"""Simulates teleoperation: a hand moves a master arm with gravity compensation, and a PSM follows at scale 1/3."""
 
 import sys
 
@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 import dvrk_drake as dvrk
 
 meshcat = dvrk.start_meshcat(camera=[1.7, 0.45, 0.5], target=[0, -0.12, 0.08])
-meshcat.SetTransform("mtml", RigidTransform([0, 0.45, 0.05]))  # where the bases stand [m]
+meshcat.SetTransform("mtml", RigidTransform([0, 0.45, 0.05]))  # positions of the bases [m]
 meshcat.SetTransform("psm", RigidTransform([0, -0.22, 0]))
 arms = dvrk.TeleoperatedArms(dvrk.load_arm("mtml"), dvrk.load_arm("psm"), scale=1 / 3, meshcat=meshcat)
 simulator = Simulator(arms)
@@ -28,5 +28,5 @@ for t in np.arange(0.1, 3.0, 0.01):  # the hand moves the handle up by 6 cm
 
 print("handle moved [mm]", np.round(1e3 * (arms.CalcX_MG(context).translation() - X_MG0.translation()), 2))
 print("tip moved    [mm]", np.round(1e3 * (arms.CalcX_FT(context).translation() - X_FT0.translation()), 2))
-if sys.stdin.isatty():  # the page ends with this script
-    input(f"{meshcat.web_url()} shows both arms; press Enter to end ")
+if sys.stdin.isatty():  # the page exists only while this script runs
+    input(f"{meshcat.web_url()} shows both arms. Press Enter to end. ")

@@ -1,4 +1,4 @@
-"""Fixtures of all tests."""
+"""Fixtures and markers shared by all tests."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from pathlib import Path
 import pytest
 from own_network import pytest_terminal_summary  # noqa: F401
 
-# Before numpy is imported. Matrices are small here, and each core has a worker already: more threads of BLAS only wait
-# for each other, and take two thirds more processor time.
+# Must be set before numpy is imported. The matrices are small and each core already has a test worker, so additional
+# BLAS threads only wait for each other.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 TESTS = Path(__file__).resolve().parent
 
-#: Folders and files of which CI runs one Python only: what they test uses nothing of Drake that differs between its
-#: versions. A name stands for all that begin with it.
+#: Prefixes of test files that CI runs with one Python version only, because they do not depend on the Drake version.
 ONE_PYTHON = (
     *("recordings/test_collection_file", "recordings/test_lcm_log", "recordings/test_pose_file"),
     *("recordings/test_recording", "recordings/test_conversion", "recordings/test_public_recordings_document"),
@@ -28,13 +27,13 @@ ONE_PYTHON = (
     "analysis/static/",
     *("experiments/test_reproduction", "experiments/study/", "experiments/test_transparency"),
     "experiments/test_tuning",
-    *("processes/test_collector", "processes/test_leg", "processes/test_live_line", "processes/test_teacher"),
+    *("processes/test_collector", "processes/test_trajectory", "processes/test_live_line", "processes/test_teacher"),
     "cli/test_collect",
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the tests of these files, and puts files with slow tests first: then both workers end at about one time."""
+    """Marks the tests in `ONE_PYTHON`, and runs files with slow tests first, which balances the load of workers."""
     for item in items:
         if item.path.relative_to(TESTS).as_posix().startswith(ONE_PYTHON):
             item.add_marker("one_python")
@@ -44,9 +43,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Recordings of real arms, which are not part of the project: `<repository>/../shared/data`.
+    """Returns the folder with recordings of real arms, which are not part of the repository.
 
-    The environment variable DVRK_DRAKE_SHARED names another place of `shared`.
+    The default is `<repository>/../shared/data`. The environment variable DVRK_DRAKE_SHARED replaces `shared`.
     """
     default = TESTS.parents[1] / "shared"
     data = Path(os.environ.get("DVRK_DRAKE_SHARED", default)) / "data"

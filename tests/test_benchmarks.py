@@ -1,4 +1,4 @@
-"""Input and timing of the benchmarks: public recordings in their own coordinates, and alternating runs."""
+"""Tests of the benchmarks: reading of public recordings, timing and tables."""
 
 import importlib.util
 
@@ -21,7 +21,7 @@ def benchmark():
     return load_script("dynamic_recordings")
 
 
-def test_functions_are_measured_in_turn_without_the_first_call():
+def test_functions_are_timed_alternately_after_a_warm_up():
     timing = load_script("timing")
     calls, clock = [], iter(range(100))
     functions = {name: lambda name=name: calls.append(name) for name in ("a", "b")}
@@ -32,7 +32,7 @@ def test_functions_are_measured_in_turn_without_the_first_call():
     assert {name: len(values) for name, values in times.items()} == {"a": 2, "b": 2}
 
 
-def test_ratio_is_within_each_repetition():
+def test_ratio_is_computed_for_each_repetition():
     timing = load_script("timing")
     times = {"ours": np.array([1.0, 2.0, 30.0]), "peer": np.array([2.0, 4.0, 60.0])}
     assert timing.median_ratio(times, "ours", "peer") == 0.5
@@ -50,7 +50,7 @@ def test_table_columns_are_aligned(capsys):
     ]
 
 
-def test_a_recording_that_is_not_there_is_one_line(benchmark, tmp_path):
+def test_missing_recording_gives_one_line(benchmark, tmp_path):
     with pytest.raises(SystemExit, match=r"none\.csv: no such file"):
         benchmark.read_public(tmp_path / "none.csv", load_arm("mtmr"))
 

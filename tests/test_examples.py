@@ -1,4 +1,4 @@
-"""Every script of examples/ runs, writes only to given paths, and names no page that is gone."""
+"""The scripts in examples/ run, and write only to given paths."""
 
 import os
 import pty
@@ -17,7 +17,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording, write_recording
 
 EXAMPLES = ROOT / "examples"
-SHOWS_A_PAGE = ["hold_an_arm.py", "teleoperation.py"]
+PAGE_SCRIPTS = ["hold_an_arm.py", "teleoperation.py"]
 
 
 def run(folder, *command):
@@ -32,23 +32,23 @@ def run(folder, *command):
     )
 
 
-def test_every_script_is_tested():
+def test_all_scripts_are_tested():
     assert {path.name for path in EXAMPLES.glob("*.py")} == {
-        *SHOWS_A_PAGE,
+        *PAGE_SCRIPTS,
         "real_recording.py",
         "regressor_in_numpy.py",
     }
 
 
 @pytest.mark.parametrize("script", sorted(path.name for path in EXAMPLES.glob("*.py")))
-def test_a_script_has_one_import_of_ours(script):
+def test_scripts_import_only_the_public_api(script):
     lines = (EXAMPLES / script).read_text().splitlines()
     assert [line for line in lines if "import" in line and "dvrk_drake" in line] == ["import dvrk_drake as dvrk"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", [*SHOWS_A_PAGE, "regressor_in_numpy.py"])
-def test_a_script_writes_nothing_and_names_no_dead_page(script, tmp_path):
+@pytest.mark.parametrize("script", [*PAGE_SCRIPTS, "regressor_in_numpy.py"])
+def test_scripts_write_no_files_and_print_no_dead_links(script, tmp_path):
     done = run(tmp_path, script)
     assert done.returncode == 0, done.stderr
     assert done.stdout and "http" not in done.stdout
@@ -56,31 +56,31 @@ def test_a_script_writes_nothing_and_names_no_dead_page(script, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_page_lives_until_enter_on_a_terminal(tmp_path):
-    ours, theirs = pty.openpty()
+def test_page_is_served_until_enter_on_a_terminal(tmp_path):
+    controller, terminal = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, EXAMPLES / "hold_an_arm.py"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,  # Python writes the prompt of input() there
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,  # Python writes the prompt of input() to stderr
     )
-    os.close(theirs)
+    os.close(terminal)
     printed = b""
     while b"press Enter" not in printed:
-        printed += os.read(ours, 1000)
+        printed += os.read(controller, 1000)
     address = re.search(rb"http://\S+", printed).group().decode()
     with urllib.request.urlopen(address) as page:
         assert page.status == 200
     assert process.poll() is None
-    os.write(ours, b"\n")
+    os.write(controller, b"\n")
     assert process.wait() == 0
-    os.close(ours)
+    os.close(controller)
 
 
 @pytest.mark.slow
-def test_the_model_is_written_where_the_user_says(tmp_path):
+def test_model_is_written_to_the_given_path(tmp_path):
     arm, generator = load_arm("mtmr"), np.random.default_rng(0)
     model = compile_static_model(arm)
     q = arm.sample_poses(40, generator, margin=0.05)

@@ -1,4 +1,4 @@
-"""Damaged files: every reader, and every command that takes a file, accepts them or ends with one line of error."""
+"""Fuzz tests: readers and commands accept a damaged file or reject it with one error line."""
 
 from __future__ import annotations
 
@@ -44,22 +44,22 @@ from dvrk_drake.recordings.conversion import convert
 from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, save_poses
 from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
-#: How many times as many examples as CI runs; more than 1 draws new ones each time.
-MORE = int(os.environ.get("DVRK_DRAKE_FUZZ", "1"))
-#: Processor time [s] that one file may take.
-MAX_LENGTH = 20
+#: Factor of the number of examples. With a factor above 1, each run draws new examples.
+EXAMPLE_FACTOR = int(os.environ.get("DVRK_DRAKE_FUZZ", "1"))
+#: Maximum CPU time for one file [s].
+MAX_CPU_TIME = 20
 
 
 @contextmanager
-def hang_is_an_error():
-    """Raises TimeoutError in a block that takes more than MAX_LENGTH seconds of the processor, or waits for minutes."""
+def time_limit():
+    """Raises TimeoutError if the block needs more than MAX_CPU_TIME, or ten times as much wall-clock time."""
 
     def stop(*_):
-        raise TimeoutError(f"took longer than {MAX_LENGTH} s")
+        raise TimeoutError(f"took longer than {MAX_CPU_TIME} s")
 
     before = [signal.signal(number, stop) for number in (signal.SIGPROF, signal.SIGALRM)]
-    signal.setitimer(signal.ITIMER_PROF, MAX_LENGTH)
-    signal.setitimer(signal.ITIMER_REAL, 10 * MAX_LENGTH)
+    signal.setitimer(signal.ITIMER_PROF, MAX_CPU_TIME)
+    signal.setitimer(signal.ITIMER_REAL, 10 * MAX_CPU_TIME)
     try:
         yield
     finally:
@@ -70,7 +70,7 @@ def hang_is_an_error():
 
 
 def write_arm(folder: Path) -> None:
-    """The PSM as files of one's own: arm.yaml, mechanism.yaml, instrument.yaml, arm.sdf, instrument.sdf."""
+    """Writes the PSM as user files: arm.yaml, mechanism.yaml, instrument.yaml, mechanism.sdf, instrument.sdf."""
     arm = (MODELS_FOLDER / "arms/psm.yaml").read_text()
     arm = arm.replace("mechanism: psm", "mechanism: mechanism.yaml")
     (folder / "arm.yaml").write_text(arm.replace("instrument: large_needle_driver", "instrument: instrument.yaml"))
@@ -85,7 +85,7 @@ def write_arm(folder: Path) -> None:
 
 
 def dynamic_model() -> IdentifiedModel:
-    """A model of a PSM with dynamics, friction and effects of position."""
+    """Returns a PSM model with dynamics, friction and position-dependent effects."""
     arm = load_arm("psm")
     kinds = [("viscous", 0.0), ("coulomb", 0.1), ("presliding", 0.02), ("cable sine", 1.0), ("spring", 0.4)]
     effects = [DriveEffect(f"actuator.{arm.joint_names[0]}", kind, scale, 0.1) for kind, scale in kinds]
@@ -121,7 +121,7 @@ GAINS = "kp: [1, 2, 3, 4, 5, 6, 7]\nkd: [1, 1, 1, 1, 1, 1, 1]\nki: [0, 0, 0, 0, 
 
 
 def write_valid_files(folder: Path) -> None:
-    """One small valid file of each kind that a reader takes."""
+    """Writes one small valid file of each kind."""
     psm, mtml = load_arm("psm"), load_arm("mtml")
     write_arm(folder)
     model = IdentifiedModel.from_arm(mtml)
@@ -166,7 +166,7 @@ def read_results(path: Path) -> None:
         pass
 
 
-#: File that is damaged -> its kind, how many damages, and what reads it (the file, or the one that names it).
+#: Mapping from a damaged file to its kind, the number of damages, and the function that reads it.
 READERS = {
     "mtml.yaml": ("yaml", 200, IdentifiedModel.load),
     "psm.yaml": ("yaml", 150, IdentifiedModel.load),
@@ -204,22 +204,22 @@ def valid(tmp_path_factory):
 
 
 def fuzz(count: int, strategy: st.SearchStrategy[bytes], test) -> None:
-    """Runs `test` with `count` different draws, the same ones each time unless MORE is above 1."""
+    """Runs `test` with `count` different examples. They are the same in each run unless EXAMPLE_FACTOR is above 1."""
     tested: set[int] = set()
 
     def test_if_new(content: bytes) -> None:
-        # What failed is drawn again.
-        if hash(content) in tested or len(tested) == count * MORE:
+        # Hypothesis repeats failed examples, so these are not in `tested`.
+        if hash(content) in tested or len(tested) == count * EXAMPLE_FACTOR:
             return
         test(content)
         tested.add(hash(content))
 
     run = given(strategy)(test_if_new)
     options = settings(
-        max_examples=2 * count * MORE,
+        max_examples=2 * count * EXAMPLE_FACTOR,
         deadline=None,
         database=None,
-        derandomize=MORE == 1,
+        derandomize=EXAMPLE_FACTOR == 1,
         suppress_health_check=list(HealthCheck),
         phases=(Phase.generate, Phase.shrink),
     )
@@ -231,7 +231,7 @@ _numbers = itertools.count()
 
 @contextmanager
 def damaged_copy(valid: Path, name: str, content: bytes):
-    """A new folder with the valid files, one of them damaged; yields that one, and removes the folder."""
+    """Yields the path of a damaged file in a temporary folder that contains all other valid files."""
     folder = valid.parent / f"{valid.name}-{os.getpid()}-{next(_numbers)}"
     folder.mkdir()
     for path in valid.iterdir():
@@ -249,17 +249,17 @@ def damaged_copy(valid: Path, name: str, content: bytes):
 
 
 def check_reader(valid: Path, name: str, content: bytes) -> None:
-    """Fails unless the reader of a file takes this content, or refuses it with an error of ours, soon."""
-    with damaged_copy(valid, name, content) as path, hang_is_an_error():
+    """Fails unless the reader accepts the content or raises a DvrkDrakeError within the time limit."""
+    with damaged_copy(valid, name, content) as path, time_limit():
         try:
             READERS[name][2](path)
-        except DvrkDrakeError as refusal:
-            assert str(refusal)
+        except DvrkDrakeError as error:
+            assert str(error)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
-def test_a_damaged_file_is_read_or_refused(name, valid):
+def test_damaged_file_is_read_or_rejected(name, valid):
     kind, count, read = READERS[name]
     content = (valid / name).read_bytes()
     with damaged_copy(valid, name, content) as path:
@@ -270,7 +270,7 @@ def test_a_damaged_file_is_read_or_refused(name, valid):
     fuzz(count, damaged(kind, content), lambda damage: check_reader(valid, name, damage))
 
 
-#: What a command does for long, or with an arm that is not there, once it has read its files.
+#: Functions that take long or require an arm. Commands call them after reading their files.
 WORK = (
     "dvrk_drake.processes.lcm_network.open_lcm",
     "dvrk_drake.experiments.tuning.tuning.tune_arm",
@@ -279,7 +279,7 @@ WORK = (
     "dvrk_drake.analysis.identification.identify_dynamic",
     "dvrk_drake.analysis.payload.payload.estimate_payload",
 )
-#: Command with its options -> the files that are damaged, in turn; its outputs begin with "out".
+#: Mapping from a command to the files that are damaged one after the other. Output names begin with "out".
 COMMANDS = {
     "model --arm arm.yaml --format python --output out.py": (
         "arm.yaml",
@@ -323,28 +323,28 @@ COMMANDS = {
 
 @pytest.fixture(scope="module")
 def short_work():
-    """Commands end where their long work would begin; a simulation takes 20 ms."""
+    """Makes commands stop before their long work, and shortens simulations to 20 ms."""
 
-    def cut(*_, **__):
-        raise DvrkDrakeError("its work is left out")
+    def skip(*_, **__):
+        raise DvrkDrakeError("the work is skipped in this test")
 
     with pytest.MonkeyPatch.context() as patch:
         for name in WORK:
-            patch.setattr(name, cut)
+            patch.setattr(name, skip)
         simulation = importlib.import_module("dvrk_drake.experiments.simulation")
         simulate = simulation.simulate
 
-        def briefly(scenario, **rest):
+        def simulate_briefly(scenario, **rest):
             brief = replace(scenario, duration=0.02, sample_period=0.01, targets=[])
             brief.check()
             return simulate(brief, **rest)
 
-        patch.setattr(simulation, "simulate", briefly)
+        patch.setattr(simulation, "simulate", simulate_briefly)
         yield
 
 
 def check_whole(path: Path) -> None:
-    """Fails unless a file that a command wrote ends where it should."""
+    """Fails unless an output file is complete."""
     text = path.read_text()
     if path.suffix == ".json":
         json.loads(text)
@@ -362,8 +362,8 @@ def check_whole(path: Path) -> None:
 
 
 def check_command(valid: Path, command: str, name: str, content: bytes) -> None:
-    """Fails unless a command with a damaged file ends in order and soon, and what it wrote is whole."""
-    with damaged_copy(valid, name, content) as path, hang_is_an_error(), redirect_stdout(io.StringIO()):
+    """Fails unless a command with a damaged file exits cleanly within the time limit, with complete output files."""
+    with damaged_copy(valid, name, content) as path, time_limit(), redirect_stdout(io.StringIO()):
         folder, errors = path.parent, io.StringIO()
         with redirect_stderr(errors):
             code = main(command.split())
@@ -373,7 +373,7 @@ def check_command(valid: Path, command: str, name: str, content: bytes) -> None:
         new = {path.name for path in folder.iterdir()} - {path.name for path in valid.iterdir()}
         assert all(name.startswith("out") for name in new), new
         for output in new - {"out_meshes"}:
-            # `check` writes what it found of a recording that it refuses.
+            # `check` also writes its findings for a recording that it rejects.
             assert code == 0 or command.startswith("check"), f"{output} was written although the command failed"
             check_whole(folder / output)
         for untouched in valid.iterdir():
@@ -383,12 +383,12 @@ def check_command(valid: Path, command: str, name: str, content: bytes) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_command_ends_in_order_with_a_damaged_file(command, valid, short_work):
+def test_command_exits_cleanly_with_a_damaged_file(command, valid, short_work):
     for name in COMMANDS[command]:
         content = (valid / name).read_bytes()
         kind = READERS[name][0]
         test = functools.partial(check_command, valid, command, name)
-        # The equations of an arm of one's own are derived anew each time.
+        # The equations of a user-defined arm are derived anew in each run.
         is_quick = not any(word.startswith("arm.yaml") for word in command.replace("=", " ").split())
         if is_quick:
             test(content)

@@ -1,11 +1,11 @@
-"""Packages import in one direction: descriptions of arms at the bottom, the command line on top."""
+"""Packages import in one direction: `models` is the lowest package, `cli` the highest."""
 
 import ast
 
 import pytest
 from repository import ROOT
 
-#: What each package may import beside itself and `COMMON`; the picture is in docs/packages.md.
+#: Packages that each package may import, besides itself and `COMMON`. docs/packages.md has a diagram.
 ALLOWED = {
     "models": set(),
     "recordings": {"models"},
@@ -18,7 +18,7 @@ ALLOWED = {
 }
 ALLOWED["reports"] = ALLOWED.keys() - {"reports"}
 ALLOWED["cli"] = ALLOWED.keys() - {"cli"}
-#: What every package may import, and what imports no package: errors, progress, generated messages.
+#: Modules that every package may import and that import no package.
 COMMON = {"errors", "progress", "lcmtypes"}
 PACKAGE = ROOT / "dvrk_drake"
 MODULES = {
@@ -28,7 +28,7 @@ MODULES = {
 
 
 def imports_of(source: str) -> set[str]:
-    """Names of all modules that a source imports anywhere: at its top, in functions, under TYPE_CHECKING."""
+    """Returns the names of all modules that a source imports, also in functions and under TYPE_CHECKING."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -40,18 +40,18 @@ def imports_of(source: str) -> set[str]:
 
 
 def package_of(module: str) -> str:
-    """`models` of `dvrk_drake.models.arm`; "" of `dvrk_drake` itself."""
+    """Returns the package of a module: "models" for `dvrk_drake.models.arm`, "" for `dvrk_drake`."""
     return module.partition(".")[2].partition(".")[0]
 
 
-def test_every_package_has_its_place():
+def test_all_packages_are_listed():
     packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
     modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
     assert packages | modules == ALLOWED.keys() | COMMON
 
 
 @pytest.mark.parametrize("package", sorted(ALLOWED.keys() | COMMON))
-def test_package_imports_only_what_is_below_it(package):
+def test_package_imports_only_allowed_packages(package):
     allowed = {package} if package in COMMON else {package, *ALLOWED[package], *COMMON}
     wrong = [
         f"{module} imports {name}"
@@ -63,7 +63,7 @@ def test_package_imports_only_what_is_below_it(package):
     assert not wrong, "\n".join(sorted(wrong))
 
 
-def test_imports_are_found_wherever_they_are():
+def test_finds_imports_at_all_places():
     source = """
 import numpy, dvrk_drake.models.arm
 from dvrk_drake.cli import main

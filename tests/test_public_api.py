@@ -1,4 +1,4 @@
-"""The public API: one import that loads nothing, documented names whose examples run, and README's example."""
+"""Tests of the public API: fast import, documented names with examples, and the example in the README."""
 
 import ast
 import dataclasses
@@ -16,12 +16,12 @@ import dvrk_drake as dvrk
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
-#: Packages that take long to import.
+#: Packages with a slow import.
 SLOW = {"pydrake", "numba", "numpy", "scipy", "sympy", "matplotlib", "rich", "yaml"}
 
 
 def loaded_by(code: str) -> set[str]:
-    """Names of all modules that a process of its own has loaded after `code`."""
+    """Returns the names of all modules that a new process has loaded after `code`."""
     done = subprocess.run(
         [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"],
         cwd=ROOT,
@@ -32,18 +32,18 @@ def loaded_by(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_the_import_loads_nothing_else():
+def test_import_loads_no_submodules():
     loaded = loaded_by("import dvrk_drake; assert 'identify' in dir(dvrk_drake)")
     assert "dvrk_drake" in loaded and not loaded & SLOW
     assert not {name for name in loaded if name.startswith("dvrk_drake.")}
 
 
-def test_a_name_loads_only_what_it_needs():
+def test_name_loads_only_required_packages():
     loaded = loaded_by("import dvrk_drake; dvrk_drake.Recording")
     assert "numba" not in loaded and "matplotlib" not in loaded
 
 
-def test_names_are_the_same_for_type_checkers_and_at_run_time():
+def test_type_checkers_see_the_run_time_names():
     tree = ast.parse((ROOT / "dvrk_drake/__init__.py").read_text())
     typed = next(node for node in tree.body if isinstance(node, ast.If))
     modules = {alias.name: node.module for node in typed.body for alias in node.names}
@@ -53,27 +53,27 @@ def test_names_are_the_same_for_type_checkers_and_at_run_time():
     assert not packages & set(modules), "a module would hide the function"
 
 
-def test_an_unknown_name_is_named():
+def test_unknown_name_is_in_the_error():
     with pytest.raises(AttributeError, match="'dvrk_drake' has no attribute 'identifi'"):
         dvrk.identifi  # noqa: B018
 
 
 @pytest.mark.parametrize("name", dvrk.__all__)
-def test_the_example_of_a_name_runs(name, tmp_path, monkeypatch):
+def test_docstring_example_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     value = getattr(dvrk, name)
     tests = doctest.DocTestFinder(recurse=False).find(value, name, module=False)
     examples = [example for test in tests for example in test.examples]
     assert examples and examples[0].source.startswith("import dvrk_drake as dvrk")
-    said = []
+    failures = []
     for test in tests:
-        doctest.DocTestRunner().run(test, out=said.append)
-    assert not said, "".join(said)
+        doctest.DocTestRunner().run(test, out=failures.append)
+    assert not failures, "".join(failures)
 
 
 @pytest.fixture(scope="module")
 def poses():
-    """An arm, the model that its SDF states, and a recording of 40 poses that the model holds."""
+    """Returns an arm, its nominal model, and a recording of 40 static poses with the holding torque of the model."""
     arm, generator = dvrk.load_arm("mtmr"), np.random.default_rng(0)
     model = dvrk.IdentifiedModel.from_arm(arm)
     q = arm.sample_poses(40, generator, margin=0.05)
@@ -81,7 +81,7 @@ def poses():
     return arm, model, dvrk.Recording(q=q, tau=tau, source="poses.csv", sha256="1" * 64)
 
 
-def test_a_refusal_has_its_findings(poses):
+def test_error_contains_the_findings(poses):
     arm, _, recording = poses
     opposite = dataclasses.replace(recording, tau=-recording.tau)
     with pytest.raises(dvrk.DvrkDrakeError, match=r"poses\.csv: refused") as refused:
@@ -90,7 +90,7 @@ def test_a_refusal_has_its_findings(poses):
     assert str(refused.value.findings[0].what) in str(refused.value)
 
 
-def test_warnings_are_of_the_recording_and_of_the_result(poses):
+def test_warnings_are_from_recording_and_result(poses):
     arm, _, recording = poses
     tau = recording.tau.copy()
     tau[:, 6] = 0.0
@@ -98,11 +98,11 @@ def test_warnings_are_of_the_recording_and_of_the_result(poses):
     assert ("no effort", "wrist_roll") in {(warning.kind, warning.where) for warning in result.warnings}
     errors = dvrk.validate(result.model, recording)
     assert [warning.kind for warning in errors.warnings] == ["same recording"]
-    with pytest.raises(dvrk.DvrkDrakeError, match="not identified from"):
+    with pytest.raises(dvrk.DvrkDrakeError, match="was identified from this recording"):
         errors.save("model.yaml")
 
 
-def test_progress_names_the_steps_in_order(poses):
+def test_progress_reports_the_steps_in_order(poses):
     arm, _, recording = poses
     steps = []
     dvrk.identify(recording, arm, progress=lambda step, share: steps.append((step, share)))
@@ -112,21 +112,21 @@ def test_progress_names_the_steps_in_order(poses):
         assert shares == sorted(shares) and shares[0] == 0.0 and 0.9 < shares[-1] <= 1.0
 
 
-def test_a_result_replaces_a_file_only_on_request(poses, tmp_path):
+def test_result_replaces_a_file_only_on_request(poses, tmp_path):
     arm, model, recording = poses
     result = dvrk.identify(recording, arm, method="paper")
     result.save(tmp_path / "model.yaml")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml: exists already; .* overwrite=True"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml already exists\. .* overwrite=True"):
         result.save(tmp_path / "model.yaml")
     result.save(tmp_path / "model.yaml", overwrite=True)
     dvrk.export_model(model, tmp_path / "arm.urdf")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf: exists already"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf already exists"):
         dvrk.export_model(model, tmp_path / "arm.urdf")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: its format is not clear; state one of sdf, urdf"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: the format is not given; give one of sdf, urdf"):
         dvrk.export_model(model, tmp_path / "arm.xml")
 
 
-def test_verdicts_are_stored_and_not_replaced_unasked(poses, tmp_path):
+def test_verdicts_are_stored_and_not_replaced_by_default(poses, tmp_path):
     _, model, recording = poses
     dvrk.validate(model, recording).save(tmp_path / "model.yaml")
     stored = dvrk.IdentifiedModel.load(tmp_path / "model.yaml")
@@ -135,8 +135,8 @@ def test_verdicts_are_stored_and_not_replaced_unasked(poses, tmp_path):
         dvrk.validate(stored, recording).save(tmp_path / "model.yaml")
 
 
-def test_the_model_of_an_arms_files_has_its_dynamics(tmp_path):
-    """At rest it holds what the static model holds; a motion under it has the efforts of the simulated arm."""
+def test_nominal_model_has_the_dynamics_of_the_arm(tmp_path):
+    """The model predicts the holding torques of the static model, and the efforts of a simulated motion."""
     arm = dvrk.load_arm("psm")
     model = dvrk.IdentifiedModel.from_arm(arm, dynamics=True)
     model.save(tmp_path / "psm.yaml")
@@ -157,21 +157,21 @@ def test_the_model_of_an_arms_files_has_its_dynamics(tmp_path):
     assert np.corrcoef(predicted[200:-200, 1], run.recording.tau[200:-200, 1])[0, 1] > 0.99
 
 
-def test_a_simulation_takes_a_system_or_a_scenario(poses):
+def test_simulates_a_system_or_a_scenario(poses):
     arm, model, _ = poses
-    limp = LimpController(arm.num_joints)
-    falls = dvrk.simulate(arm, controller=limp, effects=False, duration=0.3)
+    controller = ZeroEffortController(arm.num_joints)
+    falls = dvrk.simulate(arm, controller=controller, effects=False, duration=0.3)
     assert falls.desired is None and np.all(falls.recording.tau == 0) and np.abs(falls.recording.q[-1]).max() > 0.05
     controller = dvrk.GravityPidController(model)
     start = [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5]
     held = dvrk.simulate(arm, controller=controller, effects=False, duration=0.3, start=start)
     np.testing.assert_allclose(held.recording.q[-1], start, atol=1e-3)
-    with pytest.raises(dvrk.DvrkDrakeError, match="a scenario states duration itself"):
+    with pytest.raises(dvrk.DvrkDrakeError, match="`duration` cannot be given with a scenario"):
         dvrk.simulate(dvrk.load_scenario("mtmr"), duration=1.0)
 
 
-class LimpController(LeafSystem):
-    """Commands no effort."""
+class ZeroEffortController(LeafSystem):
+    """Controller that commands zero effort."""
 
     def __init__(self, n):
         super().__init__()
@@ -184,7 +184,7 @@ def readme_example() -> str:
     return example
 
 
-def test_the_readme_example_is_short_and_has_one_import():
+def test_readme_example_is_short_and_has_one_import():
     statements = ast.parse(readme_example()).body
     assert len([node for node in ast.walk(ast.Module(statements, [])) if isinstance(node, ast.stmt)]) <= 12
     assert [ast.unparse(n) for n in statements if isinstance(n, ast.Import | ast.ImportFrom)] == [
@@ -192,7 +192,7 @@ def test_the_readme_example_is_short_and_has_one_import():
     ]
 
 
-def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
+def test_readme_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arm, generator = dvrk.load_arm("mtmr"), np.random.default_rng(0)
     model = dvrk.IdentifiedModel.from_arm(arm)
@@ -221,40 +221,43 @@ def exact():
         ({"coordinates": "Joint"}, 'poses.csv: coordinates is "Joint"; allowed: joint, actuator'),
     ],
 )
-def test_a_recording_is_checked_when_it_is_made(exact, change, message):
+def test_recording_is_checked_on_creation(exact, change, message):
     with pytest.raises(RecordingError, match=message):
         dataclasses.replace(exact[1], **change)
 
 
 @pytest.mark.parametrize("name", ["q", "tau"])
-def test_a_number_that_is_none_is_refused_with_its_row(exact, name):
+def test_nan_is_rejected_with_its_row(exact, name):
     arm, recording = exact
     values = getattr(recording, name).copy()
     values[3, 1] = np.nan
-    with pytest.raises(RecordingError, match=rf"poses.csv: row 4: {name}2 = nan is no reading of an arm"):
+    with pytest.raises(RecordingError, match=rf"poses.csv, row 4: {name}2 = nan is not plausible"):
         dvrk.identify(dataclasses.replace(recording, **{name: values}), arm)
 
 
-def test_an_unknown_method_is_refused(exact):
+def test_rejects_an_unknown_method(exact):
     with pytest.raises(DvrkDrakeError, match='method is "pape"; allowed: robust, paper'):
         dvrk.identify(exact[1], exact[0], method="pape")
 
 
-def test_what_cannot_be_simulated_is_refused():
+def test_rejects_invalid_simulation_arguments():
     arm = dvrk.load_arm("mtml")
     for controller, message in (
-        ("m.yaml", "controller is a str; allowed: an IdentifiedModel"),
-        (dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")), "controller is a model of MTMR, not of MTML"),
+        ("m.yaml", "`controller` is a str; allowed: an IdentifiedModel"),
+        (
+            dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")),
+            "`controller` is a model of MTMR, but the simulated arm is MTML",
+        ),
     ):
         with pytest.raises(DvrkDrakeError, match=message):
             dvrk.simulate(arm, controller=controller)
-    with pytest.raises(DvrkDrakeError, match="what is a str; allowed: an Arm"):
+    with pytest.raises(DvrkDrakeError, match="`what` is a str; allowed: an Arm"):
         dvrk.simulate("mtml")
     with pytest.raises(DvrkDrakeError, match="unknown effect frictions"):
         dvrk.simulate(arm, effects="frictions")
 
 
-def test_an_arm_file_that_changed_is_read_again(tmp_path):
+def test_changed_arm_file_is_read_again(tmp_path):
     path = tmp_path / "own.yaml"
     text = (MODELS_FOLDER / "arms" / "mtmr.yaml").read_text()
     path.write_text(text)
@@ -264,7 +267,7 @@ def test_an_arm_file_that_changed_is_read_again(tmp_path):
     assert (first.name, dvrk.load_arm(path).name) == ("MTMR", "OTHER")
 
 
-def test_verdicts_replace_no_other_file(exact, tmp_path):
+def test_verdicts_do_not_replace_other_files(exact, tmp_path):
     arm, recording = exact
     result = dvrk.identify(recording, arm)
     own, other = tmp_path / "own.yaml", tmp_path / "other.csv"
@@ -273,7 +276,7 @@ def test_verdicts_replace_no_other_file(exact, tmp_path):
     q = arm.sample_poses(40, np.random.default_rng(1))
     tau = dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
     validation = dvrk.validate(result.model, dvrk.Recording(q=q, tau=tau, source="others.csv"))
-    with pytest.raises(DvrkDrakeError, match="exists already"):
+    with pytest.raises(DvrkDrakeError, match="already exists"):
         validation.save(other)
     assert other.read_text() == "mine"
     validation.save(own)

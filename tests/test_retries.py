@@ -1,4 +1,4 @@
-"""Tests over UDP that fail: watchdogs, and all while the computer stands still, run again and are counted."""
+"""Failed UDP tests are repeated and counted: watchdog tests, and all tests during a standstill of the computer."""
 
 import os
 import re
@@ -17,7 +17,7 @@ import own_network
 from own_network import inside, outside, run_inside, watchdog
 
 own_network.unshare, own_network.NETWORK = lambda: ["env"], "true"
-own_network.STANDSTILL = {standstill}
+own_network.STALL_TIME = {standstill}
 
 
 @outside
@@ -26,7 +26,7 @@ def test_outside(request):
 
 
 def fail(times, name):
-    """Fails so often, then passes."""
+    """Fails `times` times, then passes."""
     path = Path(__file__).with_name(name)
     runs = len(path.read_text()) if path.exists() else 0
     path.write_text((runs + 1) * ".")
@@ -55,7 +55,7 @@ def test_watchdog():
         (100, 0, 0.0, False, f"{MAX_RETRIES} retries", (1 + MAX_RETRIES, 1)),
     ],
 )
-def test_what_runs_again_and_is_counted(tmp_path, steady, late, standstill, passes, retries, runs):
+def test_failed_tests_are_repeated_and_counted(tmp_path, steady, late, standstill, passes, retries, runs):
     path = tmp_path / "test_some_udp.py"
     text = FILE
     for name, value in (("steady", steady), ("late", late), ("standstill", standstill)):
@@ -63,7 +63,7 @@ def test_what_runs_again_and_is_counted(tmp_path, steady, late, standstill, pass
     path.write_text(text)
     command = [sys.executable, "-m", "pytest", "-c", ROOT / "pyproject.toml", "-p", "own_network"]
     environment = {name: value for name, value in os.environ.items() if name != INSIDE}
-    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # half of the time that pytest takes to start
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # pytest starts faster
     environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests/support"), *sys.path])
     done = subprocess.run(
         [*command, "-p", "no:cacheprovider", path],
@@ -74,8 +74,8 @@ def test_what_runs_again_and_is_counted(tmp_path, steady, late, standstill, pass
         check=False,
     )
     assert done.returncode == (0 if passes else 1), done.stdout
-    said = re.search(r"^UDP tests: (.*) of at most (\d+)(: .*)?$", done.stdout, re.MULTILINE)
-    assert said[1] == retries and said[2] == str(MAX_RETRIES)
+    summary = re.search(r"^UDP tests: (.*) of at most (\d+)(: .*)?$", done.stdout, re.MULTILINE)
+    assert summary[1] == retries and summary[2] == str(MAX_RETRIES)
     assert [len((tmp_path / name).read_text()) for name in ("steady", "late")] == list(runs)
     if not passes:
         assert f"failed: test_{'steady' if steady else 'watchdog'}" in done.stdout

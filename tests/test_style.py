@@ -1,4 +1,4 @@
-"""Checks of text and names that a program can make: banned words, docstrings, test names, length of the README."""
+"""Automatic style checks: banned words, docstrings, test names, length of the README."""
 
 import ast
 import re
@@ -7,7 +7,7 @@ import subprocess
 import pytest
 from repository import ROOT
 
-#: Words and phrases that are ruled out: metaphors, personification and terms that the field does not use.
+#: Words that the style guide does not allow: metaphors, personification and non-standard terms.
 BANNED = re.compile(
     r"\b(doubt(s|ed|ful)?|undoubted|trust(s|ed)?|untrusted|told|honest|vouch(es|ed)?|knows|hears|heard|wishes|remembers|"
     r"unrest|felt|feels|leans|leaning|rambling|somebody|whoever|laboratory|true arm|links that can exist|"
@@ -36,11 +36,11 @@ TEXTS = [path for path in tracked("*.py", "*.md", "*.yaml") if path.name != "CHA
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_banned_word(path):
-    # Old keys of files are named where they are read and tested.
+def test_files_contain_no_banned_words(path):
+    # Lines that read or test old keys of files contain banned words.
     lines = ["" if "formerly(" in line or "earlier key" in line else line for line in path.read_text().splitlines()]
     found = [f"line {i}: {match.group()}" for i, line in enumerate(lines, 1) if (match := BANNED.search(line))]
-    assert not found, "words that style rules out"
+    assert not found, "words that the style guide does not allow"
 
 
 @pytest.mark.parametrize("path", PYTHON, ids=lambda path: str(path.relative_to(ROOT)))
@@ -64,5 +64,5 @@ def test_test_names_are_short():
     assert not sorted(name for name in names if name.startswith("test_") and len(name) > MAX_TEST_NAME)
 
 
-def test_the_readme_is_short():
+def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= MAX_README_LINES

@@ -1,19 +1,19 @@
-"""Tests compare computed numbers with a tolerance, because BLAS and numba round differently on each CPU."""
+"""Tests compare computed numbers with a tolerance, because rounding in BLAS and numba depends on the CPU."""
 
 import ast
 from pathlib import Path
 
 TESTS = Path(__file__).parent
-#: Smallest absolute tolerance: 450 times the rounding of a number near 1.
+#: Smallest absolute tolerance, 450 times the rounding error of numbers near 1.
 MIN_VALUE = 1e-13
-#: Functions that compute with BLAS or numba. Tests never compare their results exactly.
+#: Functions that compute with BLAS or numba. Tests must not compare their results exactly.
 COMPUTED = {"column", "effect_effort", "effort", "holding_torque", "mass_matrix", "predict", "predict_motion"} | {
     *("pull_back_effort", "regressor", "torque"),
 }
 
 
 def calls(*names):
-    """Yields the place and the node of each call of these functions in the tests."""
+    """Yields the location and the syntax node of each call of the named functions in the tests."""
     for path in sorted(TESTS.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and called(node) in names:
@@ -28,14 +28,14 @@ def argument(node, name):
     return next((keyword.value for keyword in node.keywords if keyword.arg == name), None)
 
 
-def test_every_comparison_states_an_absolute_tolerance():
-    """A relative tolerance alone fails where a number can be zero. `atol=0` states that it cannot."""
+def test_comparisons_have_an_absolute_tolerance():
+    """A relative tolerance alone fails for numbers that can be zero. `atol=0` declares that they cannot be zero."""
     found = dict(calls("assert_allclose", "isclose", "allclose"))
     assert len(found) > 100
     assert not [place for place, node in found.items() if argument(node, "atol") is None]
 
 
-def test_no_tolerance_is_as_small_as_rounding():
+def test_tolerances_exceed_rounding_errors():
     found = [(p, argument(n, "atol")) for p, n in calls("assert_allclose", "isclose", "allclose")]
     found += [(p, argument(n, "abs")) for p, n in calls("approx")]
     assert not [p for p, atol in found if isinstance(atol, ast.Constant) and 0 < atol.value < MIN_VALUE]

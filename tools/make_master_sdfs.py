@@ -1,4 +1,4 @@
-"""Make models/sdf/mtml.sdf and mtmr.sdf, the left and the right master, from mtm.sdf and arms/*.yaml."""
+"""Makes models/sdf/mtml.sdf and mtmr.sdf (left and right master) from mtm.sdf and arms/*.yaml."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -9,7 +9,7 @@ MASTERS = ("mtml", "mtmr")
 
 
 def master_sdf(arm: Arm) -> str:
-    """Returns the text of the arm's SDF: its own side's links and its own position limits."""
+    """Returns the text of the SDF of an arm, with the links of its side and its position limits."""
     root = compose_sdf(arm.sdf, arm.mirrored_links)
     name = arm.name.lower()
     model = root.find("model")
@@ -30,7 +30,7 @@ def master_sdf(arm: Arm) -> str:
 
 
 def main() -> None:
-    """Write both files."""
+    """Writes both files."""
     for name in MASTERS:
         path = MODELS_FOLDER / "sdf" / f"{name}.sdf"
         path.write_text(master_sdf(load_arm(name)))

@@ -1,4 +1,4 @@
-"""Make the visual meshes of the arms, models/sdf/meshes/<model>/<link>.gltf (needs the `geometry` extra)."""
+"""Makes the visual meshes of the arms, models/sdf/meshes/<model>/<link>.gltf. Requires the extra `geometry`."""
 
 from argparse import ArgumentParser
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from shapes import Body, write_gltf
 
 SDF_FOLDER = Path(__file__).parents[1] / "dvrk_drake/models/sdf"
 
-# Model (its SDF and its meshes have that name) -> bodies of its links, made when they are asked for.
+# By name of the model, which is also the name of its SDF and its folder of meshes: functions that make its bodies.
 MODELS: dict[str, Callable[[Path], dict[str, Callable[[], Body]]]] = {
     "mtm": mtm_shapes.bodies,
     "psm": psm_shapes.bodies,
@@ -20,9 +20,11 @@ MODELS: dict[str, Callable[[Path], dict[str, Callable[[], Body]]]] = {
 
 
 def main() -> None:
-    """Write one file per link."""
+    """Writes one file per link."""
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=SDF_FOLDER / "meshes", help="where to write")
+    parser.add_argument(
+        "--folder", type=Path, default=SDF_FOLDER / "meshes", help="output folder; default: %(default)s"
+    )
     parser.add_argument("--model", action="append", choices=list(MODELS), help="only this model (may be repeated)")
     parser.add_argument("--link", action="append", help="only this link (may be repeated)")
     options = parser.parse_args()

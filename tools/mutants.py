@@ -1,8 +1,8 @@
 """Mutation testing: changes one operator, constant or statement at a time and lists the changes that no test detects.
 
-Each mutant is tested in a fork of a process that has imported Drake and numpy. Tests that detected a mutant last run
-first, then the fastest; those marked slow do not run. Modules that numba compiles are refused: numba would take the
-unchanged ones from its cache.
+Each mutant is tested in a fork of a process that has imported Drake and numpy. The tests that last detected a mutant
+run first, then the fastest tests. Tests marked slow do not run. Modules that numba compiles are refused, since numba
+would use the unchanged functions from its cache.
 """
 
 import ast
@@ -30,19 +30,19 @@ _SWAPS = (
     "Lt:LtE,GtE LtE:Lt,Gt Gt:GtE,LtE GtE:Gt,Lt Eq:NotEq NotEq:Eq Is:IsNot IsNot:Is In:NotIn NotIn:In And:Or Or:And "
     "Add:Sub Sub:Add Mult:Div Div:Mult Pow:Mult BitOr:BitAnd BitAnd:BitOr LShift:RShift RShift:LShift"
 )
-#: Operators and what stands in their place.
+#: Replacements of each operator.
 OPERATORS = {
     getattr(ast, old): [getattr(ast, name) for name in new.split(",")]
     for old, new in (swap.split(":") for swap in _SWAPS.split())
 }
-#: Functions and what stands in their place.
+#: Replacement of each function.
 FUNCTIONS = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "any": "all", "all": "any"}
-#: Functions in whose place their first argument stands, or the object whose method they are.
+#: Functions that are replaced by their first argument, and methods that are replaced by their object.
 IDENTITIES = {"clip", "abs", "copy", "round"}
 
 
 class Mutant(NamedTuple):
-    """A changed module: its file, line and text of the change, and the compiled module."""
+    """Changed module: file, line and text of the change, and compiled module."""
 
     path: Path
     line: int
@@ -51,7 +51,7 @@ class Mutant(NamedTuple):
 
 
 def replacements(node: Any) -> Iterator[Any]:
-    """Yields what may stand in the place of `node`."""
+    """Yields the replacements of `node`."""
     match node:
         case ast.Constant(bool()):
             yield ast.Constant(not node.value)
@@ -89,7 +89,7 @@ def replacements(node: Any) -> Iterator[Any]:
 
 
 def mutants(path: Path) -> Iterator[Mutant]:
-    """Yields all mutants of a module; annotations, docstrings, messages and `if TYPE_CHECKING` stay as they are."""
+    """Yields all mutants of a module. Annotations, docstrings, messages and `if TYPE_CHECKING` are not changed."""
     tree = ast.parse(path.read_text())
 
     def visit(node: Any) -> Iterator[Mutant]:
@@ -111,9 +111,9 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
 
 class _Tests:
-    """Runs tests in a fork: imports a mutant in the place of its module, and is a plugin of pytest.
+    """Runs tests in a forked process that imports a mutant instead of its module. The object is also a pytest plugin.
 
-    `shared` has a key for each test, which sorts them, and under "" what the process needed and imported.
+    `shared` contains the sort key of each test. Its key "" contains the CPU time of the process and its modules.
     """
 
     def __init__(self, tests: list[str], shared: Any, limit: float, mutant: Mutant | None = None) -> None:
@@ -121,7 +121,7 @@ class _Tests:
         self.module = mutant and ".".join(mutant.path.relative_to(ROOT).with_suffix("").parts)
 
     def exit_code(self) -> int | None:
-        """Returns pytest's exit code; an endless loop is killed after `limit` seconds of processor time."""
+        """Returns the exit code of pytest. The process is killed after `limit` seconds of CPU time."""
         process = PROCESSES.Process(target=self._run)
         process.start()
         process.join()
@@ -155,21 +155,26 @@ class _Tests:
 
 
 def main() -> None:
-    """Prints the mutants that survive, and how many of each module do."""
+    """Prints the surviving mutants and their number per module."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("path", type=Path, help="module or folder, e.g. dvrk_drake/systems/guard")
-    parser.add_argument("--tests", nargs="+", help="what pytest runs; default: the folder in tests/ of the same name")
-    parser.add_argument("--every", type=int, default=1, help="make only every such mutant; default: %(default)s")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="mutants at a time; default: %(default)s")
+    parser.add_argument("--tests", nargs="+", help="tests to run; default: the folder of the same name in tests/")
+    parser.add_argument("--every", type=int, default=1, help="test only every n-th mutant; default: %(default)s")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=os.cpu_count() or 1,
+        help="number of mutants tested in parallel; default: %(default)s",
+    )
     options = parser.parse_args()
     path = options.path.resolve()
     folder = (path if path.is_dir() else path.parent).relative_to(ROOT / "dvrk_drake")
     files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
     if compiled := [file.name for file in files if "import numba" in file.read_text()]:
-        parser.error(f"numba compiles {', '.join(compiled)}; name modules that it does not compile")
+        parser.error(f"numba compiles {', '.join(compiled)}. Give modules that numba does not compile.")
     tests = partial(_Tests, options.tests or [str(ROOT / "tests" / folder)], shared := PROCESSES.Manager().dict())
     if tests(limit=1e6).exit_code():
-        parser.error("the tests fail without a change, or there are none; --tests names others")
+        parser.error("the tests fail without a mutant, or there are no tests. Select other tests with --tests.")
     needed, modules = shared.pop("")
     own = {file.stem for file in (ROOT / "tests").rglob("*.py")}
     for name in modules:
@@ -186,7 +191,7 @@ def main() -> None:
                 print(f"{mutant.path.relative_to(ROOT)}:{mutant.line}: {mutant.text}", flush=True)
     for file, made in Counter(mutant.path for mutant in todo).items():
         print(f"{file.relative_to(ROOT)}: {made} mutants, {survived[file]} survive")
-    print(f"{len(todo)} mutants, {survived.total()} survive: {survived.total() / max(len(todo), 1):.1%}")
+    print(f"{len(todo)} mutants, {survived.total()} survive: {100 * survived.total() / max(len(todo), 1):.1f} %")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Run a command with the kernels of another CPU: OpenBLAS, numpy and numba round differently on each kind.
+"""Runs a command with the numerical kernels of another CPU, since OpenBLAS, numpy and numba round differently on it.
 
     python tools/other_kernels.py make test-fast
 
@@ -21,7 +21,7 @@ print("numba:", cpu_target.target_context.codegen().magic_tuple()[1])
 
 
 def other_kernels() -> dict[str, str]:
-    """Returns the environment variables that select other kernels."""
+    """Returns environment variables that select the kernels of another CPU."""
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     newest = [name for name in found if name == "X86_V4" or name.startswith("AVX512")]
     return {
@@ -49,10 +49,10 @@ def main() -> None:
     """Checks that the variables take effect, then runs the command."""
     variables = other_kernels()
     used = used_kernels(variables)
-    left = next(line for line in used if line.startswith("numpy:")).split()
+    remaining = next(line for line in used if line.startswith("numpy:")).split()
     disabled = variables["NPY_DISABLE_CPU_FEATURES"].split()
-    wanted = {f"Core: {variables['OPENBLAS_CORETYPE']}", f"numba: {variables['NUMBA_CPU_NAME']}"}
-    if not wanted <= set(used) or set(disabled) & set(left):
+    expected = {f"Core: {variables['OPENBLAS_CORETYPE']}", f"numba: {variables['NUMBA_CPU_NAME']}"}
+    if not expected <= set(used) or set(disabled) & set(remaining):
         sys.exit(f"other_kernels.py: the variables {variables} have no effect; in use: {'; '.join(used)}")
     print("kernels:", "; ".join(used), flush=True)
     os.execvpe(sys.argv[1], sys.argv[1:], os.environ | variables)

@@ -1,4 +1,4 @@
-"""Write a picture of an arm at a pose, as Meshcat shows it (needs a Chromium; no display)."""
+"""Writes a picture of an arm in Meshcat. Requires Chromium, but no display."""
 
 import shutil
 import subprocess
@@ -24,12 +24,12 @@ CHROMIUM_FLAGS = (
     "--hide-scrollbars",
     "--virtual-time-budget=8000",
 )
-# Drake's page shows a control panel, which has no setting of its own.
+# Drake's page has a control panel that no option hides.
 HIDE_PANEL = "<style>.dg, #status-message, #stats-plot { display: none !important; }</style>"
 
 
-def picture(html: str, file: Path, width: int, height: int, chromium: str) -> None:
-    """Let Chromium draw a page that Meshcat has written, one that needs no server."""
+def write_picture(html: str, file: Path, width: int, height: int, chromium: str) -> None:
+    """Draws a page written by `Meshcat.StaticHtml` with Chromium."""
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "scene.html"
         page.write_text(html.replace("</head>", HIDE_PANEL + "</head>", 1))
@@ -44,31 +44,52 @@ def picture(html: str, file: Path, width: int, height: int, chromium: str) -> No
         file.unlink(missing_ok=True)
         subprocess.run(command, check=True, capture_output=True, timeout=120)
     if not file.exists():
-        raise RuntimeError(f"{chromium} wrote no picture")
+        raise RuntimeError(f"{chromium} did not write {file}.")
 
 
 def main() -> None:
-    """Read the options and write the picture."""
+    """Reads the options and writes the picture."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path, help="PNG to write")
-    parser.add_argument("--page", type=Path, help="a page that Meshcat has written, instead of an arm")
-    parser.add_argument("--arm", default="mtml", help="which arm")
+    parser.add_argument("--page", type=Path, help="page written by Meshcat, instead of an arm")
+    parser.add_argument("--arm", default="mtml", help="name of the arm; default: mtml")
     parser.add_argument(
-        "--pose", nargs="+", type=float, default=[0.0] * 7, metavar="q", help="independent joints, rad or m"
+        "--pose",
+        nargs="+",
+        type=float,
+        default=[0.0] * 7,
+        metavar="q",
+        help="positions of the independent joints [rad, m]",
     )
-    parser.add_argument("--camera", nargs=3, type=float, metavar="m", help="its place; default: frames the arm")
-    parser.add_argument("--target", nargs=3, type=float, metavar="m", help="seen point; default: the arm's middle")
-    parser.add_argument("--zoom", type=float, default=ZOOM, help="magnification of Meshcat's 75 degree view")
+    parser.add_argument(
+        "--camera",
+        nargs=3,
+        type=float,
+        metavar="m",
+        help="position of the camera [m]; default: the whole arm is visible",
+    )
+    parser.add_argument(
+        "--target",
+        nargs=3,
+        type=float,
+        metavar="m",
+        help="point at the centre of the picture [m]; default: middle of the arm",
+    )
+    parser.add_argument(
+        "--zoom", type=float, default=ZOOM, help="magnification relative to Meshcat's field of view of 75 degrees"
+    )
     parser.add_argument("--collision", action="store_true", help="show the collision shapes instead")
-    parser.add_argument("--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width, height")
-    parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="the browser")
+    parser.add_argument(
+        "--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width and height of the picture"
+    )
+    parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="program of the browser")
     options = parser.parse_args()
     html = options.page.read_text() if options.page else scene(options).StaticHtml()
-    picture(html, options.file, *options.size, options.chromium)
+    write_picture(html, options.file, *options.size, options.chromium)
 
 
 def scene(options: Namespace) -> Meshcat:
-    """The arm at its pose."""
+    """Returns a Meshcat that shows the arm in the given pose."""
     role = Role.kProximity if options.collision else Role.kIllustration
     arm = load_arm(options.arm)
     camera, target = framing(arm)

@@ -1,4 +1,4 @@
-"""Rounded solids (build123d, millimetres) and a glTF writer for them, used by make_meshes.py."""
+"""Rounded solids (build123d, in mm) and a glTF writer for make_meshes.py."""
 
 import json
 from base64 import b64encode
@@ -15,8 +15,8 @@ from OCP.TopAbs import TopAbs_REVERSED
 from OCP.TopLoc import TopLoc_Location
 
 Point = tuple[float, float, float]
-Circle = tuple[float, float, float]  # two coordinates in the plane across the axis, and the radius
-Body = list[tuple[str, cad.Shape]]  # what a link is made of: the name of a material and a solid
+Circle = tuple[float, float, float]  # two coordinates in the plane normal to the axis, and the radius
+Body = list[tuple[str, cad.Shape]]  # solids of a link with the names of their materials
 
 # Base colour (linear red, green, blue), metallic and roughness factors.
 MATERIALS: dict[str, tuple[Point, float, float]] = {
@@ -29,26 +29,26 @@ MATERIALS: dict[str, tuple[Point, float, float]] = {
     "rubber": ((0.012, 0.012, 0.013), 0.0, 0.85),
     "strap": ((0.035, 0.045, 0.075), 0.0, 0.95),
 }
-LINEAR_TOLERANCE = 1 / 400  # of a solid's diagonal, but
-FINEST, COARSEST = 0.09, 0.25  # millimetres
+LINEAR_TOLERANCE = 1 / 400  # share of a solid's diagonal, limited to FINEST..COARSEST
+FINEST, COARSEST = 0.09, 0.25  # mm
 ANGULAR_TOLERANCE = 0.60  # radians
 
 
 def across(axis: str, height: float) -> cad.Plane:
-    """Plane across an axis; its own axes follow in the order x, y, z, x: those across "y" are (z, x)."""
+    """Returns a plane normal to an axis. Its axes are the next two in the order x, y, z, x, e.g. (z, x) for "y"."""
     unit = np.eye(3)["xyz".index(axis)]
     return cad.Plane(origin=tuple(unit * height), x_dir=tuple(np.roll(unit, 1)), z_dir=tuple(unit))
 
 
 def disc(axis: str, low: float, high: float, radius: float, at: Sequence[float] = (0, 0), edge: float = 0) -> cad.Part:
-    """Cylinder between two heights on an axis, its rims rounded by `edge`."""
+    """Returns a cylinder between two heights on an axis, with rims rounded by the radius `edge`."""
     align = (cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN)
     solid = across(axis, low) * cad.Pos(*at) * cad.Cylinder(radius, high - low, align=align)
     return cad.fillet(solid.edges().filter_by(cad.GeomType.CIRCLE), edge) if edge else solid
 
 
 def plate(axis: str, low: float, high: float, circles: Sequence[Circle], edge: float = 0) -> cad.Part:
-    """Plate between two heights on an axis, outlined by the hull of circles, rims rounded by `edge`."""
+    """Returns a plate between two heights on an axis: the hull of circles, with rims rounded by the radius `edge`."""
     outlines = [(cad.Pos(u, v) * cad.Circle(radius)).edges() for u, v, radius in circles]
     hull = cad.make_hull([edge for edges in outlines for edge in edges])
     solid = cad.extrude(across(axis, low) * hull, high - low)
@@ -59,25 +59,25 @@ def plate(axis: str, low: float, high: float, circles: Sequence[Circle], edge: f
 
 
 def swept(path: cad.Edge | cad.Wire, outward: Point, *sections: tuple[float, float, float]) -> cad.Part:
-    """Sweep rounded rectangles along a path; `outward` is the thickness direction at the start.
+    """Returns the sweep of rounded rectangles along a path. `outward` is the thickness direction at the start.
 
-    Each section is width, thickness and corner radius; they are spread evenly over the path.
+    Each section consists of width, thickness and corner radius. Sections are evenly spaced on the path.
     """
     profiles = []
     for index, (width, thickness, corner) in enumerate(sections):
-        where = path.location_at(index / max(1, len(sections) - 1))
+        location = path.location_at(index / max(1, len(sections) - 1))
         tangent = path.tangent_at(index / max(1, len(sections) - 1))
         direction = np.asarray(outward, dtype=float)
-        if index:  # turn the start's direction along with the tangent
-            direction = turn_with(path.tangent_at(0), tangent, direction)
+        if index:  # rotate the direction at the start with the tangent
+            direction = rotate_with(path.tangent_at(0), tangent, direction)
         sideways = np.cross(direction, tuple(tangent))
-        plane = cad.Plane(origin=where.position, x_dir=tuple(sideways), z_dir=tangent)
+        plane = cad.Plane(origin=location.position, x_dir=tuple(sideways), z_dir=tangent)
         profiles.append(plane * cad.RectangleRounded(width, thickness, corner))
     return cad.sweep(profiles if len(profiles) > 1 else profiles[0], path=path, multisection=len(profiles) > 1)
 
 
-def turn_with(start: cad.Vector, end: cad.Vector, direction: np.ndarray) -> np.ndarray:
-    """The direction after the smallest rotation that takes one tangent to the other."""
+def rotate_with(start: cad.Vector, end: cad.Vector, direction: np.ndarray) -> np.ndarray:
+    """Returns `direction` rotated by the smallest rotation from tangent `start` to tangent `end`."""
     a, b = (np.asarray(tuple(vector)) / np.linalg.norm(tuple(vector)) for vector in (start, end))
     normal = np.cross(a, b)
     return direction + np.cross(normal, direction) + np.cross(normal, np.cross(normal, direction)) / (1 + a @ b)
@@ -93,7 +93,7 @@ def bolts(
     at: Sequence[float] = (0, 0),
     phase: float = 0.5,
 ) -> list[cad.Part]:
-    """Screw heads on a circle; `phase` is the first one's place as a fraction of their spacing."""
+    """Returns screw heads on a circle. `phase` is the position of the first one as a share of the spacing."""
     angles = [2 * pi * (index + phase) / count for index in range(count)]
     places = [(at[0] + circle * cos(angle), at[1] + circle * sin(angle)) for angle in angles]
     return [disc(axis, low, high, radius, place) for place in places]
@@ -106,31 +106,33 @@ def both(make: Callable[[float], Sequence[cad.Shape] | cad.Shape]) -> list[cad.S
 
 
 def moved(body: Body, by: Sequence[float]) -> Body:
-    """The body shifted."""
+    """Returns the body translated by a vector."""
     return [(material, cad.Pos(*by) * solid) for material, solid in body]
 
 
-def of(material: str, *solids: cad.Shape | Sequence[cad.Shape]) -> Body:
-    """The solids, each marked with a material."""
+def made_of(material: str, *solids: cad.Shape | Sequence[cad.Shape]) -> Body:
+    """Returns a body of these solids in one material."""
     flat = [part for solid in solids for part in (solid if isinstance(solid, list) else [solid])]
     return [(material, part) for part in flat]
 
 
 def fused(material: str, *solids: cad.Shape) -> Body:
-    """The union of the solids in one material.
+    """Returns the union of the solids in one material.
 
     Raises:
-        ValueError: the kernel lost a solid, which it does silently where faces all but coincide; move them apart.
+        ValueError: The CAD kernel lost a solid. It does so silently if faces almost coincide. Move them apart.
     """
     union = solids[0].fuse(*solids[1:])
-    bounds, wanted = union.bounding_box(), cad.Compound(children=list(solids)).bounding_box()
-    if (bounds.min - wanted.min).length > 1e-3 or (bounds.max - wanted.max).length > 1e-3:
-        raise ValueError(f"a solid was lost: the union spans {bounds}, the solids {wanted}")
+    bounds, expected = union.bounding_box(), cad.Compound(children=list(solids)).bounding_box()
+    if (bounds.min - expected.min).length > 1e-3 or (bounds.max - expected.max).length > 1e-3:
+        raise ValueError(
+            f"The union lost a solid: its bounding box is {bounds} instead of {expected}. Move the faces apart."
+        )
     return [(material, union)]
 
 
 def triangulated(solid: cad.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, unit normals (exact, of the surface) and triangles; faces share none, so edges stay crisp."""
+    """Returns vertices, exact unit normals, and triangles. Faces share no vertices, so edges are sharp."""
     tolerance = min(COARSEST, max(FINEST, LINEAR_TOLERANCE * solid.bounding_box().diagonal))
     BRepMesh_IncrementalMesh(solid.wrapped, tolerance, False, ANGULAR_TOLERANCE, False)
     points, normals, triangles, count = [], [], [], 0
@@ -156,7 +158,7 @@ def triangulated(solid: cad.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def joined(solids: Sequence[cad.Shape]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, normals and triangles of several solids together."""
+    """Returns the vertices, normals and triangles of several solids."""
     parts = [triangulated(solid) for solid in solids]
     first = np.cumsum([0] + [len(points) for points, _, _ in parts])
     triangles = [triangles + start for (_, _, triangles), start in zip(parts, first, strict=False)]
@@ -164,7 +166,7 @@ def joined(solids: Sequence[cad.Shape]) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def write_gltf(body: Body, path: Path) -> None:
-    """Write a body as one .gltf file in metres, Y up as the format asks (Drake turns it to Z up)."""
+    """Writes a body to a glTF file, in metres and with Y up, as the format requires. Drake rotates it to Z up."""
     data, views, accessors, meshes, materials = bytearray(), [], [], [], []
     for name in dict.fromkeys(material for material, _ in body):
         points, normals, triangles = joined([solid for material, solid in body if material == name])

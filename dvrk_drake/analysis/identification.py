@@ -29,21 +29,21 @@ def identify(
 ) -> StaticIdentification | DynamicIdentification:
     """Checks a recording and identifies the arm's model from it, as `dvrk-drake identify` does.
 
-    A recording of poses gives a static model with gravity, cables and springs. A motion in which the arm rests often
-    enough also gives a static model. A motion without rests gives the full dynamics: physically consistent inertial
-    parameters, rotors and friction.
+    A recording of poses gives a static model with gravity, cables and springs. A motion with enough static poses also
+    gives a static model. Any other motion gives the full dynamics: physically consistent inertial parameters, rotors
+    and friction.
 
     Args:
         recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.
-        arm: Arm that was recorded, with its mounting, see `Arm.with_gravity`.
+        arm: Arm that was recorded, with the gravity direction of its mounting, see `Arm.with_gravity`.
         method: Method for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
-        low_speed_segments: Use the low-speed segments of a motion without rests as poses.
+        low_speed_segments: True to treat the low-speed segments of a motion without static poses as poses.
         progress: Callback that receives the step, "checking the recording" or "identifying", and its finished share,
             0 to 1.
 
     Returns:
-        Result with the model as `model`, the prepared recording as `recording`, warnings as `warnings`, and the data of
-        tables and figures. Its method `save` writes the model file.
+        Result with the model as `model`, the recording used for the fit as `recording`, and `warnings`. The method
+        `save` of the result writes the model file.
 
     Raises:
         RecordingError: The recording does not fit the arm, or `check` rejects it, see `findings` of the error.
@@ -88,8 +88,8 @@ def _friction_in_segments(result: StaticIdentification, measured: NDArray[np.boo
     if measured is None or not commanded:
         return ()
     what = (
-        "friction in low-speed segments can look like gravity, also in the ten-fold error; the torque on "
-        f"{', '.join(commanded)} may be worse than zero torque elsewhere"
+        "friction in low-speed segments is not separated from gravity, so the torque of "
+        f"{', '.join(commanded)} may be worse than zero torque at other poses"
     )
-    advice = "validate the model on static poses before it commands an arm"
+    advice = "Cross-validation does not detect this error. Validate the model on static poses before you use it."
     return (Finding("warning", "low-speed segments", result.recording.source or "recording", what, advice),)

@@ -1,4 +1,4 @@
-"""Updates friction and offsets of an identified model from a short recording, without changing other parameters."""
+"""Refits the friction and offsets of an identified model to a short motion, without changing other parameters."""
 
 from __future__ import annotations
 
@@ -26,15 +26,17 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Folds of the motion, divided by its phase if it repeats. Each is predicted from the others to decide what is kept.
+#: Number of folds for cross-validation. A motion that repeats is divided by its phase.
 FOLDS = 4
-#: Prior deviations of a friction scale from 1, and of an offset as a share of the RMS effort.
+#: Prior standard deviations: of a friction scale about 1, and of an offset as a share of the RMS effort.
 SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
-#: Relative error for weighting the efforts.
+#: Assumed relative error of the efforts.
 _RELATIVE_ERROR = 0.1
-#: Least share of the time for which an actuator must move in each direction.
+#: Time over which errors are correlated, because they are model errors [s].
+_CORRELATION_TIME = 0.1
+#: Smallest share of the time in which an actuator must move in each direction.
 MIN_SHARE = 0.1
-#: Largest mean relative error of a recording of this arm.
+#: Largest accepted mean relative error after the refit.
 MAX_ERROR = 0.7
 
 
@@ -44,12 +46,12 @@ class RecalibratedActuator:
 
     Attributes:
         name: Name of the joint of the actuator.
-        before: Error of the model before recalibration.
-        after: Error of held-out parts of the motion, predicted with friction and offset from the other parts.
-        kept: True if the new model contains the new friction and offset.
-        reason: Reason if they are not kept, or "".
-        dry: Scale of the actuator's dry friction, from the whole recording; None if it has none.
-        viscous: Scale of the actuator's viscous friction, from the whole recording; None if it has none.
+        before: Relative error of the model before recalibration [1].
+        after: Cross-validated relative error after refitting friction and offset [1].
+        kept: True if the new model has the refitted friction and offset.
+        reason: Reason why they are not in the new model, or "".
+        dry: Factor by which the dry friction of the actuator changes [1], None if the model has none.
+        viscous: Factor by which the viscous friction of the actuator changes [1], None if the model has none.
         offset: Change of the offset [N m, N].
     """
 
@@ -65,12 +67,12 @@ class RecalibratedActuator:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Recalibration(ModelResult):
-    """Model with new friction.
+    """Result of `recalibrate`: a model with refitted friction and offsets.
 
     Attributes:
         actuators: Recalibration of the actuators, in the arm's order.
-        shared: Scales of friction at coordinates that several actuators move, e.g. "finger_1 dry".
-        seconds: Duration of the motion that was used, without one second at each end.
+        shared: Factors of the friction at coordinates that several actuators move, for example "finger_1 dry" [1].
+        seconds: Duration of the motion, without one second at each end [s].
     """
 
     actuators: list[RecalibratedActuator]
@@ -81,7 +83,7 @@ class Recalibration(ModelResult):
 def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Recalibration:
     """Checks a short motion and refits a model's friction and offsets to it, as `dvrk-drake recalibrate` does.
 
-    The improvement applies to similar motions. At other positions and speeds it can be much smaller.
+    The error decreases for similar motions. For other positions and speeds, the improvement can be much smaller.
 
     Args:
         model: Model identified from a motion.
@@ -90,10 +92,12 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
             share, 0 to 1.
 
     Returns:
-        Result with the new model as `model`, each actuator's error before and after as `actuators`, and `warnings`.
+        Result with the new model as `model`, the errors of each actuator before and after as `actuators`, and
+        `warnings`.
 
     Raises:
-        RecordingError: `check` rejects the recording, it is of another arm, or no actuator moves in both directions.
+        RecordingError: `check` rejects the recording, the model error remains too large, or no actuator moves in both
+            directions.
         ModelError: The model has no dynamics.
 
     Example:
@@ -119,11 +123,11 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
 
 
 def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
-    """Fits a scale of dry and of viscous friction for every coordinate of the drive, and an offset per actuator.
+    """Fits a factor of the dry and of the viscous friction of every coordinate, and an offset of every actuator.
 
-    Rigid bodies, springs and cables do not change. Each of `FOLDS` parts of the motion is predicted from the others. If
-    the error of an actuator does not decrease, its offset and friction keep their values, and so does friction that it
-    shares. The others are then fitted again. Finally, the kept terms are fitted to the whole recording.
+    Rigid bodies, springs and cables do not change. The errors are cross-validated over `FOLDS` folds of the motion. If
+    the error of an actuator does not decrease, its offset, its friction, and friction that it shares with other
+    actuators keep their values. The remaining terms are fitted again, finally to the whole recording.
 
     Raises:
         RecordingError: The recording is not a motion of this arm, efforts have the wrong sign, or no actuator moves in
@@ -134,26 +138,26 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     excited = fit.excited
     if not np.any(excited):
         raise RecordingError(
-            f"{recording.source or 'recording'}: no actuator moves both ways for {MIN_SHARE:.0%} of the time at "
-            f"{REST_SPEED[0]:g} rad/s, {REST_SPEED[1]:g} m/s RMS or more; friction shows only in such a motion"
+            f"{recording.source or 'recording'}: no actuator moves in both directions. Each direction requires "
+            f"{100 * MIN_SHARE:.0f} % of the time and an RMS speed of {REST_SPEED[0]:g} rad/s ({REST_SPEED[1]:g} m/s)."
         )
     refuse_opposite_efforts(recording, fit.names, fit.tau, fit.expected)
-    before = fit.error(fit.nothing)
-    first = fit.left_out_error(excited)
+    before = fit.error(fit.unchanged)
+    first = fit.cross_validated_error(excited)
     free, after = excited.copy(), first
     while np.any(worse := free & ~(after < before)):
         free &= ~worse
-        after = fit.left_out_error(free)
+        after = fit.cross_validated_error(free)
     if not np.mean(np.minimum(before, after)) < MAX_ERROR:
         raise RecordingError(
-            f"{recording.source or 'recording'}: efforts differ from the model's by {np.mean(before):.0%} on average "
-            f"over the actuators, and by {np.mean(after):.0%} with its friction fitted; {MAX_ERROR:.0%} is "
-            "allowed: is it of this arm, in these coordinates?"
+            f"{recording.source or 'recording'}: the mean relative error of the model is {100 * np.mean(after):.0f} % "
+            f"with fitted friction ({100 * np.mean(before):.0f} % before); at most {100 * MAX_ERROR:.0f} % is allowed. "
+            "Check the arm and the coordinates of the recording."
         )
     x = fit.solve(free, np.ones(len(fit.tau), dtype=bool))
     actuators = []
     for i, name in enumerate(fit.names):
-        reason = "" if free[i] else "gains nothing" if excited[i] else "does not move both ways"
+        reason = "" if free[i] else "error not reduced" if excited[i] else "no motion in both directions"
         actuators.append(
             RecalibratedActuator(
                 name=name,
@@ -180,31 +184,31 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     )
 
 
-def predict_other_phases(
-    model: IdentifiedModel, recording: Recording, parts: int
+def cross_validated_errors(
+    model: IdentifiedModel, recording: Recording, folds: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the relative errors (n,) of the model before and after refitting its friction to other phases.
+    """Returns the relative errors (n,) of the model, and the cross-validated errors (n,) after refitting its friction.
 
-    A periodic motion is divided by its phase, so that no part is predicted from its own repetition. All actuators that
+    A periodic motion is divided by its phase, so that no fold is predicted from its own repetition. All actuators that
     move in both directions are refitted.
 
     Raises:
         RecordingError: The recording is not a motion of this arm.
         ModelError: The model has no dynamics.
     """
-    fit = _Fit(model.dynamic_model, recording, parts)
-    return fit.error(fit.nothing), fit.left_out_error(fit.excited)
+    fit = _Fit(model.dynamic_model, recording, folds)
+    return fit.error(fit.unchanged), fit.cross_validated_error(fit.excited)
 
 
 class _Fit:
-    """Least squares for x = (friction scales, offsets), with the values of the model as prior."""
+    """Least-squares fit of x = (friction factors, offsets), with priors about the values of the model."""
 
     def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
         grid = motion_grid(recording, model.arm, model.section.signals)
         self.names = model.arm.joint_names
         self.rate = grid.rate
         expected = drive_efforts(model, grid)
-        self.tau = grid.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort())
+        self.tau = grid.filter_efforts(recording.in_actuator_coordinates(model.arm).measured_effort())
         self.other = expected.other
         self.keys = list(expected.friction)
         self.friction = np.stack([expected.friction[key] for key in self.keys], axis=2)
@@ -213,25 +217,25 @@ class _Fit:
         self.expected = expected.total()
         self._folds = folds
         self._fold, self._edge = phase_folds(grid, period_of(grid), folds)
-        self.excited = _moves_both_ways(model, grid)
-        self.nothing = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
+        self.excited = _moves_in_both_directions(model, grid)
+        self.unchanged = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
 
     def error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the relative error (n,)."""
-        return self._relative(np.sum(self._left(x) ** 2, axis=0))
+        """Returns the relative errors (n,) for x (k + n,)."""
+        return self._relative(np.sum(self._residuals(x) ** 2, axis=0))
 
-    def left_out_error(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Returns the relative error (n,) on held-out parts, predicted from the others without the adjoining edges."""
+    def cross_validated_error(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Returns the relative errors (n,) on held-out folds. Rows next to a held-out fold are not used for its fit."""
         squares = np.zeros(len(self.names))
         for fold in range(self._folds):
-            own = self._fold == fold
-            beside = (self._edge[:, 0] & (self._fold == (fold + 1) % self._folds)) | (
+            held_out = self._fold == fold
+            adjacent = (self._edge[:, 0] & (self._fold == (fold + 1) % self._folds)) | (
                 self._edge[:, 1] & (self._fold == (fold - 1) % self._folds)
             )
-            squares += np.sum(self._left(self.solve(free, ~own & ~beside))[own] ** 2, axis=0)
+            squares += np.sum(self._residuals(self.solve(free, ~held_out & ~adjacent))[held_out] ** 2, axis=0)
         return self._relative(squares)
 
-    def _left(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _residuals(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         k = len(self.keys)
         return np.asarray(self.tau - self.other - self.friction @ x[:k] - x[k:])
 
@@ -240,35 +244,38 @@ class _Fit:
         return np.asarray(np.sqrt(squares / np.maximum(size, np.finfo(float).tiny)))
 
     def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Returns x (k + n,).
+        """Returns x (k + n,) for some rows of the motion.
 
-        Offsets and friction of actuators that are not free are constant, and so is friction that they share.
+        Args:
+            free: Mask (n,) of the actuators whose friction and offset are fitted. Friction that is shared with another
+                actuator is not fitted.
+            rows: Mask (r,) of the rows.
         """
         k, n = len(self.keys), len(self.names)
-        known = np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
+        fixed = np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
         size = np.sqrt(np.mean(self.tau**2, axis=0))
         deviation = np.concatenate([np.full(k, SCALE_DEVIATION), OFFSET_DEVIATION * size])
-        H, b = np.diag(deviation**-2.0), self.nothing / deviation**2
+        H, b = np.diag(deviation**-2.0), self.unchanged / deviation**2
         for i in range(n):
             X = np.hstack([self.friction[rows, i], np.tile(np.eye(n)[i], (int(np.sum(rows)), 1))])
-            # Rows are not independent, because unmodelled errors are correlated over about 0.1 s.
-            weight = 1 / (_RELATIVE_ERROR * size[i]) ** 2 / (self.rate * 0.1)
+            # Rows within the correlation time are not independent.
+            weight = 1 / (_RELATIVE_ERROR * size[i]) ** 2 / (self.rate * _CORRELATION_TIME)
             H += weight * X.T @ X
             b += weight * X.T @ (self.tau - self.other)[rows, i]
-        x = self.nothing.copy()
-        R = np.linalg.cholesky(H[np.ix_(~known, ~known)]).T
-        right = b[~known] - H[np.ix_(~known, known)] @ x[known]
-        lower = np.concatenate([np.zeros(k), np.full(n, -np.inf)])[~known]
-        x[~known] = lsq_linear(R, np.linalg.solve(R.T, right), bounds=(lower, np.inf)).x if len(right) else []
+        x = self.unchanged.copy()
+        R = np.linalg.cholesky(H[np.ix_(~fixed, ~fixed)]).T
+        right = b[~fixed] - H[np.ix_(~fixed, fixed)] @ x[fixed]
+        lower = np.concatenate([np.zeros(k), np.full(n, -np.inf)])[~fixed]
+        x[~fixed] = lsq_linear(R, np.linalg.solve(R.T, right), bounds=(lower, np.inf)).x if len(right) else []
         return x
 
     def scale(self, x: NDArray[np.float64], coordinate: str, part: FrictionPart) -> float | None:
-        """Returns the scale of one part of the friction at a coordinate, None if the model has none there."""
+        """Returns the factor of one part of the friction of a coordinate, None if the model has no such friction."""
         return float(x[self.keys.index((coordinate, part))]) if (coordinate, part) in self.keys else None
 
 
-def _moves_both_ways(model: DynamicModel, grid: MotionGrid) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the actuators that move in both directions for long enough and fast enough."""
+def _moves_in_both_directions(model: DynamicModel, grid: MotionGrid) -> NDArray[np.bool_]:
+    """Returns a mask (n,) of the actuators that move in both directions, by `MIN_SHARE` and `REST_SPEED`."""
     v = model.arm.transmission.velocity(grid.v)
     share = np.minimum(np.mean(v > 0, axis=0), np.mean(v < 0, axis=0))
     speed = np.sqrt(np.mean(v**2, axis=0))
@@ -276,7 +283,7 @@ def _moves_both_ways(model: DynamicModel, grid: MotionGrid) -> NDArray[np.bool_]
 
 
 def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64]) -> DynamicSection:
-    """Returns the section with scaled friction and changed offsets."""
+    """Returns the dynamic section with the refitted friction and offsets x (k + n,)."""
     scales = dict(zip(fit.keys, x[: len(fit.keys)], strict=True))
     offsets = {f"actuator.{name}": float(c) for name, c in zip(fit.names, x[len(fit.keys) :], strict=True) if c}
     effects = []

@@ -23,7 +23,7 @@ class ModelResult:
 
     Attributes:
         model: New model.
-        warnings: Findings in the recording or in the fit that make the model less reliable; `str` of each is one line.
+        warnings: Findings that make the model less reliable, about the recording or the fit; `str` of each is one line.
     """
 
     model: IdentifiedModel
@@ -37,7 +37,7 @@ class ModelResult:
 
         Args:
             path: YAML file to write.
-            overwrite: Replace an existing file.
+            overwrite: True to replace an existing file.
 
         Raises:
             DvrkDrakeError: The file exists, or cannot be written.
@@ -51,9 +51,9 @@ class Identification(ModelResult):
     """Result of `identify`: a `StaticIdentification` or a `DynamicIdentification`.
 
     Attributes:
-        recording: Prepared recording: distinct poses in joint coordinates, or the motion as recorded.
-        note: Origin of the poses, or "".
-        num_rows: Number of rows of the recording, or of poses found in it, before repeated poses are averaged.
+        recording: Recording used for the fit: distinct poses in joint coordinates, or the motion as recorded.
+        note: Note on how poses were extracted from a motion, or "".
+        num_rows: Number of rows of the recording, or of poses extracted from it, before repeated poses are averaged.
     """
 
     recording: Recording
@@ -66,10 +66,10 @@ class Validation(ABC):
     """Result of `validate`: a `StaticValidation` or a `DynamicValidation`.
 
     Attributes:
-        model: Model that was compared.
-        recording: Prepared recording for the comparison: poses, or the motion as recorded.
-        warnings: Findings in the recording or in the comparison that the errors do not show; `str` of each is one line.
-        note: Origin of the poses, or "".
+        model: Model that was validated.
+        recording: Recording used for the comparison: poses, or the motion as recorded.
+        warnings: Findings about the recording or the comparison; `str` of each is one line.
+        note: Note on how poses were extracted from a motion, or "".
     """
 
     model: IdentifiedModel
@@ -98,34 +98,36 @@ class Validation(ABC):
 
     @abstractmethod
     def as_dict(self) -> dict:
-        """Returns what `validate --json` writes."""
+        """Returns the data of `validate --json`."""
 
     def unfit(self, required: Requirement) -> list[str]:
-        """Returns the joints whose verdict is worse than "good" or "usable", each with its verdict."""
+        """Returns the joints whose verdict is worse than `required`, each with its verdict."""
         return unfit(self.verdicts, required)
 
     @property
     def of_same_recording(self) -> bool:
-        """True if the model was identified from this recording, so that the errors are those of the fit."""
+        """True if the model was identified from this recording, so that the errors are errors of the fit."""
         return bool(self.recording.sha256) and self.recording.sha256 == self.model.provenance.sha256
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the model with these verdicts. `dvrk-drake run` warns of a model without verdicts.
+        """Writes the model with these verdicts. `dvrk-drake run` prints a warning for a model without verdicts.
 
         Args:
             path: File of the model, or a new file.
-            overwrite: Replace verdicts from another recording, or another file.
+            overwrite: True to replace verdicts from another recording, or another file.
 
         Raises:
             ModelError: The model was identified from this recording, or already has verdicts.
-            DvrkDrakeError: The file exists and is not of this model.
+            DvrkDrakeError: The file exists and contains another model.
         """
         source = self.recording.source or "recording"
         if self.of_same_recording:
-            raise ModelError(f"{source}: verdicts need a recording that the model was not identified from")
+            raise ModelError(
+                f"{source}: the model was identified from this recording. Validate with another recording."
+            )
         if self.model.validation is not None and not overwrite:
             saved = self.model.validation.recording
-            raise ModelError(f"{path}: has verdicts from {saved} already; replace them with overwrite=True")
+            raise ModelError(f"{path} has verdicts from {saved} already. Replace them with overwrite=True.")
         if not self._is_own_file(path):
             refuse_existing(path, overwrite)
         summary = ValidationSummary(self.recording.source, self.recording.sha256, dict(self.verdicts))
@@ -144,8 +146,8 @@ class Prediction:
     """Result of `predict`.
 
     Attributes:
-        tau: (m, n) efforts at the rows of the recording, in its coordinates [N m; N].
-        warnings: Findings of `check` in the recording; `str` of each is one line.
+        tau: Predicted efforts (m, n), in the coordinates of the recording [N m; N].
+        warnings: Findings of `check`; `str` of each is one line.
     """
 
     tau: NDArray[np.float64]

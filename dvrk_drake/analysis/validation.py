@@ -24,12 +24,12 @@ def validate(
     """Compares a model's efforts with those of a recording, as `dvrk-drake validate` does.
 
     For a motion and a model with dynamics, efforts are compared after the low-pass filter of the identification.
-    Otherwise holding torques are compared.
+    Otherwise, holding torques are compared.
 
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
         recording: Poses or a motion with efforts (m, n) that the model was not identified from.
-        low_speed_segments: Use the low-speed segments of a motion without rests as poses.
+        low_speed_segments: True to treat the low-speed segments of a motion without static poses as poses.
         progress: Callback that receives the step, "checking the recording" or "validating", and its finished share, 0
             to 1.
 
@@ -38,7 +38,7 @@ def validate(
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects it, see `findings` of the error.
-        IdentificationError: `low_speed_segments` is set, and there are none.
+        IdentificationError: `low_speed_segments` is True, but the motion has no low-speed segments.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -61,19 +61,19 @@ def validate(
         found = unexplained_effort({name: errors[name] for name, v in validation.verdicts.items() if v == "do not use"})
     else:
         validation = validate_static(model, poses.recording, poses.measured)
-        found = _motion(poses.recording.motion(arm), report.source)
+        found = _static_model_warning(poses.recording.motion(arm), report.source)
     share(1.0)
     if validation.of_same_recording:
-        what = "the model was identified from this recording, so these are errors of the fit"
-        found += (Finding("warning", "same recording", report.source, what, "validate with another one"),)
+        what = "the model was identified from this recording, so the errors are those of the fit"
+        found += (Finding("warning", "same recording", report.source, what, "Validate with another recording."),)
     return replace(validation, warnings=(*report.warnings, *found), note=poses.note)
 
 
-def _motion(motion: str, source: str) -> tuple[Finding, ...]:
+def _static_model_warning(motion: str, source: str) -> tuple[Finding, ...]:
     if not motion:
         return ()
-    what = f"the arm moves in this recording ({motion})"
-    advice = "the model is static: it has no inertia and no friction of motion"
+    what = f"the arm moves in this recording ({motion}), but the model is static"
+    advice = "A static model has no inertia and no friction. Validate with poses at rest."
     return (Finding("warning", "motion", source, what, advice),)
 
 
@@ -87,9 +87,9 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
             to 1.
 
     Returns:
-        Result with `tau` (m, n) [N m; N] in the recording's coordinates, and `warnings`. For a motion and a model with
-        dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification. Otherwise it
-        contains the holding torques.
+        Result with efforts `tau` (m, n) [N m; N] in the coordinates of the recording, and `warnings`. For a motion and
+        a model with dynamics, these are the total motor efforts after the low-pass filter of the identification.
+        Otherwise, they are holding torques.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects it, see `findings` of the error.
@@ -103,12 +103,12 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
         (3, 7)
     """
     arm = model.arm
-    # The functions that find and check a motion require efforts.
+    # `find_poses` and `require_usable` require efforts.
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
     if model.dynamics is None or not find_poses(measured, arm).moves:
         step_progress(progress, "predicting")(0.0)
         return Prediction(predict_static(model, recording))
-    report = require_usable(measured, arm, progress, apart_from="no effort" if recording.tau is None else "")
+    report = require_usable(measured, arm, progress, ignored_kind="no effort" if recording.tau is None else "")
     share = step_progress(progress, "predicting")
     share(0.0)
     tau = predict_motion(model, recording)

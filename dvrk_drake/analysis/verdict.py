@@ -1,6 +1,6 @@
-"""Verdict on whether the torque of each joint of a model may be commanded, based on the error on a recording.
+"""Judges from the error on a recording whether the model torque of a joint may be commanded.
 
-This module contains the thresholds, the rule and its text. docs/identification.md has the evidence for the thresholds.
+docs/identification.md has the evidence for the thresholds.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 
 Requirement = Literal["good", "usable"]
 
-#: Largest ratio of the RMS error to the RMS measured effort of a joint that is "good".
+#: Largest ratio of the RMS error to the RMS measured effort for the verdict "good".
 GOOD_RATIO = 0.35
-#: Largest ratio of a joint that is "usable", at rest. A ratio of 1 is the error of commanding zero torque.
+#: Largest ratio for the verdict "usable" at rest. Zero torque has a ratio of 1.
 USABLE_RATIO_AT_REST = 1.0
-#: Largest ratio of a joint that is "usable", in motion, where friction is part of the model.
+#: Largest ratio for the verdict "usable" in motion, where the model includes friction.
 USABLE_RATIO_IN_MOTION = 0.5
-#: Errors below this share of the effort limit are "usable" at any ratio, because friction supports the joint.
+#: Largest error, as a share of the effort limit, that is "usable" at any ratio, because friction supports the joint.
 SMALL_ERROR = 0.02
 
 
@@ -29,11 +29,11 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
     """Returns the verdict on one joint.
 
     Args:
-        effort: RMS of the measured effort, equal to the error of commanding zero torque [N m; N]; 0 if not measured.
-        error: RMS of measured minus predicted effort [N m; N]; NaN if it is not known.
+        effort: RMS measured effort, which is the error of zero torque [N m; N]; 0 if not measured.
+        error: RMS of measured minus predicted effort [N m; N]; NaN if unknown.
         effort_limit: Effort limit of the joint [N m; N].
         in_motion: True if the recording is a motion and the model has dynamics.
-        commanded: True if the model predicts an effort for this joint; False if identification disabled it.
+        commanded: False if identification disabled the feedforward of this joint.
     """
     if not commanded:
         return "off"
@@ -60,33 +60,36 @@ def rule_text(in_motion: bool) -> str:
 
 def worst(verdicts: Mapping[str, Verdict]) -> tuple[Verdict, list[str]]:
     """Returns the least favourable verdict and the joints that have it."""
-    last = max(verdicts.values(), key=get_args(Verdict).index)
-    return last, [name for name, verdict in verdicts.items() if verdict == last]
+    result = max(verdicts.values(), key=get_args(Verdict).index)
+    return result, [name for name, verdict in verdicts.items() if verdict == result]
 
 
 def unfit(verdicts: Mapping[str, str], required: Requirement) -> list[str]:
-    """Returns the joints that do not meet a requirement, with their verdicts. A joint without torque meets all."""
+    """Returns the joints that do not meet a requirement, with their verdicts. The verdict "off" meets all."""
     accepted = ("good", "off") if required == "good" else ("good", "usable", "off")
     return [f"{name} ({verdict})" for name, verdict in verdicts.items() if verdict not in accepted]
 
 
 def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...]:
-    """Returns a warning that names the joints in motion whose efforts the model does not explain.
+    """Returns a warning for the joints whose relative error in motion exceeds `USABLE_RATIO_IN_MOTION`.
 
     Args:
         errors: Relative error of each joint [1]; None if nothing was measured.
     """
-    bad = [f"{name} ({e:.0%})" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
+    bad = [f"{name} ({100 * e:.0f} %)" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
     if not bad:
         return ()
-    advice = "is a sign, a unit or --coordinates wrong, or is it another arm? Do not use the model for these"
-    return (Finding("warning", "unexplained effort", ", ".join(bad), "most of the effort is not explained", advice),)
+    what = "the model error exceeds half of the effort"
+    advice = (
+        "Do not use the model for these joints. Check the arm, the signs and units of the columns, and --coordinates."
+    )
+    return (Finding("warning", "unexplained effort", ", ".join(bad), what, advice),)
 
 
 def cross_validated_verdicts(model: IdentifiedModel) -> dict[str, Verdict]:
-    """Returns the verdict on each joint from the cross-validated errors that identification stored.
+    """Returns the verdict on each joint from the cross-validated errors of the identification.
 
-    The held-out data are from the same recording. Another recording is a stronger test.
+    Validation with another recording is a stronger test.
     """
     limits = model.arm.effort_limits
     if model.dynamics is not None:

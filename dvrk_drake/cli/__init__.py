@@ -1,6 +1,6 @@
-"""Command line of dvrk_drake. Bad input gives one line on stderr and exit code 2.
+"""Command line of dvrk_drake. Invalid input gives one line on stderr and exit code 2.
 
-This module imports nothing slow, so that Ctrl-C ends the program in order as early as possible.
+The imports of this module are fast, so that Ctrl-C gives one line of output even during the start.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns the exit code: 0, or 2 for bad input.
+    """Runs one command and returns the exit code: 0 for success, 2 for invalid input.
 
     Without `arguments`, the function uses the arguments of the process and installs a handler for Ctrl-C.
     """
@@ -27,6 +27,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def leave(*_: object) -> None:
-    """Signal handler that ends the process at once. It is installed only while no file is partly written."""
+    """Ends the process immediately on a signal. The handler is installed only while no file is partly written."""
     os.write(2, b"dvrk-drake: interrupted\n")
     os._exit(130)

@@ -28,7 +28,7 @@ MODEL, IDENTIFY, SIMULATE, HARDWARE, PAPER, OPTIONS = (
 )
 app["--help"].group = app["--version"].group = OPTIONS
 app.register_install_completion_command(
-    name="--install-completion", group=OPTIONS, help="Install the completion of commands for this shell."
+    name="--install-completion", group=OPTIONS, help="Install command completion for the current shell."
 )
 
 
@@ -40,7 +40,7 @@ def _complete_arm(_: Any) -> list[str]:
 
 def _check_seconds(_: object, value: float | None) -> None:
     if value is not None and not (math.isfinite(value) and value > 0):
-        raise ValueError("must be a number of seconds above 0")
+        raise ValueError("must be a number of seconds greater than 0")
 
 
 def whole_number(_: object, tokens: Sequence[Token]) -> int:
@@ -53,7 +53,7 @@ def whole_number(_: object, tokens: Sequence[Token]) -> int:
 
 def _check_seed(_: object, value: int) -> None:
     if value < 0:
-        raise ValueError("must be a whole number from 0")
+        raise ValueError("must be a whole number, 0 or larger")
 
 
 def one_of(title: str, least: int = 1) -> Group:
@@ -62,38 +62,51 @@ def one_of(title: str, least: int = 1) -> Group:
     def check(arguments: ArgumentCollection) -> None:
         if not least <= sum(argument.has_tokens for argument in arguments) <= 1:
             names = ", ".join(argument.name for argument in arguments)
-            raise ValueError(f"give {'one' if least else 'at most one'} of {names}")
+            raise ValueError(f"give {'exactly' if least else 'at most'} one of {names}")
 
     return Group(title, validator=check, sort_key=0)
 
 
-Arm = Annotated[str, Parameter(metavar="ARM", completer=_complete_arm, help="mtml, mtmr, psm, or an arm's YAML file.")]
-Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="An identified model, from identify.")]
-Coordinates = Annotated[Literal["joint", "actuator"], Parameter(help="Coordinates of q and tau in a CSV recording.")]
+Arm = Annotated[
+    str, Parameter(metavar="ARM", completer=_complete_arm, help="mtml, mtmr, psm, or the path of an arm file (YAML).")
+]
+Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written by identify.")]
+Coordinates = Annotated[
+    Literal["joint", "actuator"], Parameter(help="Coordinates of q, qd and tau in a CSV recording.")
+]
 Gravity = Annotated[
     tuple[float, float, float] | None,
     Parameter(
         metavar="X Y Z",
-        help="Gravity in the arm's base frame [m/s^2], for another mounting. Without it: 0 0 -9.81 or as in its file.",
+        help="Gravity vector in the base frame of the arm [m/s^2], for another mounting. Default: from the arm file.",
     ),
 ]
-Overwrite = Annotated[bool, Parameter(show_default=False, help="Replace files that exist. Without it they are kept.")]
-Verbose = Annotated[bool, Parameter(alias="-v", show_default=False, help="Print all details, not only the summary.")]
-Plots = Annotated[str | None, Parameter(metavar="FOLDER", help="Write figures into this folder, new or empty.")]
+Overwrite = Annotated[
+    bool, Parameter(show_default=False, help="Replace existing files, and write into folders that are not empty.")
+]
+Verbose = Annotated[bool, Parameter(alias="-v", show_default=False, help="Print all details.")]
+Plots = Annotated[
+    str | None, Parameter(metavar="FOLDER", help="Write figures into this folder, which must be new or empty.")
+]
 Json = Annotated[str | None, Parameter(metavar="FILE", help="Write the results as JSON.")]
-Seed = Annotated[int, Parameter(converter=whole_number, validator=_check_seed, help="Seed of random numbers.")]
+Seed = Annotated[
+    int,
+    Parameter(converter=whole_number, validator=_check_seed, help="Seed of the random number generator, 0 or larger."),
+]
 Seconds = Annotated[float, Parameter(metavar="S", validator=_check_seconds)]
-Port = Annotated[int | None, Parameter(converter=whole_number, help="Port of the page. Without it: a free one.")]
+Port = Annotated[int | None, Parameter(converter=whole_number, help="TCP port of the web page. Default: a free port.")]
 LcmUrl = Annotated[
-    str, Parameter(metavar="URL", show_default=False, help="LCM network. Without it: LCM_DEFAULT_URL, or LCM's own.")
+    str,
+    Parameter(metavar="URL", show_default=False, help="LCM network. Default: $LCM_DEFAULT_URL, or the default of LCM."),
 ]
 Key = Annotated[
     str | None,
-    Parameter(metavar="FILE", help="Key from dvrk-drake key that signs messages, the same on both sides."),
+    Parameter(metavar="FILE", help="Key file to sign messages, from dvrk-drake key. Both sides need the same key."),
 ]
 Realtime = Annotated[
-    bool, Parameter(show_default=False, help="Ask for real-time scheduling; a warning where it is not permitted.")
+    bool,
+    Parameter(show_default=False, help="Request real-time scheduling. Print a warning if it is not permitted."),
 ]
 Set = Annotated[
-    list[str] | None, Parameter(metavar="KEY=VALUE", help="Change a value of the scenario; repeat for more.")
+    list[str] | None, Parameter(metavar="KEY=VALUE", help="Change a value of the scenario. The option can be repeated.")
 ]

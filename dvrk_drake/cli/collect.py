@@ -16,7 +16,7 @@ from dvrk_drake.errors import CollectionError
 if TYPE_CHECKING:
     from dvrk_drake.processes.live_status import LiveLine
 
-_TASK = one_of("Task (give one)")
+_TASK = one_of("Task (one is required)")
 
 
 @app.command(group=HARDWARE)
@@ -28,13 +28,13 @@ def record(
     lcm_url: LcmUrl = "",
     key: Key = None,
 ) -> None:
-    """Record an arm over LCM.
+    """Record the measurements of an arm over LCM.
 
-    The file is complete up to its last row, even after Ctrl-C or an error.
+    The file contains only complete rows, even after Ctrl-C or an error.
 
     Args:
-        output: New file to write: .csv, or .log for an LCM log.
-        duration: Duration [s], counted from the first status message. Without it: until Ctrl-C.
+        output: New file: .csv for a CSV recording, .log for an LCM log.
+        duration: Duration [s], counted from the first status message. Default: until Ctrl-C.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
@@ -49,12 +49,12 @@ def record(
     recorder = Recorder(recorded, output, url, load_key(key))
     line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
-    print(f"recording {recorded.name} on LCM {url}; end with Ctrl-C", flush=True)
+    print(f"recording {recorded.name} on LCM {url}; Ctrl-C ends the recording", flush=True)
     try:
         recorder.run(float("inf") if duration is None else duration, stopped, line.show)
     finally:
         line.clear()
-    print_written(output, f"{recorder.stream.num_taken} rows")
+    print_written(output, f"{recorder.stream.num_used} rows")
     print_notes(output, recorder.notes())
 
 
@@ -71,18 +71,18 @@ def collect(
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
     traverse_time: Seconds = 5.0,
 ) -> None:
-    """Collect poses and holding torques over LCM.
+    """Collect static poses and their holding torques over LCM.
 
-    Run the same command again to continue after an interruption.
+    After an interruption, run the same command again to continue.
 
     Args:
-        poses: File of the poses, read or written.
+        poses: File of poses. --output reads it, --teach and --random add poses to it.
         output: Move the arm to each pose, and append one row per pose to this file.
-        teach: Move the arm by hand, and add the current pose to the file with Enter.
+        teach: Compensate gravity while you move the arm by hand. Enter adds the current pose to the file.
         random: Add N random poses to the file.
         at_rest: With --teach: also add each pose at which the arm rests for one second.
-        both_sides: Approach each pose from below and from above, and average the torques. This cancels dry friction.
-        traverse_time: Time to move a joint over its full range [s].
+        both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
+        traverse_time: Time to move a joint over its full range, 1 to 60 s. It sets the speed between poses.
     """
     check_output(poses, overwrite=True)
     if random is not None:
@@ -101,7 +101,7 @@ def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
     from dvrk_drake.recordings.pose_file import load_poses_if_any, save_poses
 
     if count < 1:
-        raise CollectionError(f"--random must be 1 pose or more; got {count}")
+        raise CollectionError(f"--random must be 1 or larger; got {count}")
     arm = load_arm(name)
     poses = load_poses_if_any(path, arm)
     # Near a joint limit the guard adds a restoring effort, and there is no room to approach a pose from both sides.
@@ -125,20 +125,20 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=_reporter(line))
-    when = "Enter, or a second's rest, takes" if at_rest else "Enter takes"
-    print(f"the weight of {controller.arm.name} is carried: move it by hand; {when} a pose, Ctrl-C ends", flush=True)
+    event = "Enter or one second of rest" if at_rest else "Enter"
+    print(f"{controller.arm.name} compensates gravity; move it by hand; {event} adds a pose, Ctrl-C ends", flush=True)
     try:
         control(
             link(),
             controller,
             stopped,
             lambda text: line.show(lambda: f"{len(teacher.poses)} poses; {text}"),
-            teacher.lead,
+            teacher.update,
         )
     finally:
         teacher.close()
         line.clear()
-    print_written(poses, f"{len(teacher.poses)} poses; {controller.arm.name} holds by itself")
+    print_written(poses, f"{len(teacher.poses)} poses; the guard of {controller.arm.name} regulates the pose")
 
 
 def _visit(
@@ -158,21 +158,21 @@ def _visit(
     output = CollectionFile(output_file, arm, both_sides)
     num_done = output.finished(poses).sum()
     if num_done == len(poses):
-        print(f"{output_file}: has all {len(poses)} poses already")
+        print(f"{output_file}: contains all {len(poses)} poses already")
         return
     with interrupt_ends_process():
         controller, link, _ = ready_controller(controlled, "hold")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
-    print(f"{len(poses) - num_done} poses of {arm.name} to visit; Ctrl-C stops, the same command goes on", flush=True)
+    print(f"{len(poses) - num_done} poses of {arm.name} remain; after Ctrl-C, the same command continues", flush=True)
     try:
         control(
             link(),
             controller,
             lambda: collector.finished,
             lambda text: line.show(lambda: f"{collector.describe()}; {text}"),
-            collector.lead,
+            collector.update,
         )
     finally:
         collector.close()
@@ -184,7 +184,7 @@ def _visit(
         raise KeyboardInterrupt
     if collector.unsettled:
         numbers = ", ".join(map(str, collector.unsettled))
-        raise CollectionError(f"poses left out: {numbers}; the arm did not come to rest there. Run again to try again")
+        raise CollectionError(f"the arm did not come to rest at poses {numbers}. Run the command again to repeat them")
 
 
 def _reporter(line: LiveLine) -> Callable[[str], None]:

@@ -11,7 +11,7 @@ from dvrk_drake.cli.support import Steps, check_output, new_folder, print_writte
 from dvrk_drake.progress import step_progress
 
 _DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "releasing and holding", "drawing"
-Folder = Annotated[str, Parameter(metavar="FOLDER", help="Write into this folder, new or empty.")]
+Folder = Annotated[str, Parameter(metavar="FOLDER", help="Write into this folder, which must be new or empty.")]
 
 
 @app.command(group=SIMULATE)
@@ -23,7 +23,7 @@ def demo(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate an arm, identify it, compensate it and hold it.
+    """Collect poses of a simulated arm, identify it, and test the model.
 
     Args:
         arm: Arm to simulate.
@@ -51,12 +51,12 @@ def teleop(
     port: Port = None,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate a master arm that controls a PSM.
+    """Simulate a PSM that is teleoperated with an MTM.
 
-    Move the master with sliders in a browser, or play a recorded hand motion.
+    Move the MTM with sliders in a browser, or play a recorded hand motion with --output.
 
     Args:
-        output: Play the recorded hand motion, write the scene to this page, and print the tracking error of the PSM.
+        output: Play a recorded hand motion, write an animation to this page, and print the tracking error of the PSM.
     """
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.files import atomic_write
@@ -67,8 +67,8 @@ def teleop(
     if output is None:
         meshcat = start_scene(port)
         print(
-            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
-            "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
+            f"MTML controls PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale are under Open Controls; "
+            "the arms appear after some seconds; Stop, Escape or Ctrl-C ends",
             flush=True,
         )
         run_live_teleoperation(meshcat)
@@ -95,13 +95,12 @@ def reproduce(
 ) -> None:
     """Reproduce the figures and tables of the paper.
 
-    The page shows the published numbers beside the reproduced ones.
+    The command writes a page that compares published and reproduced numbers.
+    Without the recording of the paper, Fig. 4 is omitted and a different MTM is simulated.
 
     Args:
         what: Table, figure or experiment to reproduce.
-        data: Folder with the paper's recording mtm_2015_good72.csv (docs/reproduction.md). Without it:
-            $DVRK_DRAKE_SHARED/data/mtm_static. If that is missing too, Fig. 4 is omitted and the other figures use a
-            different simulated arm.
+        data: Folder of mtm_2015_good72.csv (docs/reproduction.md). Default: $DVRK_DRAKE_SHARED/data/mtm_static.
     """
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
     from dvrk_drake.reports.reproduction.run import NAMES
@@ -110,7 +109,7 @@ def reproduce(
     quiet_drake()
     recordings = PaperRecordings.find(data)
     if what == "fig4":
-        _ = recordings.poses  # reject missing recordings before creating a folder
+        _ = recordings.poses  # rejects a missing recording before the folder is created
     output = new_folder(folder, overwrite=overwrite)
     names = NAMES if what == "all" else (what,)
     with Steps(*names) as steps:

@@ -15,11 +15,11 @@ from dvrk_drake.errors import DvrkDrakeError, ModelError
 if TYPE_CHECKING:
     from dvrk_drake.export.model_export import Format
 
-_SOURCE = one_of("Source (give one)")
-_GRAVITY_COMPENSATION = Group("Options of --dvrk-gc (--gc-tolerance also of --dvrk-kinematic-gc)")
-SourceArm = Annotated[Arm | None, Parameter(group=_SOURCE, help="What the SDF of this arm states.")]
+_SOURCE = one_of("Source (one is required)")
+_GRAVITY_COMPENSATION = Group("Options of --dvrk-gc (--gc-tolerance: also of --dvrk-kinematic-gc)")
+SourceArm = Annotated[Arm | None, Parameter(group=_SOURCE, help="Use the nominal model of this arm, from its SDF.")]
 SourceModel = Annotated[Model | None, Parameter(group=_SOURCE)]
-OfEachJoint = Annotated[
+PerJoint = Annotated[
     tuple[float, float, float, float, float, float, float] | None,
     Parameter(metavar="J1 .. J7", group=_GRAVITY_COMPENSATION),
 ]
@@ -39,28 +39,27 @@ def export(
     verbose: Verbose = False,
     gc_tolerance: Annotated[float | None, Parameter(metavar="NM", group=_GRAVITY_COMPENSATION)] = None,
     friction: Annotated[bool, Parameter(show_default=False, group=_GRAVITY_COMPENSATION)] = False,
-    coulomb: OfEachJoint = None,
-    friction_ratio: OfEachJoint = None,
-    dead_band: OfEachJoint = None,
-    saturation: OfEachJoint = None,
+    coulomb: PerJoint = None,
+    friction_ratio: PerJoint = None,
+    dead_band: PerJoint = None,
+    saturation: PerJoint = None,
 ) -> None:
-    """Write a model as SDF, URDF or files of the dVRK.
+    """Export a model as SDF, URDF or gravity-compensation file of the dVRK.
 
-    One call can write several files.
+    One call can write several files. Export an identified model: the masses in the SDF of an arm are estimates.
 
     Args:
-        sdf: SDF file to write, with the inertias of the model. Meshes are written to a folder beside it.
-        urdf: URDF file to write, as for --sdf. The linkage is written as mimic joints.
-        dvrk_gc: Gravity-compensation file of the dVRK controller for an MTM. With --arm, whose masses are estimates, it
-            requires --gc-tolerance. Identify your arm first.
+        sdf: SDF file to write, with the inertias of the model. Its meshes are copied to a folder next to it.
+        urdf: URDF file to write, like --sdf. The linkage becomes mimic joints.
+        dvrk_gc: Gravity-compensation file of the dVRK controller for an MTM.
         dvrk_kinematic_gc: Gravity-compensation file of the dVRK controller for a PSM.
-        diff: Print the differences from the arm's own SDF, line by line.
-        gc_tolerance: Largest accepted difference between the file and the model [N m]. Without it: 1e-6.
-        friction: Also compensate the Coulomb friction of the model. Requires a model identified from a motion.
+        diff: Print the differences between the SDF of the arm and the exported SDF.
+        gc_tolerance: Largest accepted error of the file with respect to the model [N m; N]. Default: 1e-6.
+        friction: Also compensate the dry friction of the model, which must be identified from a motion.
         coulomb: Coulomb friction of each joint [N m], instead of --friction.
-        friction_ratio: Share of the friction to compensate, 0 to 1, per joint. Without it: as in dVRK files in use.
-        dead_band: Joint speed [rad/s] below which friction is not compensated. Without it: as in files in use.
-        saturation: Joint speed [rad/s] above which friction is fully compensated. Without it: as in files in use.
+        friction_ratio: Share of --friction or --coulomb to compensate, 0 to 1. Default: 0.8 0.8 0.8 0.4 0.6 0.6 0.
+        dead_band: Speeds [rad/s] without friction compensation. Default: 0.02 0.02 0.02 0.01 0.008 0.008 0.01.
+        saturation: Speeds [rad/s] from which the full share is compensated. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export
@@ -68,17 +67,17 @@ def export(
     from dvrk_drake.reports.export import print_export
     from dvrk_drake.reports.terminal_tables import make_console
 
-    named: dict[Format, str | None] = {
+    requested: dict[Format, str | None] = {
         "sdf": sdf,
         "urdf": urdf,
         "dvrk-gc": dvrk_gc,
         "dvrk-kinematic-gc": dvrk_kinematic_gc,
     }
-    outputs = {format: path for format, path in named.items() if path is not None}
+    outputs = {format: path for format, path in requested.items() if path is not None}
     if not outputs and not diff:
-        raise DvrkDrakeError(f"nothing to write; give {' or '.join('--' + format for format in named)}, or --diff")
+        raise DvrkDrakeError(f"no output is given; use {', '.join('--' + format for format in requested)} or --diff")
     if friction and coulomb is not None:
-        raise DvrkDrakeError("--friction and --coulomb both say how large friction is; give one")
+        raise DvrkDrakeError("--friction and --coulomb exclude each other; give one of them")
     loaded = load_model(model, arm)
     for format, path in outputs.items():
         check_output(path, model or "", overwrite=overwrite)
@@ -123,7 +122,7 @@ def compare_gc(
 ) -> None:
     """Compare a gravity-compensation file of the dVRK with a model.
 
-    The comparison covers static poses over the full range of all joints.
+    The comparison covers random static poses over the full range of all joints.
 
     Args:
         file: Gravity-compensation file (gc-*.json) of the dVRK controller.
@@ -151,7 +150,9 @@ def compare_gc(
     if folder is not None:
         from dvrk_drake.reports.figures.export import plot_compensation
 
-        plot_compensation(folder / "compensation.png", comparison, f"{file} and {origin} over the joint box, at rest")
+        plot_compensation(
+            folder / "compensation.png", comparison, f"Static torque of {file} and {origin} over the joint range"
+        )
         print_written(folder)
     if json is not None:
         print_written(json)

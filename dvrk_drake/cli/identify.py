@@ -32,13 +32,15 @@ from dvrk_drake.cli.support import (
 )
 from dvrk_drake.errors import ModelError
 
-Recording = Annotated[str, Parameter(help="CSV with header q1..qn, tau1..taun (t, qd1..qdn optional), or an LCM log.")]
-NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="The model file to write.")]
+Recording = Annotated[
+    str, Parameter(help="CSV file with columns q1..qn, tau1..taun, optionally t, qd1..qdn; or LCM log.")
+]
+NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 LowSpeedSegments = Annotated[
-    bool, Parameter(show_default=False, help="Of a motion without rests: take its low-speed segments as poses.")
+    bool, Parameter(show_default=False, help="Treat low-speed segments of a motion as static poses.")
 ]
 _STEPS = "reading", "checking the recording"
-_SOURCE = one_of("Source of the model (give one)")
+_SOURCE = one_of("Source of the model (one is required)")
 
 
 @app.command(group=IDENTIFY)
@@ -58,10 +60,10 @@ def identify(
 ) -> None:
     """Identify a model from a recording.
 
-    A recorded motion gives the full dynamics. Static poses give the gravity torque.
+    A motion determines the full dynamics, including friction. Static poses determine only the holding torque.
 
     Args:
-        method: Method for static poses: robust, or the least squares of the paper.
+        method: Method for static poses: robust regression, or the least squares of the paper.
     """
     from dvrk_drake.reports.identification import print_identification
     from dvrk_drake.reports.terminal_tables import make_console
@@ -111,14 +113,14 @@ def validate(
     low_speed_segments: LowSpeedSegments = False,
     json: Json = None,
     plots: Plots = None,
-    overwrite: Overwrite = False,
+    overwrite: Annotated[Overwrite, Parameter(help="Replace existing files, plots and stored verdicts.")] = False,
     verbose: Verbose = False,
 ) -> None:
-    """Compare a model with another recording.
+    """Evaluate the error of a model on another recording.
 
     Args:
-        require: Return exit code 2 unless every joint with feedforward has at least this verdict.
-        save: Store the verdicts in the model file. The command run checks them.
+        require: Exit with code 2 unless each joint with feedforward has at least this verdict.
+        save: Store the verdicts in the model file, where the command run checks them.
     """
     from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console
@@ -131,10 +133,12 @@ def validate(
         if save:
             check_output(model, recording, overwrite=True)
             if read.sha256 and read.sha256 == loaded.provenance.sha256:
-                raise ModelError(f"{read.source}: --save needs a recording that the model was not identified from")
+                raise ModelError(
+                    f"{read.source}: the model was identified from this recording; --save requires another one"
+                )
             if loaded.validation is not None and not overwrite:
                 saved = loaded.validation.recording
-                raise ModelError(f"{model}: has verdicts from {saved} already; replace them with --overwrite")
+                raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
         validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
     # Save before printing: the reader of the output may close the pipe (head).
     if save:
@@ -155,7 +159,7 @@ def validate(
     if json is not None:
         print_written(json)
     if save:
-        print_written(model, "with the verdicts")
+        print_written(model, "verdicts stored")
     if require is not None and (failed := validation.unfit(require)):
         raise ModelError(
             f"{model}: not {require} on {read.source}: {', '.join(failed)}; identify from a recording with more varied "
@@ -173,13 +177,13 @@ def predict(
     coordinates: Coordinates = "joint",
     overwrite: Overwrite = False,
 ) -> None:
-    """Write the efforts that a model predicts for a recording.
+    """Predict the efforts of a recording with a model.
 
-    For a motion, the predicted efforts are low-pass filtered with the cut-off of the model. For static poses, they are
-    holding efforts.
+    For a motion and a model with dynamics: total efforts, low-pass filtered as in the identification.
+    Otherwise: holding efforts.
 
     Args:
-        output: CSV file to write, with columns tau1..taun [N m, N].
+        output: CSV file to write: tau1..taun [N m; N if prismatic], in the coordinates of the recording.
     """
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
@@ -204,10 +208,9 @@ def recalibrate(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Refit friction and offsets to a short motion of another day.
+    """Refit the friction and offsets of a model to a short new motion.
 
-    The improvement is valid for similar motions. It can be much smaller at other positions and speeds
-    (docs/payload.md).
+    The result is valid for similar motions, positions and speeds only (docs/payload.md).
     """
     from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
@@ -226,8 +229,8 @@ def payload(
     loaded: str,
     /,
     *,
-    arm: Annotated[Arm | None, Parameter(group=_SOURCE, help="Its model is identified from REFERENCE.")] = None,
-    model: Annotated[Model | None, Parameter(group=_SOURCE, help="Identified from a motion.")] = None,
+    arm: Annotated[Arm | None, Parameter(group=_SOURCE, help="Identify the model of this arm from REFERENCE.")] = None,
+    model: Annotated[Model | None, Parameter(group=_SOURCE, help="Model identified from a motion.")] = None,
     link: Annotated[str | None, Parameter(metavar="NAME")] = None,
     coordinates: Coordinates = "joint",
     gravity: Gravity = None,
@@ -237,29 +240,29 @@ def payload(
 ) -> None:
     """Estimate the mass and centre of mass of a payload.
 
-    The estimate compares two recordings of one motion, without and with the payload.
+    The command compares two recordings of the same motion, one without and one with the payload.
 
     Args:
         reference: Recording of the motion without the payload.
         loaded: Recording of the same motion with the payload.
-        link: Name of the SDF link that carries the payload. Without it: the link with the best fit.
+        link: SDF link that carries the payload. Default: the link with the smallest cross-validated error.
     """
     from dvrk_drake.reports.payload import print_payload
     from dvrk_drake.reports.terminal_tables import make_console
 
     if model is not None and gravity is not None:
-        raise ModelError(f"{model}: states its gravity; --gravity is for --arm")
+        raise ModelError("--gravity requires --arm; with --model, the gravity vector of the model is used")
     if json is not None:
         check_output(json, reference, loaded, overwrite=overwrite)
-    known = None if model is None else dvrk.IdentifiedModel.load(model)
-    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if known is None else known.arm
-    with Steps(*_STEPS, *(["identifying"] if known is None else []), "estimating") as steps:
-        without, with_it = (
-            dvrk.read_recording(p, recorded_arm, coordinates, progress=steps) for p in (reference, loaded)
+    identified = None if model is None else dvrk.IdentifiedModel.load(model)
+    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if identified is None else identified.arm
+    with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
+        without_payload, with_payload = (
+            dvrk.read_recording(path, recorded_arm, coordinates, progress=steps) for path in (reference, loaded)
         )
-        for recording in (without, with_it):
+        for recording in (without_payload, with_payload):
             print_notes(recording.source, recording.notes)
-        result = dvrk.payload(without, with_it, known or recorded_arm, link, progress=steps)
+        result = dvrk.payload(without_payload, with_payload, identified or recorded_arm, link, progress=steps)
     if json is not None:
         write_json(json, result.as_dicts())
     console = make_console()

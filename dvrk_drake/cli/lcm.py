@@ -30,7 +30,7 @@ class ControlledArm:
 
     arm: Arm
     model: Annotated[
-        Model | None, Parameter(help="An identified model, from identify. Without it: what the arm's SDF states.")
+        Model | None, Parameter(help="Model file, written by identify. Default: the nominal model from the SDF.")
     ] = None
     lcm_url: LcmUrl = ""
     key: Key = None
@@ -39,7 +39,7 @@ class ControlledArm:
         bool,
         Parameter(
             show_default=False,
-            help="Print why the arm has a fault or its guard took over, and clear that before it is controlled.",
+            help="Print and clear a fault of the arm, and resume control after its guard took over.",
         ),
     ] = False
 
@@ -56,12 +56,12 @@ def arm(
     meshcat: Annotated[bool, Parameter(show_default=False)] = False,
     realtime: Realtime = False,
 ) -> None:
-    """Run a simulated arm on LCM, with the safeguards of a driver.
+    """Run a simulated arm with its driver and command guard on LCM.
 
     Args:
-        driver: Configuration file of the driver, with the fields of DvrkDriver.
-        pose: Initial joint positions [rad, m]. Without it: near zero.
-        meshcat: Show the arm in a browser.
+        driver: Configuration file of the driver (docs/lcm.md). Default: the default driver.
+        pose: Initial joint positions [rad; m if prismatic]. Default: near zero, inside the joint limits.
+        meshcat: Show the arm in a web browser.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
@@ -71,36 +71,36 @@ def arm(
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
     quiet_drake()
-    played = mounted(load_arm(arm), gravity)
+    simulated_arm = mounted(load_arm(arm), gravity)
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
-    start = start_pose(played, pose)
+    start = start_pose(simulated_arm, pose)
     url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
-    print(f"starting the simulated {played.name}", flush=True)
+    print(f"starting the simulated {simulated_arm.name}", flush=True)
     with interrupt_ends_process():
-        simulated = SimulatedArm(played, configuration, url, start)
+        simulated = SimulatedArm(simulated_arm, configuration, url, start)
         stopped = stop_on_signals()
     with live_view(arm, url) if meshcat else nullcontext():
         if realtime:
             for warning in make_realtime():
                 _warn(warning)
         settle_memory()
-        print(f"simulated {played.name} on LCM {url}; end with Ctrl-C", flush=True)
+        print(f"simulated {simulated_arm.name} on LCM {url}; Ctrl-C ends", flush=True)
         pace = simulated.run(stopped, lambda line: print(line, flush=True))
-    print(f"ended; {pace.late} ticks began more than a period late", flush=True)
+    print(f"ended; {pace.late} steps started more than one period late", flush=True)
 
 
 @app.command(group=HARDWARE)
 def key(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
-    """Create a key that signs LCM messages.
+    """Create a key to sign LCM messages.
 
     Args:
-        output: New key file, readable only by its owner.
+        output: New key file. Only its owner can read it.
     """
     from dvrk_drake.models.lcm_messages import create_key_file
 
     create_key_file(output)
-    print_written(output, "copy it to the other side, e.g. with scp -p, and name it on both with --key")
+    print_written(output, "copy it to the other side, e.g. with scp -p, and use --key on both sides")
 
 
 @app.command(group=HARDWARE)
@@ -113,16 +113,14 @@ def run(
     hysteresis_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     friction_model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
 ) -> None:
-    """Compensate the gravity of an arm over LCM, or hold it.
+    """Control an arm over LCM: gravity compensation, damping or pose regulation.
 
     Args:
-        mode: gravity: an operator moves the arm freely. damped: as gravity, with damping. hold: the arm holds its pose.
-        gains: Gains from the command tune, for modes hold and damped. Without it: the default gains of the arm.
-        friction_ratio: Share of the friction to compensate in mode gravity, 0 to 0.6. It is reduced where the arm could
-            creep.
-        hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9, so that the arm stays
-            where it is released.
-        friction_model: Model identified from a motion, whose friction is compensated. Without it: the one of --model.
+        mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
+        gains: Gains from the command tune, for modes damped and hold. Default: the gains of the arm file.
+        friction_ratio: Compensated share of the friction in mode gravity, 0 to 0.6. Reduced if the arm could creep.
+        hysteresis_ratio: Compensated share of the wide hysteresis in mode gravity, 0 to 0.9.
+        friction_model: Model with the friction, identified from a motion. Default: --model.
     """
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
@@ -135,25 +133,26 @@ def run(
         stopped = stop_on_signals()
     name = controller.arm.name
     print(
-        f"{mode} of {name} at {1 / period:.0f} Hz as sender {controller.sender_id}; Ctrl-C leaves it to its own hold",
+        f"mode {mode} of {name} at {1 / period:.0f} Hz as sender {controller.sender_id}; after Ctrl-C, the guard "
+        "regulates the pose",
         flush=True,
     )
     line, printed = LiveLine(sys.stderr), [("", "")]
 
     def show(status: LiveStatus) -> None:
-        if (news := (status.state, status.problem)) == printed[0]:
+        if (current := (status.state, status.problem)) == printed[0]:
             line.show(lambda: str(status))
             return
-        printed[0] = news
+        printed[0] = current
         line.clear()
         print(status, flush=True)
 
     try:
-        # Open a new link: messages that arrived while the controller was compiled are out of date.
+        # Messages that arrived during the compilation of the controller are out of date, so a new link is opened.
         control(link(), controller, stopped, show)
     finally:
         line.clear()
-    print(f"{name} holds by itself", flush=True)
+    print(f"control ended; the guard of {name} regulates the pose", flush=True)
 
 
 def _gains(path: str, mode: Mode, arm: str) -> Gains:
@@ -167,7 +166,7 @@ def _gains(path: str, mode: Mode, arm: str) -> Gains:
     from dvrk_drake.models.arm_schema import load_gains
 
     if mode == "gravity":
-        raise ControllerError("--gains is for --mode hold or damped: in mode gravity the arm is not regulated")
+        raise ControllerError("--gains requires --mode hold or damped; mode gravity does not use gains")
     gains = load_gains(path)
     if fault := load_arm(arm).gains_fault(gains):
         raise ControllerError(f"{path}: {fault}")
@@ -193,20 +192,19 @@ def _friction_compensator(
 
     if mode != "gravity":
         raise ControllerError(
-            "--friction-ratio and --hysteresis-ratio are for --mode gravity: an arm that is held or braked shall not "
-            "be easy to move"
+            f"--friction-ratio and --hysteresis-ratio require --mode gravity; mode {mode} does not compensate friction"
         )
     if controlled.model is None:
         raise ControllerError(
-            "--friction-ratio and --hysteresis-ratio need --model: without friction an arm creeps if its weight is "
-            "not known well"
+            "--friction-ratio and --hysteresis-ratio require --model; with compensated friction, an inaccurate "
+            "gravity model makes the arm creep"
         )
     arm, model = load_arm(controlled.arm), IdentifiedModel.load(controlled.model)
     error = holding_error(model)
     if ratio and not error.any():
         raise ControllerError(
-            f"--friction-ratio needs a --model from identify of poses at rest; {controlled.model} does not say how "
-            "wrong its weight may be, so nothing would keep the arm from creeping"
+            f"--friction-ratio requires a --model identified from static poses; {controlled.model} has no error bound "
+            "at rest, so the arm could creep"
         )
     friction = Friction.of_model(IdentifiedModel.load(friction_model or controlled.model, arm))
     compensator = FrictionCompensator(
@@ -215,10 +213,10 @@ def _friction_compensator(
         hysteresis_ratio=hysteresis_ratio,
         holding_error=error,
     )
-    of_effects = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
-    less = {e.coordinate: r for e, r, springs_back in of_effects if not springs_back}
-    if said := ", ".join(f"{name} {r:.2f}" for name, r in less.items() if r < 0.99 * ratio):
-        _warn(f"friction is compensated less where what remains must hold the arm against the model's error: {said}")
+    elements = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
+    ratios = {e.coordinate: r for e, r, springs_back in elements if not springs_back}
+    if reduced := ", ".join(f"{name} {r:.2f}" for name, r in ratios.items() if r < 0.99 * ratio):
+        _warn(f"the friction ratio is reduced, because friction must resist the error of the gravity model: {reduced}")
     return compensator
 
 
@@ -276,14 +274,14 @@ def model_warning(path: str, model: IdentifiedModel) -> str:
 
     if model.validation is None:
         bad = unfit(cross_validated_verdicts(model), "usable")
-        found = f"; cross-validated: {', '.join(bad)}" if bad else ""
+        verdict = f"; verdict by cross-validation: {', '.join(bad)}" if bad else ""
         command = f"dvrk-drake validate OTHER.csv --model {path} --save"
-        return f"{path}: no other recording has validated this model{found}; run: {command}"
+        return f"{path}: the model was not validated on another recording{verdict}; run: {command}"
     verdicts = model.validation.verdicts
     if not (bad := unfit({joint.name: verdicts[joint.name] for joint in model.joints}, "usable")):
         return ""
-    where = model.validation.recording
-    return f"{path}: did not pass validation on {where}: {', '.join(bad)}; their torque may be worse than none"
+    recording = model.validation.recording
+    return f"{path}: failed validation on {recording}: {', '.join(bad)}; zero torque may be better for these joints"
 
 
 def _warn(text: str) -> None:

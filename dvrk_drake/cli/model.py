@@ -21,11 +21,11 @@ def model(
     overwrite: Overwrite = False,
     gravity: Gravity = None,
 ) -> None:
-    """Show base parameters, or write gravity as source code.
+    """Show the base parameters of gravity, or generate source code.
 
     Args:
-        format: Print the gravity torque and its regressor as source code in this language.
-        output: File for the source code. Without it: standard output.
+        format: Generate source code of the gravity torque and its regressor in this language.
+        output: File for the source code. Default: standard output.
     """
     from dvrk_drake.dynamics.gravity_regressor import derive_gravity
     from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
@@ -67,12 +67,12 @@ def view(
     lcm_url: LcmUrl = "",
     port: Port = None,
 ) -> None:
-    """Show an arm in a browser.
+    """Show an arm in a web browser.
 
-    The sliders move the joints and keep the linkage closed.
+    Sliders set the joint positions. The linkage stays closed.
 
     Args:
-        live: Show the pose from the arm's status messages, without sliders.
+        live: Show the measured pose from the LCM messages of the arm, without sliders.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.control import ArmLink
@@ -82,17 +82,17 @@ def view(
 
     quiet_drake()
     if lcm_url and not live:
-        raise DvrkDrakeError("--lcm-url needs --live")
+        raise DvrkDrakeError("--lcm-url requires --live")
     shown = load_arm(arm)
     url = open_lcm(lcm_url).get_lcm_url() if live else ""
     meshcat = start_meshcat(shown, port=port)
     arm_view = ArmView(shown, meshcat)
-    ending = "end with Stop, Escape or Ctrl-C"
+    ending = "Stop, Escape or Ctrl-C ends"
     if live:
         link = ArmLink(shown, url, replays=True)
         print(f"{shown.name} live at {meshcat.web_url()}; {ending}", flush=True)
         until_stopped(meshcat, lambda: show_status(arm_view, link))
         return
     arm_view.add_sliders()
-    print(f"{shown.name} at {meshcat.web_url()}; sliders under Open Controls; {ending}", flush=True)
+    print(f"{shown.name} at {meshcat.web_url()}; the sliders are under Open Controls; {ending}", flush=True)
     until_stopped(meshcat, arm_view.follow_sliders)

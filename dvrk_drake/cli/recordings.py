@@ -25,12 +25,12 @@ def check(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Check a recording and report problems.
+    """Check a recording and report its problems.
 
-    The exit code is 2 if no model can be identified from the recording.
+    The exit code is 2 if the recording is not suitable for identification.
 
     Args:
-        recording: CSV with header q1..qn, tau1..taun (t, qd1..qdn optional), or an LCM log.
+        recording: CSV file with columns q1..qn, tau1..taun, optionally t, qd1..qdn; or LCM log.
     """
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
@@ -55,7 +55,7 @@ def check(
         if plot_report(folder, report, checked, recorded_arm):
             print_written(folder)
         else:
-            print_notes(recording, ["no plots: spectra need a motion with efforts at a known rate"])
+            print_notes(recording, ["no plots were written; spectra require a motion with efforts and time stamps"])
     for refusal in report.refusals[1:]:
         print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:
@@ -76,19 +76,19 @@ def convert(
     skip_invalid: Annotated[bool, Parameter(show_default=False)] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Convert a recording to the CSV of this project.
+    """Convert a recording to the CSV format of this project.
 
-    Accepted formats are CSV, LCM logs, .mat files of the JHU-WPI team, and CSV files of WPI.
+    Formats: csv, lcm-log, team-mat (MATLAB files of JHU and WPI), wpi-csv (CSV of WPI, no header).
 
     Args:
         recording: File to convert.
         output: CSV file to write.
-        input_format: Format of the recording. Without it: detected.
-        coordinates: Coordinates of q and tau, required for a CSV with a header. All other formats define them.
-        variable: Variable of the .mat file, required if several variables fit.
-        rate: Sampling rate [Hz] of a CSV without time stamps. Without it: 200 for WPI; no times with a header.
-        arm: CSV, WPI: convert actuator to joint coordinates of this arm. LCM log: arm to read.
-        skip_invalid: Skip and count rows that contain an empty cell, NaN or an infinite value.
+        input_format: Format of the recording. Default: detected from the content.
+        coordinates: Coordinates of q and tau, required for format csv. The other formats define them.
+        variable: Variable of a team-mat file. Required if several variables match.
+        rate: Sampling rate [Hz] of rows without time stamps. Default: 200 for wpi-csv; csv remains without times.
+        arm: For csv and wpi-csv: convert to joint coordinates of this arm. For lcm-log: arm to read.
+        skip_invalid: Skip rows with an empty cell, NaN or an infinite value, and print their number.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording
 

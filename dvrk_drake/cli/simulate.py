@@ -16,8 +16,8 @@ from dvrk_drake.progress import step_progress
 if TYPE_CHECKING:
     from dvrk_drake.experiments.transparency import Compensation
 
-_SCENARIO = one_of("Source (give one)")
-_WHERE = one_of("Where it runs (give one at most)", least=0)
+_SCENARIO = one_of("Source (one is required)")
+_EXECUTOR = one_of("Computers (at most one option)", least=0)
 
 
 @app.command(group=SIMULATE)
@@ -25,7 +25,10 @@ def simulate(
     scenario: Annotated[str | None, Parameter(group=_SCENARIO)] = None,
     /,
     *,
-    arm: Annotated[Arm | None, Parameter(group=_SCENARIO, help="Hold this arm at its home.")] = None,
+    arm: Annotated[
+        Arm | None,
+        Parameter(group=_SCENARIO, help="Regulate this arm at its home position."),
+    ] = None,
     set: Set = None,
     output: Annotated[str | None, Parameter(metavar="RECORDING.csv")] = None,
     plots: Plots = None,
@@ -33,12 +36,12 @@ def simulate(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate an arm under control and record it.
+    """Simulate a controlled arm and record its motion.
 
     Args:
-        scenario: YAML file of the scenario: arm, controller, motion, effects.
-        output: File to write, with t [s], q, qd and tau of all joints.
-        meshcat: Show the simulation in a browser, in real time.
+        scenario: YAML file with the arm, controller, motion and simulated effects.
+        output: CSV file to write, with t [s], and q, qd and tau of all joints [rad, m, N m, N].
+        meshcat: Show the simulation in a web browser, in real time.
     """
     from dvrk_drake.models.arm import known_arms
     from dvrk_drake.reports.simulation import print_simulation
@@ -46,7 +49,7 @@ def simulate(
 
     quiet_drake()
     if scenario in known_arms():
-        raise ScenarioError(f"{scenario} is an arm, not a scenario; name it with --arm {scenario}")
+        raise ScenarioError(f"{scenario} is an arm, not a scenario; use --arm {scenario}")
     source = arm or scenario or ""
     loaded = dvrk.load_scenario(source, set or [])
     folder = plots_folder(plots, overwrite=overwrite)
@@ -57,10 +60,10 @@ def simulate(
         print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
-    named = (scenario or f"--arm {arm}") if folder is None else None
+    argument = (scenario or f"--arm {arm}") if folder is None else None
     if output is not None:
         dvrk.write_recording(simulation.recording, output)
-    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=named, verbose=verbose)
+    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=argument, verbose=verbose)
     if output is not None:
         print_written(output, f"{len(simulation.recording)} rows")
     if folder is not None:
@@ -69,13 +72,13 @@ def simulate(
         plot_simulation(folder / "positions.png", simulation, loaded)
         print_written(folder)
     if page is not None:
-        print("the page can play the motion again; end with Stop, Escape or Ctrl-C", flush=True)
+        print("the page can replay the motion; Stop, Escape or Ctrl-C ends", flush=True)
         until_stopped(page)
 
 
 def _check_workers(_: object, value: int | None) -> None:
     if value is not None and not 1 <= value <= 1024:
-        raise ValueError("must be a number of processes, 1..1024")
+        raise ValueError("must be a number of processes from 1 to 1024")
 
 
 @app.command(group=SIMULATE)
@@ -86,19 +89,19 @@ def study(
     output: Annotated[str, Parameter(metavar="RESULTS.csv")],
     set: Set = None,
     workers: Annotated[
-        int | None, Parameter(metavar="N", group=_WHERE, converter=whole_number, validator=_check_workers)
+        int | None, Parameter(metavar="N", group=_EXECUTOR, converter=whole_number, validator=_check_workers)
     ] = None,
-    scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_WHERE)] = None,
+    scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_EXECUTOR)] = None,
     plots: Plots = None,
-    overwrite: Overwrite = False,
+    overwrite: Annotated[Overwrite, Parameter(help="Write into a folder of --plots that is not empty.")] = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate a scenario over many poses, seeds and errors.
+    """Simulate a scenario with many poses, seeds and variations.
 
     Args:
         study: YAML file of the study.
-        output: Results file, .csv or .parquet. An unfinished file of the same study is continued, not replaced.
-        workers: Number of processes on this computer. Without it: one per core.
+        output: Results file, .csv or .parquet. An existing file of the same study is continued, not replaced.
+        workers: Number of processes on this computer, 1 to 1024. Default: one per core.
         scheduler: Address of a Dask cluster that runs the study, e.g. tcp://host:8786.
     """
     from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
@@ -136,20 +139,24 @@ def study(
 def tune(
     *,
     arm: Arm,
-    method: Literal["paper", "model", "both"] = "both",
+    method: Annotated[
+        Literal["paper", "model", "both"],
+        Parameter(
+            help="paper: raise Kp until the joint oscillates, then set Kv and Ki. model: design gains from inertia, "
+            "friction and delay."
+        ),
+    ] = "both",
     output: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find controller gains on the simulated arm.
+    """Tune controller gains on a simulated arm.
 
-    The new gains are compared with the default gains of the arm.
+    The command compares the new gains with the gains of the arm file.
 
     Args:
-        method: paper: raise Kp until the arm oscillates, then set Kv and Ki. model: compute gains from inertia,
-            friction and delay.
-        output: File for the gains. With both methods, the better gains are written.
+        output: File for the gains. With method both, the better gains are written.
     """
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
     from dvrk_drake.models.arm import load_arm
@@ -195,16 +202,16 @@ def transparency(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate the interaction force at the handle of an arm.
+    """Simulate the interaction force when an operator moves an arm.
 
     Args:
-        path: Recording of the motion to follow. Without it: a motion through random poses.
-        speed: Speed factor for the recorded motion; 2 is twice as fast.
-        model: Model used for compensation; repeat to compare several. Without it: the model in the arm's SDF.
-        friction_ratio: Share of the friction to compensate, 0 to 0.6.
-        simulated_effects: Friction, cable and sensor effects to simulate, as in a scenario. Without it: all.
-        frame: SDF frame of the handle. Without it: dh_7 for an MTM, dh_6 for a PSM.
-        output: File for the table.
+        path: Recording of the motion of the operator. Default: a motion through random poses.
+        speed: Speed factor of the recorded motion. 2 doubles the speed.
+        model: Model for compensation. Repeat to compare models. Default: the nominal model from the SDF.
+        friction_ratio: Compensated share of the friction, 0 to 0.6.
+        simulated_effects: Effects to simulate (docs/simulated_effects.md), e.g. friction cables. Default: all.
+        frame: SDF frame at which the operator holds the arm. Default: dh_7 for an MTM, dh_6 for a PSM.
+        output: CSV file for the results.
     """
     from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
     from dvrk_drake.models.arm import load_arm
@@ -213,36 +220,39 @@ def transparency(
     from dvrk_drake.reports.transparency import print_transparency, write_transparency
 
     quiet_drake()
-    led = load_arm(arm)
-    effects = led.effects.only(simulated_effects or ["all"])
-    followed = random_path(led)
+    moved_arm = load_arm(arm)
+    effects = moved_arm.effects.only(simulated_effects or ["all"])
+    followed = random_path(moved_arm)
     if path is not None:
-        followed = recorded_path(led, read_recording(path, led, coordinates), 1.0 if speed is None else speed)
+        motion = read_recording(path, moved_arm, coordinates)
+        followed = recorded_path(moved_arm, motion, 1.0 if speed is None else speed)
     elif speed is not None:
-        raise ScenarioError("--speed is that of a recorded motion; name one with --path")
-    compensations = _compensations(led, model or [], friction_ratio)
+        raise ScenarioError("--speed requires --path with a recorded motion")
+    compensations = _compensations(moved_arm, model or [], friction_ratio)
     if output is not None:
         if not output.endswith(".csv"):
             raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
         check_output(output, path or "", *(model or []), overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     forces = []
-    names = [f"compensation by {compensation.name}" for compensation in compensations]
+    names = [f"compensation by {one.name}" if one.model else "no compensation" for one in compensations]
     with Steps(*names) as steps:
         for name, compensation in zip(names, compensations, strict=True):
             progress = step_progress(steps, name)
             forces.append(
-                simulate_operator(led, followed, compensation, effects=effects, frame_name=frame, progress=progress)
+                simulate_operator(
+                    moved_arm, followed, compensation, effects=effects, frame_name=frame, progress=progress
+                )
             )
     if output is not None:
         write_transparency(Path(output), forces)
-    print_transparency(make_console(), led, forces, verbose=verbose)
+    print_transparency(make_console(), moved_arm, forces, verbose=verbose)
     if output is not None:
         print_written(output)
     if folder is not None:
         from dvrk_drake.reports.figures.transparency import plot_transparency
 
-        plot_transparency(folder / "transparency.png", led, forces)
+        plot_transparency(folder / "transparency.png", moved_arm, forces)
         print_written(folder)
 
 
@@ -261,9 +271,9 @@ def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> li
     for path in paths:
         name = Path(path).stem
         if name in models:
-            raise ModelError(f"--model {path}: another model is named {name} too; rename one file")
+            raise ModelError(f"--model {path}: two models have the file name {name}; rename one of the files")
         if "=" in path and not Path(path).is_file():
-            raise ModelError(f"--model {path}: no such file; give a file alone, a model is named by its file")
+            raise ModelError(f"--model {path}: no such file; give only the path of the model file")
         models[name] = dvrk.IdentifiedModel.load(path, arm)
     if not models:
         models["SDF"] = dvrk.IdentifiedModel.from_arm(arm)

@@ -1,4 +1,4 @@
-"""Functions that all commands share: checks of output paths before work begins, progress, and handling of Ctrl-C."""
+"""Functions that all commands share: checks of output paths, progress display, and handling of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def import_interruptibly() -> None:
     Without this, extension modules print a traceback. No file is partly written at that time. Signal handlers remain
     unchanged in a thread or in a test.
     """
-    # Importing this module also imports the others.
+    # This module imports the slow modules that all commands need.
     modules = ("dvrk_drake.reports.identification",)
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
@@ -104,7 +104,7 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
     if not target.parent.is_dir():
         raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
     if os.path.exists(target) and not target.is_file():
-        raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
+        raise DvrkDrakeError(f"{path}: is not a regular file and cannot be replaced; give the path of a file")
     try:
         if os.path.exists(target):
             os.close(os.open(target, os.O_WRONLY))
@@ -112,17 +112,17 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
             pass
     except OSError as error:
         raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
-    for given in inputs:
-        if str(target) == os.path.realpath(given):
-            raise DvrkDrakeError(f"{path}: is an input; name another file to write")
+    for input_path in inputs:
+        if str(target) == os.path.realpath(input_path):
+            raise DvrkDrakeError(f"{path}: is an input file; choose another output file")
     if os.path.exists(target) and not overwrite:
-        raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with --overwrite")
+        raise DvrkDrakeError(f"{path}: exists already; choose another file, or replace it with --overwrite")
 
 
 def _refuse_twice(path: str) -> None:
     """Rejects a second output of this command with the same name."""
     if (target := Path(os.path.realpath(path))) in _outputs:
-        raise DvrkDrakeError(f"{path}: is named for two outputs; name another file or folder for one")
+        raise DvrkDrakeError(f"{path}: is given for two outputs; choose a different path for one of them")
     _outputs.add(target)
 
 
@@ -144,14 +144,14 @@ def new_folder(path: str, *, overwrite: bool) -> Path:
     """
     _refuse_twice(path)
     folder = Path(path).absolute()
-    missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
+    missing = [parent for parent in (folder, *folder.parents) if not os.path.exists(parent)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        filled = any(folder.iterdir())
+        not_empty = any(folder.iterdir())
     except OSError as error:
-        raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
-    if filled and not overwrite:
-        raise DvrkDrakeError(f"{path}: holds files already; name another folder, or write into it with --overwrite")
+        raise DvrkDrakeError(f"{path}: the folder cannot be created: {error.strerror}") from error
+    if not_empty and not overwrite:
+        raise DvrkDrakeError(f"{path}: folder is not empty; choose another folder, or write into it with --overwrite")
     _made[:0] = missing
     return Path(path)
 
@@ -184,21 +184,21 @@ def folders_only_for_results() -> Iterator[None]:
         raise
 
 
-def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: None) -> None:
-    """Serves a Meshcat page until its Stop button, Escape or Ctrl-C is pressed. Calls `meanwhile` repeatedly."""
+def until_stopped(meshcat: Meshcat, update: Callable[[], object] = lambda: None) -> None:
+    """Serves a Meshcat page until its Stop button, Escape or Ctrl-C is pressed. Calls `update` repeatedly."""
     meshcat.AddButton("Stop", "Escape")
     with suppress(KeyboardInterrupt):
         while meshcat.GetButtonClicks("Stop") == 0:
-            meanwhile()
+            update()
             time.sleep(0.03)
 
 
 def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
-    """Returns the model of the file given with --model, or the model in the SDF of --arm."""
+    """Returns the model of the file given with --model, or the nominal model of --arm."""
     from dvrk_drake.models.arm import known_arms
 
     if model in known_arms():
-        raise ModelError(f"{model} is an arm, not a model; name it with --arm {model}")
+        raise ModelError(f"{model} is an arm, not a model; use --arm {model}")
     if model is not None:
         return dvrk.IdentifiedModel.load(model)
     assert arm is not None

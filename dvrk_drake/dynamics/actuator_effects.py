@@ -1,9 +1,9 @@
 """Models of friction, cable and spring torques in the drive, each linear in one coefficient.
 
-An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`): an actuator, a joint moved by several
-actuators, or a location of friction. The motors must add the effort coefficient * shape(x, v, state), pulled back to
-the actuators. A position-dependent shape is an expression, used for holding torques and motions. A shape with velocity
-or memory is a step function, used for batches and for simulation.
+An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`). A coordinate is an actuator, a joint
+that several actuators move, or a location of friction. The effect adds coefficient * shape(x, v, state) to the effort
+along its coordinate. A shape that depends only on position is an expression. A shape that depends on velocity or has a
+state is a step function.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EffectKind:
-    """One kind of effect.
+    """Kind of an effect.
 
     Attributes:
-        unit: Unit of the coefficient for a revolute coordinate (N for N m and m for rad if prismatic).
+        unit: Unit of the coefficient for a revolute coordinate. For a prismatic one, N replaces N m and m replaces rad.
         scale: Meaning of `ActuatorEffect.scale` for this kind; "" if it has none.
         dissipative: True if it dissipates energy in all motions, so its coefficient must not be negative.
         revolute: True if it is allowed for revolute coordinates only.
-        loaded: True if its shape is multiplied by the load of the coordinate [N m, N].
-        code: Code of the kind in `effect_step`, if it depends on velocity or has a state.
-        of_position: Function (f, x, scale) -> shape for a kind that depends on position only. Such effects also act at
-            rest. f provides sin, cos, Min and Max for numbers or symbols.
+        loaded: True if the shape is multiplied by the load of the coordinate [N m, N].
+        code: Code of the kind in `effect_step`. 0 for kinds that depend on position only.
+        position_shape: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None. These
+            effects also act at rest. f provides sin, cos, Min and Max for numbers or symbols.
     """
 
     unit: str
@@ -46,57 +46,70 @@ class EffectKind:
     revolute: bool = False
     loaded: bool = False
     code: int = 0
-    of_position: Callable[[Any, Any, Any], Any] | None = None
+    position_shape: Callable[[Any, Any, Any], Any] | None = None
 
 
 _WIDTH = "speed at which the smoothed sign is 0.76 [rad/s, m/s]"
+#: Name -> kind of effect.
 EFFECT_KINDS: dict[str, EffectKind] = {
-    # Cable preload, current offset.
-    "offset": EffectKind("N m", of_position=lambda f, x, scale: 1),
+    # Cable preload or offset of the motor current.
+    "offset": EffectKind("N m", position_shape=lambda f, x, scale: 1),
     "viscous": EffectKind("N m s/rad", dissipative=True, code=1),
     "coulomb": EffectKind("N m", _WIDTH, dissipative=True, code=2),
     "coulomb forward": EffectKind("N m", _WIDTH, code=3),
     "stribeck": EffectKind("N m", _WIDTH, code=4),
-    "presliding": EffectKind("N m", "travel until it slips [rad, m]", dissipative=True, code=5),
-    "presliding forward": EffectKind("N m", "travel until it slips [rad, m]", code=6),
-    # Friction of gears and cables that press harder under load.
+    "presliding": EffectKind("N m", "travel before sliding [rad, m]", dissipative=True, code=5),
+    "presliding forward": EffectKind("N m", "travel before sliding [rad, m]", code=6),
+    # Friction of gears and cables, which increases with the load.
     "load coulomb": EffectKind("1", _WIDTH, dissipative=True, loaded=True, code=2),
-    # It pulls no more than at the travel that a recording covered: a straight line runs away outside of it.
+    # The torque is constant outside the range of the recording, because extrapolation of a line would be unbounded.
     "spring": EffectKind(
         "N m/rad",
-        "largest |x| to which it is a straight line [rad, m]",
-        of_position=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
+        "largest |x| of the linear range [rad, m]",
+        position_shape=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
     ),
-    # One period a turn: a spring or a cable hooked on off the axis. More: a pulley that is not round, a cable's lay.
-    "cable sine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda f, x, s: f.sin(s * x)),
-    "cable cosine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda f, x, s: f.cos(s * x)),
+    # One period per revolution: a spring or cable attached off the axis. More: an eccentric pulley or cable stranding.
+    "cable sine": EffectKind(
+        "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.sin(s * x)
+    ),
+    "cable cosine": EffectKind(
+        "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.cos(s * x)
+    ),
 }
 _NUMERIC = SimpleNamespace(sin=np.sin, cos=np.cos, Min=np.minimum, Max=np.maximum)
-#: Kinds that act at rest as well; friction holds either way and is left to the arm.
-POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_position is not None)
+#: Kinds that depend on position only and therefore act at rest. Friction at rest has no unique value.
+POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.position_shape is not None)
 
 
 @numba.njit(cache=True)
 def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
-    """Returns the next state and the shape for a kind's code; NaN for a kind that depends on position only."""
+    """Returns the next state and the shape of a kind. The shape is NaN for a kind that depends on position only.
+
+    Args:
+        code: Code of the kind.
+        z: State at the previous sample, dimensionless.
+        dx: Travel of the coordinate since the previous sample [rad, m].
+        v: Velocity of the coordinate [rad/s, m/s].
+        scale: `ActuatorEffect.scale`.
+    """
     if code == 1:
         return z, v
     if code == 2:
-        # The sign of v, smoothed.
+        # Smoothed sign of v.
         return z, math.tanh(v / scale)
     if code == 3:
-        # What friction towards +x has more than towards -x.
+        # Additional friction in the direction +x.
         return z, max(math.tanh(v / scale), 0.0)
     if code == 4:
-        # What friction has more at low speeds; it falls off within five widths of the smoothed sign.
+        # Additional friction at low speed, which decreases within five widths of the smoothed sign.
         return z, math.tanh(v / scale) * math.exp(-((v / (5.0 * scale)) ** 2))
     if code == 5:
-        # An elasto-plastic element (Prandtl): a spring that gives way when it is stretched by `scale`. Several in
-        # parallel are a generalised Maxwell slip model, which has the hysteresis of dry friction before it slides.
+        # Elasto-plastic (Prandtl) element: a spring that slides at a deflection of `scale`. Several parallel elements
+        # are a generalized Maxwell slip model, which has the presliding hysteresis of dry friction.
         z = min(max(z + dx / scale, -1.0), 1.0)
         return z, z
     if code == 6:
-        # What dry friction towards +x has more than towards -x.
+        # Additional dry friction in the direction +x.
         z = min(max(z + dx / scale, 0.0), 1.0)
         return z, z
     return z, math.nan
@@ -104,12 +117,12 @@ def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple
 
 @dataclass(frozen=True)
 class ActuatorEffect:
-    """One effect along one coordinate of the drive.
+    """Effect along a coordinate of the drive, without its coefficient.
 
     Attributes:
-        coordinate: a key of `Arm.effect_coordinates`.
-        kind: a key of `EFFECT_KINDS`.
-        scale: see `EffectKind.scale`; 0 for kinds that have none.
+        coordinate: Key of `Arm.effect_coordinates`.
+        kind: Key of `EFFECT_KINDS`.
+        scale: Number with the meaning `EffectKind.scale`; 0 for kinds without a scale.
     """
 
     coordinate: str
@@ -118,7 +131,7 @@ class ActuatorEffect:
 
     @classmethod
     def of(cls, effect: DriveEffect) -> ActuatorEffect:
-        """Returns what the coefficient of `effect` belongs to."""
+        """Returns `effect` without its coefficient."""
         return cls(effect.coordinate, effect.kind, effect.scale)
 
     def __str__(self) -> str:
@@ -129,26 +142,26 @@ class ActuatorEffect:
         """True if the coefficient must not be negative."""
         return EFFECT_KINDS[self.kind].dissipative
 
-    def of_position(self, x: sympy.Expr) -> sympy.Expr:
-        """The shape at position x [rad, m] of the coordinate, of a kind in `POSITION_KINDS`."""
-        import sympy  # takes 0.3 s, and motions need none
+    def position_shape(self, x: sympy.Expr) -> sympy.Expr:
+        """Returns the shape at position x [rad, m] of the coordinate. The kind must be in `POSITION_KINDS`."""
+        import sympy  # Importing sympy takes 0.3 s, and motions do not need it.
 
         scale = sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale)
         return sympy.sympify(self._shape(sympy, x, scale))
 
     def _shape(self, functions: Any, x: Any, scale: Any) -> Any:
-        shape = EFFECT_KINDS[self.kind].of_position
+        shape = EFFECT_KINDS[self.kind].position_shape
         assert shape is not None, f"{self} depends on more than position"
         return shape(functions, x, scale)
 
     def step(self, state: float, dx: float, x: float, v: float, load: float = 0.0) -> tuple[float, float]:
-        """Returns the next state and its shape, for a simulation.
+        """Returns the next state and the shape, for a simulation.
 
         Args:
-            state: dimensionless, 0 at the start; only the kinds of presliding have one.
-            dx: travel of the coordinate since the last step [rad, m].
-            x, v: its position [rad, m] and velocity now.
-            load: size of the effort that it carries [N m, N], of kinds that are loaded.
+            state: Dimensionless state, initially 0. Only presliding kinds use it.
+            dx: Travel of the coordinate since the previous step [rad, m].
+            x, v: Position [rad, m] and velocity of the coordinate.
+            load: Magnitude of the effort along the coordinate [N m, N]. Only kinds with `EffectKind.loaded` use it.
         """
         if self.kind in POSITION_KINDS:
             return state, float(self._shape(_NUMERIC, x, self.scale))
@@ -159,26 +172,31 @@ class ActuatorEffect:
     def column(
         self, x: NDArray[np.float64], v: NDArray[np.float64], load: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0; load: (m,), see `step`."""
+        """Returns the shape (m,) over a motion of the coordinate, starting from state 0.
+
+        Args:
+            x, v: Positions [rad, m] and velocities (m,) of the coordinate.
+            load: Magnitude (m,) of the effort along the coordinate [N m, N], see `step`.
+        """
         if self.kind in POSITION_KINDS:
             return np.array(np.broadcast_to(self._shape(_NUMERIC, x, self.scale), x.shape), dtype=np.float64)
         kind = EFFECT_KINDS[self.kind]
-        shape = _run(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
+        shape = _run_effect(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
         return shape * load if kind.loaded else shape
 
 
 @numba.njit(cache=True)
-def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+def _run_effect(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     out = np.empty(len(x))
-    state, before = 0.0, x[0]
+    state, previous = 0.0, x[0]
     for i in range(len(x)):
-        state, out[i] = effect_step(code, state, x[i] - before, v[i], scale)
-        before = x[i]
+        state, out[i] = effect_step(code, state, x[i] - previous, v[i], scale)
+        previous = x[i]
     return out
 
 
 def distinct_coordinates(arm: Arm) -> list[str]:
-    """The coordinates that move each in its own way: the first of those that move alike, so all actuators."""
+    """Returns the coordinates without those that are proportional to a preceding one. All actuators are included."""
     rows = arm.effect_coordinates
     kept: list[str] = []
     for name in rows:
@@ -188,23 +206,26 @@ def distinct_coordinates(arm: Arm) -> list[str]:
     return kept
 
 
-def slides(arm: Arm, coordinate: str) -> bool:
-    """Returns whether a coordinate is a length [m], which is the case for prismatic actuators and joints."""
+def is_prismatic(arm: Arm, coordinate: str) -> bool:
+    """Returns whether a coordinate is that of a prismatic actuator or joint."""
     return any(p and coordinate.endswith(f".{n}") for p, n in zip(arm.prismatic, arm.joint_names, strict=True))
 
 
 def joint_row(arm: Arm, coordinate: str) -> NDArray[np.float64]:
-    """(n,) what a coordinate of the drive moves by per joint; an effort f along it is row f on the joints."""
+    """Returns the row (n,) from joint velocities to the velocity of a coordinate.
+
+    An effort f along the coordinate is the joint effort row * f.
+    """
     return np.asarray(arm.effect_coordinates[coordinate] @ arm.transmission.matrix)
 
 
 def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m,) position x of a coordinate of the drive at poses q (m, n) of the joints [rad, m]."""
+    """Returns positions (m,) [rad, m] of a coordinate at joint positions q (m, n) [rad, m]."""
     return np.asarray(arm.transmission.position(q) @ arm.effect_coordinates[coordinate])
 
 
 def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
-    """A spring at a coordinate that is straight over its positions x [rad, m] in a recording, and just beyond."""
+    """Returns a spring whose linear range exceeds the positions x (m,) [rad, m] of a recording by 1 %."""
     return ActuatorEffect(coordinate, "spring", float(f"{1.01 * np.abs(x).max():.3g}"))
 
 
@@ -222,8 +243,9 @@ def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFE
     if effect.kind not in kinds:
         return f'kind is "{effect.kind}"; allowed: {", ".join(kinds)}'
     kind = EFFECT_KINDS[effect.kind]
-    if kind.revolute and slides(arm, effect.coordinate):
-        return f"kind {effect.kind} is of an angle, and {effect.coordinate} slides"
+    if kind.revolute and is_prismatic(arm, effect.coordinate):
+        return f"kind {effect.kind} requires a revolute coordinate, but {effect.coordinate} is prismatic"
     if not (0 < effect.scale < math.inf if kind.scale else effect.scale == 0):
-        return f"scale is {effect.scale:g}; of kind {effect.kind} it is {kind.scale or 'always 0'}"
+        allowed = f"a positive number, the {kind.scale}" if kind.scale else "0"
+        return f"scale is {effect.scale:g}; allowed for kind {effect.kind}: {allowed}"
     return ""

@@ -1,4 +1,4 @@
-"""Computes base parameters, the identifiable combinations of link parameters, with readable names."""
+"""Computes base parameters, which are the identifiable combinations of link parameters, and their names."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class StandardParameter:
-    """One inertial parameter of one link, in the usual notation.
+    """Inertial parameter of a link or a rotor.
 
-    `label` is the link as the field counts it ("2", or a name such as "crank"). `axis` is "" for the mass m [kg], "x",
-    "y", "z" for a first moment m c [kg m], "xx", "yy", "zz", "xy", "xz", "yz" for a moment or product of inertia
-    [kg m^2], and "a" for the inertia of an actuator's rotor [kg m^2; kg if the actuator `slides`], which `label` then
-    counts.
+    Attributes:
+        label: Number or name of the link, such as "2" or "crank". For a rotor, number of the actuator.
+        axis: "" for the mass [kg], "x", "y" or "z" for a first moment [kg m], "xx", "yy", "zz", "xy", "xz" or "yz" for
+            a moment or product of inertia [kg m^2], and "a" for the inertia of a rotor [kg m^2; kg if `prismatic`].
+        prismatic: True for the rotor of a prismatic actuator.
     """
 
     label: str
     axis: str = ""
-    slides: bool = False
+    prismatic: bool = False
 
     def __str__(self) -> str:
         if self.is_inertia:
@@ -40,19 +41,21 @@ class StandardParameter:
     def unit(self) -> str:
         """SI unit of the parameter."""
         if self.is_inertia:
-            return "kg" if self.slides else "kg m^2"
+            return "kg" if self.prismatic else "kg m^2"
         return "kg m" if self.axis else "kg"
 
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Base parameters beta = combination phi; Y_base consists of the columns `columns` of the regressor of phi.
+    """Base parameters beta = combination phi of standard parameters phi (p,).
+
+    The regressor of beta consists of the columns `columns` of the regressor of phi.
 
     Attributes:
-        columns: (b,) index of the standard parameter whose column stands for each base parameter.
-        combination: (b, p) coefficients.
-        names: (b,) such as "L2 (m2+...+m7) + m2 c2x".
-        units: (b,) those of the standard parameters of `columns`; "kg" is of a mass that a prismatic joint lifts.
+        columns: Index (b,) of the standard parameter with the regressor column of each base parameter.
+        combination: Coefficients (b, p).
+        names: Names (b,), such as "L2 (m2+...+m7) + m2 c2x".
+        units: Units (b,) of the base parameters.
     """
 
     columns: tuple[int, ...]
@@ -64,11 +67,11 @@ class BaseParameters:
 def independent_columns(
     regressor: NDArray[np.float64], tolerance: float = 1e-9
 ) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
-    """Returns independent columns of a regressor (rows, p), and B (b, p) with regressor = regressor[:, columns] B.
+    """Returns independent columns of a regressor, and B (b, p) with regressor = regressor[:, columns] B.
 
     Args:
-        regressor: stacked over random states; rows must be well over p.
-        tolerance: relative size below which a column counts as dependent.
+        regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
+        tolerance: Relative magnitude below which a column counts as dependent.
     """
     R, pivots = scipy.linalg.qr(regressor, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > tolerance * abs(R[0, 0])))
@@ -85,24 +88,25 @@ def reduce_to_base(
     lengths: Mapping[str, float],
     tolerance: float = 1e-9,
 ) -> BaseParameters:
-    """Reduces a regressor to a base set, keeping the columns that come first in `preference`.
+    """Computes base parameters whose regressor columns come as early as possible in `preference`.
 
-    This is a QR decomposition whose pivots are chosen to be read rather than by size; on exact regressors the two
-    differ only in names (Gautier, "Numerical calculation of the base inertial parameters of robots", 1991).
+    This is a QR decomposition with pivots in the order of `preference` instead of their magnitude. For an exact
+    regressor, the order affects only the form of the base parameters. Reference: Gautier, "Numerical calculation of the
+    base inertial parameters of robots" (1991).
 
     Args:
-        regressor: (rows, p) stacked over random poses; rows must be well over p.
-        parameters: the p standard parameters.
-        preference: a permutation of 0..p-1.
-        lengths: named coefficients, to print 0.2794 as L2: lengths [m], and where there are inertias their products.
-        tolerance: relative size below which a column counts as dependent.
+        regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
+        parameters: Standard parameters (p,).
+        preference: Permutation of 0 to p - 1.
+        lengths: Name -> coefficient, such as a length [m] or a product of lengths. Names replace equal coefficients.
+        tolerance: Relative magnitude below which a column counts as dependent.
     """
     scale = np.linalg.norm(regressor, axis=0).max()
     columns: list[int] = []
     basis = np.empty((len(regressor), 0))
     for column in preference:
         residual = regressor[:, column]
-        for _ in range(2):  # twice is enough (Kahan, Parlett): orthogonal to machine precision
+        for _ in range(2):  # Two passes give orthogonality to machine precision (Kahan, Parlett).
             residual = residual - basis @ (basis.T @ residual)
         norm = np.linalg.norm(residual)
         if norm > tolerance * scale:
@@ -110,21 +114,26 @@ def reduce_to_base(
             basis = np.column_stack([basis, residual / norm])
     columns.sort()
     in_basis = basis.T @ regressor
-    combination = _snap(np.asarray(np.linalg.solve(in_basis[:, columns], in_basis)), lengths)
-    names = tuple(_readable(row, parameters, lengths) for row in combination)
+    combination = _snap_to_known(np.asarray(np.linalg.solve(in_basis[:, columns], in_basis)), lengths)
+    names = tuple(_format_combination(row, parameters, lengths) for row in combination)
     units = tuple(parameters[column].unit for column in columns)
     return BaseParameters(tuple(columns), combination, names, units)
 
 
-def _snap(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDArray[np.float64]:
-    """Replaces coefficients within rounding of 0, +-1 or a named length by exactly that."""
+def _snap_to_known(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDArray[np.float64]:
+    """Replaces coefficients within rounding error of 0, +-1 or a named length by the exact values."""
     known = np.array([0.0, 1.0, -1.0, *lengths.values(), *(-v for v in lengths.values())])
     nearest = known[np.argmin(np.abs(combination[..., None] - known), axis=-1)]
     return np.where(np.abs(combination - nearest) < 1e-9, nearest, combination)
 
 
-def _readable(row: NDArray[np.float64], parameters: Sequence[StandardParameter], lengths: Mapping[str, float]) -> str:
-    """One combination as the field writes it: inertias, masses with a common coefficient grouped, first moments."""
+def _format_combination(
+    row: NDArray[np.float64], parameters: Sequence[StandardParameter], lengths: Mapping[str, float]
+) -> str:
+    """Formats a base parameter as a sum of inertias, masses and first moments.
+
+    Masses with a common coefficient are grouped in brackets.
+    """
     groups: dict[float, list[StandardParameter]] = {}
     inertias: list[tuple[float, str]] = []
     moments: list[tuple[float, str]] = []
@@ -134,22 +143,22 @@ def _readable(row: NDArray[np.float64], parameters: Sequence[StandardParameter],
         elif coefficient and parameter.axis:
             moments.append((coefficient, str(parameter)))
         elif coefficient:
-            # One that has no name is known to rounding only.
+            # Rounding gives equal coefficients the same key, also if they have no name.
             groups.setdefault(round(coefficient, 12), []).append(parameter)
     terms = inertias + [(coefficient, _sum_of_masses(group)) for coefficient, group in groups.items()] + moments
     text = ""
-    for coefficient, what in terms:
+    for coefficient, term in terms:
         size = next(
             (name for name, v in lengths.items() if abs(v - abs(coefficient)) < 1e-11), f"{abs(coefficient):.6g}"
         )
         factor = "" if size == "1" else f"{size} "
         sign = ("- " if coefficient < 0 else "+ ") if text else ("-" if coefficient < 0 else "")
-        text += f"{' ' if text else ''}{sign}{factor}{what}"
+        text += f"{' ' if text else ''}{sign}{factor}{term}"
     return text
 
 
 def _sum_of_masses(group: Sequence[StandardParameter]) -> str:
-    """m2+...+m7 for consecutive numbered links, all of them written out otherwise; brackets where a factor follows."""
+    """Formats masses, e.g. "(m2+...+m7)" for more than three consecutive links or "(m2+m_coupler)" otherwise."""
     if len(group) == 1:
         return str(group[0])
     numbers = [int(p.label) for p in group if p.label.isdigit()]

@@ -1,4 +1,4 @@
-"""Symbolic expressions as Python source and as functions compiled with numba."""
+"""Generates Python source and functions compiled with numba from symbolic expressions."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from dvrk_drake.dynamics.trigonometry import cos, sin
 
 @dataclass(frozen=True)
 class SharedTerms:
-    """An array of expressions after common subexpression elimination.
+    """Array of expressions after common subexpression elimination.
 
     Attributes:
-        assignments: (symbol, expression), in order of use.
-        entries: (index, expression) of each entry that is not identically zero.
-        shape: of the array.
+        assignments: Symbol and expression of each common subexpression, in order of use.
+        entries: Index and expression of each array element that is not identically zero.
+        shape: Shape of the array.
     """
 
     assignments: list[tuple[sympy.Symbol, sympy.Expr]]
@@ -32,7 +32,7 @@ class SharedTerms:
 
 
 def share_terms(array: sympy.NDimArray | sympy.MatrixBase) -> SharedTerms:
-    """Common subexpression elimination over a vector or matrix of expressions."""
+    """Eliminates common subexpressions of a vector or matrix of expressions."""
     dense = sympy.ImmutableDenseNDimArray(array)
     indices = list(np.ndindex(*dense.shape))
     flat = [dense[index] for index in indices]
@@ -48,19 +48,20 @@ def python_source(
     docstring: str = "",
     functions: Mapping[str, str] | None = None,
 ) -> str:
-    """A Python function `name(*arguments, out)` that fills the array `out`; needs only the standard library's math.
+    """Returns source of a Python function `name(*arguments, out)` that fills the array `out`.
 
     Args:
-        name: of the function.
-        arguments: (name, symbols) each; a one-element tuple of the same name is a scalar, else symbols are unpacked.
-        terms: what to compute.
-        docstring: first statement of the function.
-        functions: names of sympy's functions, where others than those of math are to be called.
+        name: Name of the function.
+        arguments: Name and symbols of each argument. An argument with one symbol of the same name is a scalar. Other
+            arguments are arrays with one element per symbol.
+        terms: Expressions to compute.
+        docstring: Docstring of the function; none if empty.
+        functions: sympy function name -> function to call. By default, the functions of `math` are called.
     """
     lines = [f"def {name}({', '.join(n for n, _ in arguments)}, out):"]
     if docstring:
         lines.append(f'    """{docstring}"""')
-    lines += unpacking(arguments, terms, "    {symbol} = {array}[{index}]")
+    lines += unpacking_lines(arguments, terms, "    {symbol} = {array}[{index}]")
     code = partial(sympy.pycode, user_functions=dict(functions or {}))
     lines += [f"    {symbol} = {code(e)}" for symbol, e in terms.assignments]
     if len(terms.entries) < math.prod(terms.shape):
@@ -72,9 +73,9 @@ def python_source(
 def compile_function(
     name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms
 ) -> Callable[..., None]:
-    """The function of `python_source`, compiled with numba for float64; vectors and `out` must be C-contiguous.
+    """Compiles the function of `python_source` with numba for float64. Arrays must be C-contiguous.
 
-    Sine and cosine are those of `trigonometry`.
+    Sine and cosine are the functions of `trigonometry`.
     """
     namespace: dict[str, Any] = {"math": math, "sin": sin, "cos": cos}
     exec(python_source(name, arguments, terms, functions={"sin": "sin", "cos": "cos"}), namespace)
@@ -84,10 +85,15 @@ def compile_function(
 
 
 def compile_batch(function: Callable[..., None], num_arguments: int, shape: tuple[int, ...]) -> Callable:
-    """A compiled loop of `function` over the rows of its first argument.
+    """Compiles a loop of `function` over the rows of its first argument.
+
+    Args:
+        function: Compiled function with an output array of the given shape as its last argument.
+        num_arguments: Number of arguments without the output array.
+        shape: Shape of the output array.
 
     Returns:
-        f(rows, *others) -> (len(rows), *shape), where rows is (m, k) C-contiguous.
+        Function f(rows, *other_arguments) for rows (m, k), which returns an array (m, *shape).
     """
     others = ", ".join(f"a{i}" for i in range(1, num_arguments))
     call = f"rows[i], {others + ', ' if others else ''}out[i]"
@@ -110,21 +116,29 @@ def compile_batch(function: Callable[..., None], num_arguments: int, shape: tupl
 
 
 def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:
-    """The only signature of a compiled function, without the choice between signatures (4 us a call here).
+    """Returns the machine code of a compiled function with one signature, which is called without type checks.
 
-    Its types are not checked any more: the arrays must be what the signature says. Drake's always are.
+    The caller must pass arrays of exactly the compiled types.
     """
     (overload,) = dispatcher.overloads.values()  # type: ignore[attr-defined]
     return overload.entry_point
 
 
 def is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
-    """Returns whether an argument is a number: one symbol, of the same name."""
+    """Returns whether an argument is a scalar, which has one symbol of the same name."""
     return len(symbols) == 1 and symbols[0].name == name
 
 
-def unpacking(arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, form: str) -> list[str]:
-    """A line for each symbol that `terms` use of an array argument; `form` has {symbol}, {array} and {index}."""
+def unpacking_lines(
+    arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, form: str
+) -> list[str]:
+    """Returns one line of code for each array element that `terms` use.
+
+    Args:
+        arguments: Arguments of `python_source`.
+        terms: Expressions to compute.
+        form: Format of a line, with {symbol}, {array} and {index}.
+    """
     used = set().union(*(e.free_symbols for _, e in [*terms.assignments, *terms.entries]), set())
     return [
         form.format(symbol=symbol, array=name, index=index)

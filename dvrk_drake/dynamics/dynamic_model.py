@@ -27,13 +27,13 @@ def effect_shapes(
 ) -> Iterator[NDArray[np.float64]]:
     """Yields the shape (m,) of each effect along its coordinate x = h a, starting from state 0.
 
-    The load of a coordinate is the effort f along it that bears the arm's weight as the SDF states it: of the efforts
-    tau of the actuators at rest the part h f, f = h tau / h h.
+    The load of a coordinate is |h tau| / (h h), where tau are the actuator efforts that compensate gravity according to
+    the SDF.
 
     Args:
-        regressor: of the arm.
-        effects: in its drives.
-        q, v: (m, n) positions and velocities of the joints [rad, m], evenly sampled.
+        regressor: Regressor of the arm.
+        effects: Effects in the drive.
+        q, v: Positions [rad, m] and velocities (m, n) of the joints, evenly sampled.
     """
     arm, q = regressor.arm, np.asarray(q, dtype=np.float64)
     a, a_dot = arm.transmission.position(q), arm.transmission.velocity(v)
@@ -52,8 +52,10 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: An actuator with a gravity effort up to MIN_WEIGHT [N m, N] at WEIGHING_POSES random poses carries no weight.
-MIN_WEIGHT, WEIGHING_POSES = 1e-9, 20
+#: Largest gravity effort of an actuator that carries no weight [N m, N].
+MIN_WEIGHT = 1e-9
+#: Number of random poses at which the gravity efforts are computed.
+WEIGHING_POSES = 20
 
 
 class DynamicModel:
@@ -79,7 +81,7 @@ class DynamicModel:
         self.regressor = DynamicRegressor(self.arm)
         check_section(self.regressor, section)
         phi = [x for link in section.links for x in link.parameters] + [rotor.value for rotor in section.rotors]
-        # Columns that couple two rotors belong to no motor, see `rotor_inertias`.
+        # Elements that couple two rotors are 0, because no motor has them (see `rotor_inertias`).
         self.parameters = np.concatenate([phi, np.zeros(len(self.regressor.values) - len(phi))])
         self.effects = tuple(map(ActuatorEffect.of, section.effects))
         self.coefficients = np.array([e.coefficient for e in section.effects])
@@ -100,12 +102,12 @@ class DynamicModel:
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
         poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))
         weight = np.abs(nominal_weight(DynamicRegressor(arm), poses)).max(axis=0)
-        left_out = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > MIN_WEIGHT}
-        left_out -= {e.coordinate for e in self.effects if e.kind == "cable cosine"}
+        excluded = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > MIN_WEIGHT}
+        excluded -= {e.coordinate for e in self.effects if e.kind == "cable cosine"}
         return tuple(
             i
             for i, e in enumerate(self.effects)
-            if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate not in left_out)
+            if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate not in excluded)
         )
 
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
@@ -140,28 +142,34 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
     if fault := number_fault(section):
         raise ModelError(f"dynamics.{fault}")
     if [link.link for link in section.links] != [link.link for link in regressor.links]:
-        raise ModelError(f"dynamics.links must be, in this order: {', '.join(link.link for link in regressor.links)}")
+        raise ModelError(
+            f"dynamics.links must have these links in this order: {', '.join(link.link for link in regressor.links)}"
+        )
     for link in section.links:
         if len(link.parameters) != len(PARAMETER_NAMES):
-            raise ModelError(f"dynamics: {link.link} must have ten numbers: {', '.join(PARAMETER_NAMES)}")
+            raise ModelError(f"dynamics: {link.link} must have ten parameters: {', '.join(PARAMETER_NAMES)}")
         least = float(np.linalg.eigvalsh(pseudo_inertia(link.parameters))[0])
         if not least > 0:
             raise ModelError(
-                f"dynamics: no body has the inertia of {link.link}: least eigenvalue {least:.2g} of its pseudo-inertia"
+                f"dynamics: the inertia of {link.link} is not physically consistent: the smallest eigenvalue of its "
+                f"pseudo-inertia is {least:.2g}, but must be positive"
             )
     if [rotor.actuator for rotor in section.rotors] != list(arm.joint_names):
-        raise ModelError(f"dynamics.rotors must be, in this order: {', '.join(arm.joint_names)}")
+        raise ModelError(f"dynamics.rotors must have these actuators in this order: {', '.join(arm.joint_names)}")
     _check_effects(arm, section)
     settings = section.signals
-    for which, values in (("acceleration_cut_off", settings.acceleration_cut_off), ("delay", settings.effort_delay)):
+    for which, values in (
+        ("acceleration_cut_off", settings.acceleration_cut_off),
+        ("effort_delay", settings.effort_delay),
+    ):
         if len(values) != arm.num_joints:
             raise ModelError(f"dynamics.signals: {which} must have {arm.num_joints} numbers")
 
 
 def _check_effects(arm: Arm, section: DynamicSection) -> None:
     for i, effect in enumerate(section.effects):
-        where, law = f"dynamics.effects[{i}]", ActuatorEffect.of(effect)
-        if fault := effect_fault(arm, law):
+        where, actuator_effect = f"dynamics.effects[{i}]", ActuatorEffect.of(effect)
+        if fault := effect_fault(arm, actuator_effect):
             raise ModelError(f"{where}: {fault}")
-        if law.dissipative and effect.coefficient < 0:
-            raise ModelError(f"{where}: coefficient is {effect.coefficient:g}; of friction 0 or more")
+        if actuator_effect.dissipative and effect.coefficient < 0:
+            raise ModelError(f"{where}: coefficient is {effect.coefficient:g}; for friction it must be 0 or more")

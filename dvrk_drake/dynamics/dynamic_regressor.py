@@ -40,9 +40,9 @@ class DynamicRegressor:
     """Regressor Y of the inverse dynamics tau = Y(q, v, vd) phi of an arm, including linkage and rotors.
 
     tau is the torque on the n independent joints. phi (p,) contains the ten inertial parameters of every moving link,
-    about the origin and along the axes of its SDF frame, then the inertias of the rotors in actuator coordinates. The
-    joints are read from the arm's MultibodyPlant. tau equals the plant's inverse dynamics minus gravity forces,
-    projected through the linkage with G'. Friction and joint damping are not included.
+    then the inertias of the rotors in actuator coordinates. The parameters of a link are about the origin of its SDF
+    frame and expressed in this frame. The joints are read from the arm's MultibodyPlant. tau equals the plant's inverse
+    dynamics minus gravity forces, projected through the linkage with G'. Friction and joint damping are not included.
 
     Attributes:
         arm: Arm of the regressor. Its `gravity` specifies the mounting.
@@ -167,13 +167,13 @@ class DynamicRegressor:
         q, v, vd = (np.ascontiguousarray(x, dtype=np.float64) for x in motion)
         n = self.arm.num_joints
         if q.ndim != 2 or q.shape[1] != n or not q.shape == v.shape == vd.shape:
-            raise ModelError(f"q, v, vd have shapes {q.shape}, {v.shape}, {vd.shape}; allowed: (m, {n}), all alike")
+            raise ModelError(f"q, v, vd have shapes {q.shape}, {v.shape}, {vd.shape}; allowed: (m, {n}) for all")
         return q, v, vd
 
     def _checked_parameters(self, parameters: ArrayLike) -> NDArray[np.float64]:
         phi = np.ascontiguousarray(parameters, dtype=np.float64)
         if phi.shape != self.values.shape:
-            raise ModelError(f"parameters have shape {phi.shape}; {self.arm.name} has {len(self.values)}")
+            raise ModelError(f"parameters have shape {phi.shape}; allowed for {self.arm.name}: ({len(self.values)},)")
         return phi
 
 
@@ -184,9 +184,9 @@ _AXES = tuple(parameter_axis(name) for name in PARAMETER_NAMES)
 class DynamicBaseParameters:
     """Base parameters beta = base.combination phi_F, with tau = Y_base beta = Y phi for every motion.
 
-    phi_F (p,) contains the ten parameters of each link about the origin and along the axes of its frame dh_<label>,
-    then those of the rotors. A link without such a frame uses its SDF frame. `base.names` refer to phi_F. phi (p,) are
-    the parameters of `DynamicRegressor`, about the origins of the SDF frames.
+    phi_F (p,) contains the ten parameters of each link in its frame dh_<label>, then the parameters of the rotors. A
+    link without such a frame uses its SDF frame. `base.names` refer to phi_F. phi (p,) contains the parameters of
+    `DynamicRegressor`, in the SDF frames.
 
     Attributes:
         standard_parameters: Standard parameters phi_F (p,).
@@ -231,11 +231,11 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
     for rotor in rotors:
         a, b = (model.arm.joint_names.index(name) for name in rotor.actuators)
         label = f"{a + 1}" if a == b else f"{a + 1},{b + 1}"
-        parameters.append(StandardParameter(label, "a", slides=bool(a == b and model.arm.prismatic[a])))
+        parameters.append(StandardParameter(label, "a", prismatic=bool(a == b and model.arm.prismatic[a])))
     base = reduce_to_base(
         _regressor_at_random_states(model)[:, :p] @ to_links,
         parameters,
-        _readable_preference(parameters, _hinge_axes(plant, model, frames)),
+        _preference_order(parameters, _hinge_axes(plant, model, frames)),
         _named_coefficients(named_lengths(plant, bodies)),
     )
     return DynamicBaseParameters(tuple(parameters), base, to_links)
@@ -274,27 +274,27 @@ def _hinge_axes(
     return axes
 
 
-def _readable_preference(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
+def _preference_order(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
     """Returns the columns in the order of preference as base parameters.
 
-    For a revolute link with axis u, three parameters can be regrouped with the previous link: its mass, its first
-    moment along u and one moment of inertia about an axis perpendicular to u (Khalil and Dombre, "Modeling,
-    Identification and Control of Robots", 9.4.2). These come last, starting from the base. Numbered links precede the
-    links of the linkage. Rotors follow the links, and masses are last.
+    Three parameters of a revolute link with axis u can be regrouped with the previous link. They are the mass, the
+    first moment along u and one moment of inertia about an axis perpendicular to u. These parameters come last, in the
+    order from base to tip. Numbered links precede the links of the linkage. Rotors follow the links, and masses are
+    last. Reference: Khalil and Dombre, "Modeling, Identification and Control of Robots", 9.4.2.
     """
 
-    def given_away(p: StandardParameter) -> bool:
+    def is_regrouped(p: StandardParameter) -> bool:
         if not p.axis:
             return True
         u = hinge_axes.get(p.label)
-        across = [axis for axis in range(3) if axis != u]
-        return u is not None and p.axis in ("xyz"[u], 2 * "xyz"[across[-1]])
+        perpendicular = [axis for axis in range(3) if axis != u]
+        return u is not None and p.axis in ("xyz"[u], 2 * "xyz"[perpendicular[-1]])
 
     def key(index: int) -> tuple:
         p = parameters[index]
         number = int(p.label) if p.label.isdigit() else math.inf
         rotor = p.axis == "a"
-        return (not p.axis, rotor, given_away(p), number == math.inf, number if given_away(p) else -number, index)
+        return (not p.axis, rotor, is_regrouped(p), number == math.inf, number if is_regrouped(p) else -number, index)
 
     return sorted(range(len(parameters)), key=key)
 

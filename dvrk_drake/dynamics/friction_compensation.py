@@ -1,4 +1,4 @@
-"""Computes how much friction a controller can compensate without causing the arm to move by itself."""
+"""Computes how much friction a controller can compensate without causing an arm at rest to move."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm import Arm
 
-#: Travel within which friction must hold the arm [rad, m]: an element that is stretched further before it slips lets
-#: the arm move that far. The smoothed sign of an identification stands for friction that holds at once.
+#: Largest travel before sliding of a presliding element that counts as holding the arm at rest [rad, m].
 HOLDING_TRAVEL = 0.015
-#: A smoothed sign of the velocity stands for friction that holds if it is no wider [rad/s, m/s].
+#: Largest width of the smoothed sign of a Coulomb effect that counts as holding the arm at rest [rad/s, m/s].
 HOLDING_SPEED = 0.25
-#: Share of the friction that may be compensated. On another day an arm may have a third less friction than identified
-#: (docs/dynamics.md); more than is there must never be given, also not late.
+#: Largest share of the friction that may be compensated. On another day, an arm may have a third less friction than
+#: identified (docs/dynamics.md). The compensation must never exceed the actual friction.
 MAX_RATIO = 0.6
-#: The same of hysteresis that springs back, which is a part of it.
+#: Largest share of hysteresis (see `Friction.springs_back`) that may be compensated.
 MAX_HYSTERESIS_RATIO = 0.9
-#: Assumed ratio of a model's maximum holding error to its leave-one-out RMS error; rarely exceeded on simulated arms.
-WRONG_AT_MOST = 2.0
+#: Assumed ratio of a model's largest holding error to its leave-one-out RMS error. Simulated arms rarely exceed it.
+HOLDING_ERROR_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -46,16 +45,20 @@ class Friction:
 
     @classmethod
     def of(cls, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: ArrayLike) -> Friction:
-        """The dissipative ones among the effects of an arm; the others, and what depends on the load, are left out.
+        """Returns the dissipative effects of an arm. Load-dependent friction and other effects are omitted.
+
+        Args:
+            arm: Arm of the effects.
+            effects: Effects of any kind.
+            coefficients: Coefficients (k,) of the effects, in the units of their kinds.
 
         Raises:
-            ControllerError: an effect that the arm cannot have, or a coefficient of friction that is negative or no
-                number.
+            ControllerError: An effect is not valid for the arm, or a friction coefficient is negative or not finite.
         """
         values = np.asarray(coefficients, float)
         if values.shape != (len(effects),):
-            raise ControllerError(f"friction: {len(effects)} effects need as many coefficients, not {values.shape}")
-        loaded = [kind for kind, what in EFFECT_KINDS.items() if what.loaded]
+            raise ControllerError(f"friction: coefficients have shape {values.shape}; allowed: ({len(effects)},)")
+        loaded = [name for name, kind in EFFECT_KINDS.items() if kind.loaded]
         kept = [
             k
             for k, effect in enumerate(effects)
@@ -80,7 +83,7 @@ class Friction:
         """
         effects = [effect for effect in arm.effects.friction if not effect.fall_speed]
         if not effects:
-            raise ControllerError(f"friction: the files of {arm.name} state none")
+            raise ControllerError(f"friction: the files of {arm.name} contain no friction that can be compensated")
         return cls.of(arm, list(map(ActuatorEffect.of, effects)), [e.coefficient for e in effects])
 
     @classmethod
@@ -92,25 +95,25 @@ class Friction:
         """
         if model.dynamics is None:
             raise ModelError(
-                "friction: the model was identified from poses, which tell nothing of friction; give a motion's"
+                "friction: a model identified from static poses has no friction; use a model identified from a motion"
             )
         effects = model.dynamics.effects
         return cls.of(model.arm, list(map(ActuatorEffect.of, effects)), [e.coefficient for e in effects])
 
     @property
     def rows(self) -> NDArray[np.float64]:
-        """(k, n) what the coordinate of each effect moves by per joint; f along it is row' f on the joints."""
+        """Matrix (k, n) from joint velocities to the velocities of the effects' coordinates. See `joint_row`."""
         return np.array([joint_row(self.arm, e.coordinate) for e in self.effects]).reshape(-1, self.arm.num_joints)
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """(k,) whether the effect holds the arm at rest, within `HOLDING_TRAVEL`."""
-        widest = {"coulomb": HOLDING_SPEED, "presliding": HOLDING_TRAVEL}
-        return np.array([e.scale <= widest.get(e.kind, -1.0) for e in self.effects], bool)
+        """Mask (k,), True for effects that hold the arm at rest within `HOLDING_TRAVEL`."""
+        max_scale = {"coulomb": HOLDING_SPEED, "presliding": HOLDING_TRAVEL}
+        return np.array([e.scale <= max_scale.get(e.kind, -1.0) for e in self.effects], bool)
 
     @property
     def springs_back(self) -> NDArray[np.bool_]:
-        """(k,) whether it is hysteresis so wide that a released arm goes back by more than `HOLDING_TRAVEL`."""
+        """Mask (k,), True for hysteresis that moves a released arm back by more than `HOLDING_TRAVEL`."""
         return np.array([e.kind == "presliding" and e.scale > HOLDING_TRAVEL for e in self.effects], bool)
 
 
@@ -131,66 +134,76 @@ def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
 def safe_ratios(
     friction: Friction, ratio: float, holding_error: ArrayLike, hysteresis_ratio: float = 0.0
 ) -> NDArray[np.float64]:
-    """Returns the ratio of each effect that can be compensated without creep, at most `ratio`.
+    """Returns the largest share of each effect that can be compensated while the remaining friction holds the arm.
 
-    What remains of the friction that holds the arm at rest must hold whatever the gravity compensation may be wrong by:
-    for every torque e in the box |e_i| <= holding_error_i there must be forces f_k along the coordinates with
-    sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k. The box is convex, so its corners suffice; the largest
-    such ratios are a linear program. Joints that share no coordinate are looked at apart. Where not even all the
-    friction could hold the error, none is compensated.
+    The remaining friction must hold the arm at rest for every torque error e with |e_i| <= holding_error_i. This means
+    that there are forces f_k along the coordinates with sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k.
+    The set of errors is convex, so it is sufficient to check its corners. A linear program computes the largest ratios
+    for each group of joints that share coordinates. If the friction of a group cannot hold the error even without
+    compensation, the ratios of this group are 0.
 
     Args:
-        friction: of the arm.
-        ratio: wanted, 0..`MAX_RATIO`.
-        holding_error: (n,) by which the gravity compensation may be wrong [N m, N].
-        hysteresis_ratio: wanted of what `springs_back`, 0..`MAX_HYSTERESIS_RATIO`. That holds no arm where it was
-            let go, so nothing has to remain of it; but of all that rubs along a coordinate at most `MAX_RATIO` is
-            compensated, this first.
+        friction: Friction of the arm.
+        ratio: Requested ratio, 0 to `MAX_RATIO`.
+        holding_error: Largest error (n,) of the gravity compensation [N m, N].
+        hysteresis_ratio: Requested ratio of effects with `Friction.springs_back`, 0 to `MAX_HYSTERESIS_RATIO`. It is
+            used if it exceeds `ratio`. These effects do not hold the arm where it was released, so all of them may be
+            compensated. The total compensation along a coordinate is at most `MAX_RATIO` of its friction without
+            viscous effects. Hysteresis has priority over other friction.
 
     Returns:
-        (k,) one ratio for each effect.
+        Ratios (k,) of the effects.
 
     Raises:
-        ControllerError: a ratio that is not allowed, or an error that is none.
+        ControllerError: A ratio is out of range, or `holding_error` is negative, not finite or has a wrong length.
     """
     error = np.asarray(holding_error, float)
     arm = friction.arm
     check_ratios(ratio, hysteresis_ratio)
     if error.shape != (arm.num_joints,) or not np.all((error >= 0) & np.isfinite(error)):
-        raise ControllerError(f"holding_error must be {arm.num_joints} numbers from 0; got {error.tolist()}")
+        raise ControllerError(f"holding_error must be {arm.num_joints} numbers of 0 or more; got {error.tolist()}")
     names = list(dict.fromkeys(effect.coordinate for effect in friction.effects))
     rows = np.array([joint_row(arm, name) for name in names]).reshape(-1, arm.num_joints)
     index = np.array([names.index(effect.coordinate) for effect in friction.effects], np.intp)
     holding = np.bincount(index, friction.coefficients * friction.holds, len(names)).astype(float)
     ratios = np.zeros(len(names))
-    _, block_of = connected_components(np.abs(rows).T @ np.abs(rows))
-    for block in range(block_of.max() + 1):
-        joints = block_of == block
+    _, group_of = connected_components(np.abs(rows).T @ np.abs(rows))
+    for group in range(group_of.max() + 1):
+        joints = group_of == group
         along = np.any(rows[:, joints] != 0, axis=1)
-        if not np.any(along):  # no friction there
+        if not np.any(along):  # No friction acts on these joints.
             continue
-        ratios[along] = _largest(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
+        ratios[along] = _largest_ratios(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
     if hysteresis_ratio <= ratio:
         return ratios[index]
-    dry = np.array([effect.kind != "viscous" for effect in friction.effects], bool)
-    wide = np.bincount(index, friction.coefficients * friction.springs_back, len(names))
-    most = MAX_RATIO * np.bincount(index, friction.coefficients * dry, len(names))
-    of_wide = np.minimum(hysteresis_ratio, most / np.maximum(wide, 1e-12))
-    left_for_rest = (most - of_wide * wide) / np.maximum(most / MAX_RATIO - wide, 1e-12)
-    of_rest = np.where(wide > 0, np.minimum(ratios, np.maximum(left_for_rest, 0.0)), ratios)
-    return np.where(friction.springs_back, of_wide[index], of_rest[index])
+    is_dry = np.array([effect.kind != "viscous" for effect in friction.effects], bool)
+    hysteresis = np.bincount(index, friction.coefficients * friction.springs_back, len(names))
+    max_compensated = MAX_RATIO * np.bincount(index, friction.coefficients * is_dry, len(names))
+    hysteresis_ratios = np.minimum(hysteresis_ratio, max_compensated / np.maximum(hysteresis, 1e-12))
+    remaining_ratios = (max_compensated - hysteresis_ratios * hysteresis) / np.maximum(
+        max_compensated / MAX_RATIO - hysteresis, 1e-12
+    )
+    other_ratios = np.where(hysteresis > 0, np.minimum(ratios, np.maximum(remaining_ratios, 0.0)), ratios)
+    return np.where(friction.springs_back, hysteresis_ratios[index], other_ratios[index])
 
 
-def _largest(
+def _largest_ratios(
     rows: NDArray[np.float64], holding: NDArray[np.float64], error: NDArray[np.float64], most: float
 ) -> NDArray[np.float64]:
-    """(c,) largest ratios in 0..most of the coordinates whose remaining friction holds every corner of the box."""
-    # Of opposite corners one suffices.
+    """Returns the largest ratios (c,) of coordinates for which the remaining friction holds all errors.
+
+    Args:
+        rows: Matrix (c, j) from joint velocities to velocities of the coordinates.
+        holding: Friction (c,) that holds the arm at rest, along each coordinate.
+        error: Largest errors (j,) of the gravity compensation [N m, N].
+        most: Upper bound of the ratios.
+    """
+    # Opposite corners are equivalent, so only one of each pair is included.
     corners = [np.array([1.0, *signs]) * error for signs in product((1.0, -1.0), repeat=len(error) - 1)]
     m, c = len(corners), len(rows)
-    # Unknowns: the ratios, then the forces along the coordinates at each corner.
+    # The unknowns are the ratios, then the forces along the coordinates at each corner.
     identity, limits = np.eye(m * c), np.tile(np.diag(holding), (m, 1))
-    done = linprog(
+    result = linprog(
         np.concatenate([-np.ones(c), np.zeros(m * c)]),
         A_ub=np.block([[limits, identity], [limits, -identity]]),
         b_ub=np.tile(holding, 2 * m),
@@ -198,12 +211,13 @@ def _largest(
         b_eq=np.concatenate(corners),
         bounds=[*[(0.0, most)] * c, *[(None, None)] * (m * c)],
     )
-    return done.x[:c] if done.success else np.zeros(c)
+    return result.x[:c] if result.success else np.zeros(c)
 
 
 def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
     """Returns the assumed error (n,) of the model's gravity torque [N m, N].
 
-    It is `WRONG_AT_MOST` times the leave-one-out RMS error, and zero for a model that was not identified from poses.
+    It is `HOLDING_ERROR_FACTOR` times the leave-one-out RMS error. It is zero for a model that was not identified from
+    static poses.
     """
-    return WRONG_AT_MOST * np.array([joint.rms_leave_one_out_included for joint in model.joints])
+    return HOLDING_ERROR_FACTOR * np.array([joint.rms_leave_one_out_included for joint in model.joints])

@@ -22,15 +22,16 @@ from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_select
 
 @dataclass(frozen=True, eq=False)
 class GravityParameters:
-    """Base parameters beta of the links, with the holding torque tau = Y(q) beta.
+    """Base parameters beta of an arm's gravity torque tau = Y(q) beta.
 
     Attributes:
-        arm: whose links these are.
-        standard_parameters: mass and first moments of every link, in the named frames of the SDF.
-        to_standard: (p, 10 l) the standard parameters from the ten of each link in the order of `link_inertias`. A
-            rotor without a frame of its own is part of the link that carries it, and balanced about its axis.
-        lengths: named distances between the links' frames [m], as they stand in the base parameters' names.
-        base: the base parameters beta = base.combination standard_values, in base.units.
+        arm: Arm of the links.
+        standard_parameters: Mass and first moments of every link, in the link frames of the SDF.
+        to_standard: Matrix (p, 10 l) from the ten parameters of each link, in the order of `link_inertias`, to the
+            standard parameters. A rotor without a frame dh_<name> is balanced about its axis and part of the link that
+            carries the motor.
+        lengths: Name -> distance between link frames [m]. The names of the base parameters contain these names.
+        base: Base parameters beta = base.combination standard_values, in the units base.units.
     """
 
     arm: Arm
@@ -50,7 +51,7 @@ class GravityParameters:
         return self.base.combination @ self.standard_values
 
     def combination_of(self, links: Sequence[str]) -> NDArray[np.float64]:
-        """(b, 10 l) the base parameters from the ten parameters of each of the arm's links, in the order of `links`."""
+        """Returns the matrix (b, 10 l) from the ten parameters of each of the l `links` to the base parameters."""
         order = [link.link for link in link_inertias(self.arm)]
         columns = [10 * order.index(link) + k for link in links for k in range(10)]
         return np.asarray(self.base.combination @ self.to_standard[:, columns])
@@ -61,23 +62,23 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
     """Returns the base parameters of an arm's gravity torque.
 
     Args:
-        arm: the arm; its gravity vector sets the mounting.
-        frames: prefix of the SDF frames in which the parameters are written: "dh" (dVRK) or, on the MTM, "paper".
-        serial: leaves out the links of the linkage (crank, coupler), as the paper does.
+        arm: Arm whose gravity vector specifies the mounting.
+        frames: Prefix of the SDF frames in which the parameters are expressed: "dh" (dVRK) or, for an MTM, "paper".
+        serial: True to omit the links of the linkage (crank, coupler), as the paper does.
 
     Raises:
-        ArmError: the arm's SDF has no frames of that prefix, gravity is (almost) zero, or `serial` of an arm whose
-            joints move other links than the numbered ones, as a PSM's jaw does.
+        ArmError: The SDF has no frames with this prefix, gravity is less than 1 m/s^2, or `serial` is True and a joint
+            moves a link without a numbered frame, such as the jaw of a PSM.
     """
-    if np.linalg.norm(arm.gravity) < 1.0:
-        raise ArmError(f"{arm.name} is weightless: gravity must be 1 m/s^2 or more for a gravity model, on Earth 9.8")
+    if (size := float(np.linalg.norm(arm.gravity))) < 1.0:
+        raise ArmError(f"{arm.name}: gravity is {size:.3g} m/s^2; it must be 1 m/s^2 or more for a gravity model")
     plant = shared_plant(arm)
     bodies = labelled_bodies(plant, frames)
     kept = {label: body for label, body in bodies.items() if label.isdigit() or not serial}
     driven = {plant.GetJointByName(name).child_body().index() for name in arm.joint_names}
     if serial and not driven <= {body.index() for body, _ in kept.values()}:
         raise ArmError(
-            f"{arm.name} has joints whose links have no number: its links cannot be separated from its linkage"
+            f"{arm.name}: serial is not possible, because a joint moves a link that has no frame {frames}_<number>"
         )
     parameters = [StandardParameter(label, axis) for label in kept for axis in ("", "x", "y", "z")]
     lengths = named_lengths(plant, bodies, frames)
@@ -87,17 +88,18 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
         standard_parameters=tuple(parameters),
         to_standard=_to_standard(plant, arm, list(kept.values())),
         lengths={name: length for name, length in lengths.items() if name != "1"},
-        base=reduce_to_base(regressor, parameters, _readable_preference(parameters), lengths),
+        base=reduce_to_base(regressor, parameters, _preference_order(parameters), lengths),
     )
 
 
 def _regressor_at_random_poses(
     plant: MultibodyPlant, arm: Arm, bodies: Sequence[tuple[RigidBody, RigidTransform]]
 ) -> NDArray[np.float64]:
-    """(rows, p) of a unit of gravity: the height's derivative of the origin of each frame F, and of its unit vectors.
+    """Returns regressor rows (rows, p) at random poses for gravity of 1 m/s^2.
 
-    The potential energy of a link is linear in its mass m and first moment m c: m times the height of Fo, and m c times
-    the part of F's axes that points upwards.
+    The potential energy of a link is linear in mass and first moments. The factor of the mass is the height of the
+    origin of frame F. The factors of the first moments are the upward components of the axes of F. The regressor
+    contains the derivatives of these factors.
     """
     up = -arm.gravity / np.linalg.norm(arm.gravity)
     points = [X_BF.multiply(np.hstack([np.zeros((3, 1)), np.eye(3)])) for _, X_BF in bodies]
@@ -110,9 +112,9 @@ def _regressor_at_random_poses(
             J = plant.CalcJacobianTranslationalVelocity(
                 context, JacobianWrtVariable.kV, body.body_frame(), p_BoP, world, world
             )
-            rise = np.tensordot(J.reshape(4, 3, -1)[..., selector], up, axes=(1, 0))
-            rise[1:] -= rise[0]
-            columns.append(rise @ arm.linkage.matrix)
+            height_rates = np.tensordot(J.reshape(4, 3, -1)[..., selector], up, axes=(1, 0))
+            height_rates[1:] -= height_rates[0]
+            columns.append(height_rates @ arm.linkage.matrix)
         rows.append(np.concatenate(columns).T)
     return np.concatenate(rows)
 
@@ -120,9 +122,10 @@ def _regressor_at_random_poses(
 def _to_standard(
     plant: MultibodyPlant, arm: Arm, bodies: Sequence[tuple[RigidBody, RigidTransform]]
 ) -> NDArray[np.float64]:
-    """(4 bodies, 10 l) [m, m c in F] of each body and the rotors on it, from the ten parameters of all links.
+    """Returns the matrix (4 bodies, 10 l) from the parameters of all links to the mass and first moments of each body.
 
-    Turning a rotor that is balanced about its axis moves no mass, so for gravity it is part of the link.
+    The first moments are in frame F of the body. The rotation of a balanced rotor does not change the gravity torque.
+    Therefore the rotor is part of the body that carries the motor.
     """
     order = [link.link for link in link_inertias(arm)]
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(arm_instance(plant))]
@@ -139,18 +142,20 @@ def _to_standard(
 
 
 def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
-    """(4, 4) [m, m c] of a joint's child C, about Bo and along B of the parent, from those about Co along C.
+    """Returns the matrix (4, 4) from mass and first moments of a rotor C in its frame to those in its parent frame B.
 
     Raises:
-        ArmError: C is no rotor: it does not turn, or its centre of mass is off the axis.
+        ArmError: The joint is not revolute, or the centre of mass of C is not on the joint axis.
     """
     child = joint.child_body()
     if joint.type_name() != "revolute":
-        raise ArmError(f"{child.name()} needs a frame dh_<name>: it does not turn like a rotor")
+        raise ArmError(f"link {child.name()} needs a frame dh_<name>, because its joint is not revolute")
     X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     axis, p_CM = X_CM.rotation() @ joint.revolute_axis(), X_CM.translation()
     if np.linalg.norm(np.cross(child.default_com() - p_CM, axis)) > 1e-9:
-        raise ArmError(f"{child.name()} needs a frame dh_<name>: its centre of mass is off its joint's axis")
+        raise ArmError(
+            f"link {child.name()} needs a frame dh_<name>, because its centre of mass is not on its joint axis"
+        )
     X_BC = child.body_frame().CalcPose(plant.CreateDefaultContext(), joint.parent_body().body_frame())
     along = np.outer(axis, axis)
     R_BC, p_BM = X_BC.rotation().matrix(), X_BC.multiply(p_CM)
@@ -158,9 +163,12 @@ def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
 
 
 def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
-    """Bodies by label with the frame F that their parameters are written in, X_BF; numbered links first.
+    """Returns label -> (moving body B, pose X_BF of the frame F of its parameters). Numbered links come first.
 
-    The links are those with a frame <frames>_<number>, the base's 0 left out, or dh_<name> for links of a linkage.
+    The label is the number of the frame <frames>_<number>, or the name of the frame dh_<name> for links of a linkage.
+
+    Raises:
+        ArmError: The SDF has no numbered frames with the prefix `frames`.
     """
     bodies = {}
     for index in plant.GetFrameIndices(arm_instance(plant)):
@@ -169,7 +177,7 @@ def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[Rigid
         if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
             bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
     if not any(label.isdigit() for label in bodies):
-        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
+        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; use the prefix "dh"')
     return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
 
 
@@ -186,7 +194,10 @@ def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
 def named_lengths(
     plant: MultibodyPlant, labels: Mapping[str, tuple[RigidBody, RigidTransform]], frames: str = "dh"
 ) -> dict[str, float]:
-    """Constant distances between the frames of neighbouring links as the field names them: L2, L_crank; and "1"."""
+    """Returns name -> distance between the frames of neighbouring links [m], such as "L2" and "L_crank".
+
+    The entry "1" is 1.0, for coefficients without a length.
+    """
     context = plant.CreateDefaultContext()
     lengths = {"1": 1.0}
     for label in labels:
@@ -207,11 +218,12 @@ def named_lengths(
     return lengths
 
 
-def _readable_preference(parameters: Sequence[StandardParameter]) -> list[int]:
-    """First moments of numbered links from the hand inward, then those of the linkage, masses last and from the base.
+def _preference_order(parameters: Sequence[StandardParameter]) -> list[int]:
+    """Returns parameter indices in the order of preference as base parameters.
 
-    So a link's mass is read as a first moment of the links before it, and where masses do have a column of their own
-    (those that a prismatic joint lifts) it is that of the first: "(m3+...+m7)".
+    The order is: first moments of numbered links from tip to base, first moments of the linkage, masses from base to
+    tip. With this order, a mass is part of the first moments of preceding links. Only masses that a prismatic joint
+    lifts have a base parameter, such as "(m3+...+m7)".
     """
 
     def key(index: int) -> tuple:

@@ -1,4 +1,4 @@
-"""Gravity torque and its regressor, derived symbolically from the arm's own MultibodyPlant (paper, III.B-D, H)."""
+"""Derives the gravity torque and its regressor symbolically from an arm's MultibodyPlant (paper, III.B-D, H)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from dvrk_drake.dynamics.gravity_parameters import GravityParameters, gravity_pa
 from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
 from dvrk_drake.models.arm import Arm
 
+#: Magnitude of gravity [m/s^2].
 GRAVITY = sympy.Symbol("g", positive=True)
 
 
 @dataclass(frozen=True, eq=False)
 class SymbolicGravity(GravityParameters):
-    """tau = Y(q) beta: the torque on the n independent joints that holds the arm against gravity.
+    """Symbolic gravity torque tau = Y(q) beta of the n independent joints, which holds the arm at rest.
 
     Attributes:
-        q: the n joint positions as sympy symbols q1..qn [rad, m].
-        regressor: sympy (n, b) in q and the symbol g = |gravity| [m/s^2]; d potential / dq.
-        potential: sympy (1, b); potential beta is the part of the potential energy that depends on q [J].
+        q: Joint positions as symbols q1, ..., qn [rad, m].
+        regressor: Y (n, b) as a function of q and `GRAVITY`.
+        potential: Row (1, b); potential beta is the part of the potential energy that depends on q [J].
     """
 
     q: tuple[sympy.Symbol, ...]
@@ -31,29 +32,28 @@ class SymbolicGravity(GravityParameters):
 
     @property
     def gravity_magnitude(self) -> float:
-        """|gravity| [m/s^2]: the number for the symbol g."""
+        """Magnitude of the arm's gravity vector [m/s^2], the value of `GRAVITY`."""
         return float(np.linalg.norm(self.arm.gravity))
 
 
 @cache
 def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> SymbolicGravity:
-    """Derives the gravity torque of `arm` from its plant.
+    """Derives the gravity torque of `arm` from its symbolic plant.
 
-    `MultibodyPlant.ToSymbolic()` gives the pose of every link, and so the potential energy P per unit of its mass m and
-    of its first moment m c, in which P is linear; only those that stand for base parameters are written out. tau = G'
-    dP/dq_tree falls out by making the tree a function of the independent joints first: the regressor's columns are the
-    derivatives.
+    The potential energy P is linear in the mass and the first moments of each link. It is derived for the parameters
+    that are columns of the base set, as a function of the independent joint positions q. The regressor is its
+    derivative with respect to q.
 
     Args:
-        arm, frames, serial: as in `gravity_parameters`.
+        arm, frames, serial: Arguments of `gravity_parameters`.
 
     Raises:
-        ArmError: as of `gravity_parameters`.
+        ArmError: `gravity_parameters` raises it.
     """
     parameters = gravity_parameters(arm, frames, serial)
     plant = SymbolicPlant(arm, frames)
     chosen = [parameters.standard_parameters[column] for column in parameters.base.columns]
-    # Shortened before they are differentiated: a linkage turns its links back and forth, which all drops out here.
+    # `potential_energy` returns simplified terms, so the opposite rotations in a linkage cancel before differentiation.
     energies, ring = [plant.potential_energy(p.label, p.axis) for p in chosen], plant.ring
     columns = [[ring.to_sympy(ring.shortest(ring.derivative(e, q))) for e in energies] for q in plant.q]
     return SymbolicGravity(

@@ -1,4 +1,4 @@
-"""The identified model of an arm: its files, its torques, and its evaluation in a control loop."""
+"""Identified model of an arm: model file, holding torque, and evaluation in a control loop."""
 
 import math
 import os
@@ -150,8 +150,8 @@ class _Identified:
 
 
 @dataclass(kw_only=True)
-class _Head:
-    """The first lines of a model file.
+class _Header:
+    """First fields of a model file.
 
     Attributes:
         format: Version of the file's keys.
@@ -165,7 +165,7 @@ class _Head:
 
 
 @dataclass(kw_only=True)
-class ModelFile(_Identified, _Head):
+class ModelFile(_Identified, _Header):
     """Schema of a model file."""
 
 
@@ -211,7 +211,7 @@ class IdentifiedModel(_Identified):
             ModelError: Both `effects` and `dynamics` are given.
         """
         if dynamics and effects:
-            raise ModelError("a model with dynamics has all effects of the arm; give either effects or dynamics")
+            raise ModelError("dynamics already includes all effects of the arm; give either effects or dynamics")
         gravity = gravity_parameters(arm)
         return cls(
             arm=arm,
@@ -242,20 +242,20 @@ class IdentifiedModel(_Identified):
         # Reject an unknown version before its keys are checked.
         version = content.get("format") if isinstance(content, dict) else None
         if version and version not in (FORMAT, *_EARLIER_FORMATS):
-            raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}", 3 and 2; identify anew')
+            raise ModelError(f'{path}: format is "{version}"; allowed: "{FORMAT}", 3 and 2. Identify the arm again')
         content = with_current_keys(ModelFile, content, str(path))
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A missing number would otherwise silently become 0.
         if key := missing_key(ModelFile, content):
             raise ModelError(f"{path}: {key} is missing")
         try:
-            own_arm = load_arm(_named_from(path, file.arm)).with_gravity(file.gravity)
+            own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
             if arm is not None and own_arm.name != arm.name:
-                raise ModelError(f"is of {own_arm.name}, not of {arm.name}")
+                raise ModelError(f"the model is of {own_arm.name}, not of {arm.name}")
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
         except ArmError as error:
-            raise ModelError(f'{path}: its arm "{file.arm}" cannot be loaded: {error}') from error
+            raise ModelError(f'{path}: the arm "{file.arm}" cannot be loaded: {error}') from error
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
         return model
@@ -268,7 +268,7 @@ class IdentifiedModel(_Identified):
         """
         self.check()
         with atomic_write(path) as stream:
-            stream.write(yaml_dump_typed(self._file(_name_for(path, self.arm))))
+            stream.write(yaml_dump_typed(self._file(_arm_reference(path, self.arm))))
 
     def to_yaml(self) -> str:
         """Returns the text of a model file that refers to the arm by `Arm.source`."""
@@ -284,21 +284,26 @@ class IdentifiedModel(_Identified):
             raise ModelError(fault)
         names = gravity_parameters(self.arm).base.names
         if tuple(p.name for p in self.base_parameters) != names:
-            raise ModelError(f"base parameters must be, in this order: {'; '.join(names)}")
+            raise ModelError(f"base_parameters must have these names in this order: {'; '.join(names)}")
         if tuple(joint.name for joint in self.joints) != self.arm.joint_names:
-            raise ModelError(f"joints must be, in this order: {', '.join(self.arm.joint_names)}")
+            raise ModelError(f"joints must have these names in this order: {', '.join(self.arm.joint_names)}")
         for i, effect in enumerate(self.effects):
             if fault := effect_fault(self.arm, ActuatorEffect.of(effect), POSITION_KINDS):
                 raise ModelError(f"effects[{i}]: {fault}")
         if self.validation is not None and set(self.validation.verdicts) != set(self.arm.joint_names):
-            raise ModelError(f"validation.verdicts must name these joints: {', '.join(self.arm.joint_names)}")
+            raise ModelError(
+                f"validation.verdicts has entries for {', '.join(self.validation.verdicts) or 'no joint'}; it needs "
+                f"one entry for each joint: {', '.join(self.arm.joint_names)}"
+            )
         for name, verdict in self.validation.verdicts.items() if self.validation else ():
             if verdict not in get_args(Verdict):
                 raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
         if self.dynamics is not None:
             DynamicModel(self.arm, self.dynamics)
             if self.effects or not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
-                raise ModelError("a model with dynamics has effects only there, and the gravity that stands there")
+                raise ModelError(
+                    "a model with dynamics needs all effects in dynamics and gravity equal to dynamics.gravity"
+                )
 
     @property
     def holding_effects(self) -> list[DriveEffect]:
@@ -332,7 +337,7 @@ class IdentifiedModel(_Identified):
             ModelError: The model was identified from poses and has no `dynamics`.
         """
         if self.dynamics is None:
-            raise ModelError("the model has no dynamics: it was identified from poses; identify a motion")
+            raise ModelError("the model has no dynamics; use a model that was identified from a motion")
         return DynamicModel(self.arm, self.dynamics)
 
     def with_scaled_parameters(self, factors: ArrayLike) -> "IdentifiedModel":
@@ -386,14 +391,14 @@ class ControlModel:
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
 
 
-def _name_for(path: str | Path, arm: Arm) -> str:
+def _arm_reference(path: str | Path, arm: Arm) -> str:
     """Returns the name of the arm in the model file at `path`: a URL, or a path relative to that file."""
     if not os.path.isabs(arm.source):
         return f"{PACKAGE_URL}arms/{arm.source}.yaml"
     return os.path.relpath(arm.source, os.path.dirname(os.path.realpath(path)))
 
 
-def _named_from(path: str | Path, name: str) -> str:
+def _arm_argument(path: str | Path, name: str) -> str:
     """Returns the argument of `load_arm` for the arm that the model file at `path` calls `name`."""
     if not name.endswith((".yaml", ".yml")) or name.startswith(PACKAGE_URL):
         return name

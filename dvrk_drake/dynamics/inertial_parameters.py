@@ -15,25 +15,27 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
 
-#: In this order everywhere; units kg, kg m, kg m^2.
+#: Names of the ten inertial parameters of a link [kg, kg m, kg m^2], in the order of all parameter vectors.
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 
 
 @dataclass(frozen=True, eq=False)
 class LinkInertia:
-    """M_LLo_L: the inertia of one link L about the origin Lo of its frame in the SDF, expressed in L.
+    """Spatial inertia M_LLo_L of a link L about the origin Lo of its SDF frame, expressed in L.
 
     Attributes:
-        link: name of the body in the SDF.
-        parameters: (10,) m [kg], m c = m p_LoLcm_L [kg m], then Ixx, Iyy, Izz, Ixy, Ixz, Iyz about Lo [kg m^2], the
-            products with the sign of the rotational inertia matrix: Ixy = -integral x y dm.
+        link: Name of the link in the SDF.
+        parameters: Parameters (10,): mass m [kg], first moments m p_LoLcm_L [kg m], and Ixx, Iyy, Izz, Ixy, Ixz, Iyz
+            about Lo [kg m^2]. Products of inertia are elements of the inertia matrix: Ixy = -integral x y dm.
     """
 
     link: str
     parameters: NDArray[np.float64]
 
     def pseudo_inertia(self) -> NDArray[np.float64]:
-        """(4, 4) integral of (p, 1)(p, 1)' dm, positive definite for every body that has a volume.
+        """Returns the pseudo-inertia (4, 4), the integral of (p, 1)(p, 1)' dm over points p of the link.
+
+        It is positive definite for every body with a volume.
 
         Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
         identification" (2018), equation 10.
@@ -42,16 +44,16 @@ class LinkInertia:
 
     @classmethod
     def from_spatial_inertia(cls, link: str, M_LLo_L: SpatialInertia) -> LinkInertia:
-        """The parameters of Drake's spatial inertia of a link about its own origin."""
+        """Converts Drake's spatial inertia of a link about the origin of its frame."""
         mass, I_LLo_L = M_LLo_L.get_mass(), M_LLo_L.CalcRotationalInertia()
         moments, products = I_LLo_L.get_moments(), I_LLo_L.get_products()
         return cls(link, np.concatenate([[mass], mass * M_LLo_L.get_com(), moments, products]))
 
     def to_spatial_inertia(self) -> SpatialInertia:
-        """M_LLo_L for Drake.
+        """Returns M_LLo_L as Drake's spatial inertia.
 
         Raises:
-            ModelError: the mass is not positive, or Drake finds that no body has this inertia.
+            ModelError: The mass is not positive, or the inertia is not physically consistent.
         """
         mass, moment, inertia = self.parameters[0], self.parameters[1:4], self.parameters[4:]
         if not mass > 0:
@@ -59,11 +61,12 @@ class LinkInertia:
         try:
             return SpatialInertia(mass, moment / mass, UnitInertia(*(inertia / mass)))
         except RuntimeError as error:
-            raise ModelError(f"{self.link}: no body has this inertia: {str(error).splitlines()[0]}") from error
+            reason = str(error).splitlines()[0]
+            raise ModelError(f"{self.link}: the inertia is not physically consistent: {reason}") from error
 
 
 def link_inertias(arm: Arm) -> tuple[LinkInertia, ...]:
-    """Returns all moving links of the arm, including linkage and instrument, with the inertias of the SDF."""
+    """Returns the inertias of all moving links in the SDF, including linkage and instrument."""
     return tuple(
         LinkInertia.from_spatial_inertia(body.name(), body.default_spatial_inertia())
         for body in moving_bodies(shared_plant(arm))
@@ -71,7 +74,7 @@ def link_inertias(arm: Arm) -> tuple[LinkInertia, ...]:
 
 
 def moving_bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
-    """Returns the bodies of a finalized plant that are not anchored to the world, in the order of the SDF."""
+    """Yields the bodies of a finalized plant that are not anchored to the world, in the order of the SDF."""
     bodies = (
         plant.get_body(index) for index in plant.GetBodyIndices(plant.GetBodyByName("base_link").model_instance())
     )
@@ -79,12 +82,12 @@ def moving_bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
 
 
 def parameter_axis(name: str) -> str:
-    """The axes in a name of `PARAMETER_NAMES`: "" of m, "x" of mcx, "xy" of Ixy."""
+    """Returns the axes in a name of `PARAMETER_NAMES`: "" for "m", "x" for "mcx", "xy" for "Ixy"."""
     return name.removeprefix("mc").removeprefix("m").removeprefix("I")
 
 
 def pseudo_inertia(parameters: ArrayLike) -> NDArray[np.float64]:
-    """(4, 4) pseudo-inertia of ten inertial parameters (10,), linear in them."""
+    """Returns the pseudo-inertia (4, 4), a linear function of the inertial parameters (10,)."""
     m, hx, hy, hz, Ixx, Iyy, Izz, Ixy, Ixz, Iyz = np.asarray(parameters, float)
     half_trace = (Ixx + Iyy + Izz) / 2
     return np.array(
@@ -98,16 +101,16 @@ def pseudo_inertia(parameters: ArrayLike) -> NDArray[np.float64]:
 
 
 def parameters_from_pseudo_inertia(J: ArrayLike) -> NDArray[np.float64]:
-    """(10,) inertial parameters of a symmetric (4, 4) pseudo-inertia: the inverse of `pseudo_inertia`."""
+    """Returns the inertial parameters (10,) of a pseudo-inertia J (4, 4). This is the inverse of `pseudo_inertia`."""
     J = np.asarray(J, float)
     moments = np.trace(J[:3, :3]) - np.diag(J)[:3]
     return np.array([J[3, 3], *J[:3, 3], *moments, -J[0, 1], -J[0, 2], -J[1, 2]])
 
 
 def change_of_frame(X_LF: RigidTransform) -> NDArray[np.float64]:
-    """(10, 10) T with parameters_L = T parameters_F: those of a body in frame F, re-expressed in L about Lo.
+    """Returns the matrix (10, 10) from a body's parameters about Fo in frame F to its parameters about Lo in frame L.
 
-    A point of the body is (p_L, 1) = X_LF (p_F, 1), so its pseudo-inertia is X_LF J_F X_LF'.
+    A point of the body is (p_L, 1) = X_LF (p_F, 1), so the pseudo-inertia is J_L = X_LF J_F X_LF'.
     """
     X = X_LF.GetAsMatrix4()
     return np.column_stack([parameters_from_pseudo_inertia(X @ pseudo_inertia(unit) @ X.T) for unit in np.eye(10)])
@@ -115,13 +118,14 @@ def change_of_frame(X_LF: RigidTransform) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class RotorInertia:
-    """One entry of the symmetric matrix D with tau = J' D J vd, where a = J q are the actuators' positions.
+    """Element of the rotor inertia matrix D in actuator coordinates.
+
+    The joint torque due to the rotors is tau = J' D J vd, where J is the matrix of `arm.transmission`.
 
     Attributes:
-        actuators: (a, b), a the name of the joint that the actuator has its own row in `arm.transmission`; b = a for
-            the inertia that rotor a has [kg m^2 per rad of the actuator; kg of a prismatic one]. Motors have no entry
-            with b != a: it is there because an SDF can only state rotors joint by joint (see `rotor_inertias`).
-        value: what the SDF states.
+        actuators: Names of the row and the column of D. An actuator has the name of the joint in the same row of the
+            transmission. Elements with different names are artefacts of the SDF format, see `rotor_inertias`.
+        value: Value according to the SDF [kg m^2; kg for a prismatic actuator].
     """
 
     actuators: tuple[str, str]
@@ -129,18 +133,18 @@ class RotorInertia:
 
     @property
     def name(self) -> str:
-        """Name of the parameter, such as "rotor.wrist_yaw", "rotor.wrist_pitch*wrist_yaw"."""
+        """Name of the parameter, such as "rotor.wrist_yaw" or "rotor.wrist_pitch*wrist_yaw"."""
         a, b = self.actuators
         return f"rotor.{a}" if a == b else f"rotor.{a}*{b}"
 
 
 def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
-    """The rotors as the SDF's `drake:rotor_inertia` and `drake:gear_ratio` state them: one for every actuator.
+    """Returns the rotor inertias according to `drake:rotor_inertia` and `drake:gear_ratio` in the SDF.
 
-    Drake adds gear^2 * inertia to the diagonal of the mass matrix, in joint coordinates. Where the transmission couples
-    joints that have rotors (the PSM's wrist), that is no diagonal in actuator coordinates, and the entries that couple
-    two actuators follow: without them the sum of all columns would not be the plant's. An identification leaves their
-    columns out. A rotor that the SDF models as a link is among the links, and its value here is 0.
+    The diagonal elements of all actuators come first, then the nonzero elements that couple two actuators. Drake adds
+    gear^2 * inertia to the diagonal of the mass matrix in joint coordinates. If the transmission couples joints with
+    rotors, as in the PSM's wrist, the matrix is not diagonal in actuator coordinates. Real motors have no coupling
+    elements, so identification omits them. The value is 0 for a rotor that the SDF models as a link.
     """
     D_tree = np.zeros((len(arm.tree_joint_names),) * 2)
     for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
@@ -150,18 +154,18 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
     G = arm.linkage.matrix
     D = J_inverse.T @ (G.T @ D_tree @ G) @ J_inverse
     names = arm.joint_names
-    alone = [RotorInertia((name, name), float(D[i, i])) for i, name in enumerate(names)]
+    diagonal = [RotorInertia((name, name), float(D[i, i])) for i, name in enumerate(names)]
     coupled = [
         RotorInertia((names[i], names[k]), float(D[i, k]))
         for i in range(len(names))
         for k in range(i + 1, len(names))
         if abs(D[i, k]) > 1e-12 * np.abs(D).max()
     ]
-    return (*alone, *coupled)
+    return (*diagonal, *coupled)
 
 
 def rotor_links(arm: Arm) -> set[str]:
-    """Links of the SDF that are rotors, balanced about their own axis: those that have no frame dh_<name>."""
+    """Returns the links of the SDF without a frame dh_<name>, which are rotors balanced about their axes."""
     plant = shared_plant(arm)
     frames = [plant.get_frame(i) for i in plant.GetFrameIndices(plant.GetBodyByName("base_link").model_instance())]
     framed = {frame.body().name() for frame in frames if frame.name().startswith("dh_")}

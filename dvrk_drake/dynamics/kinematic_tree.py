@@ -1,4 +1,4 @@
-"""An arm's tree of links as plain arrays, read from its plant: what a compiled recursion over the links needs."""
+"""Reads the tree of links of an arm from its plant into arrays, for compiled recursions over the links."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from dvrk_drake.models.arm import Arm
 
 @dataclass(frozen=True, eq=False)
 class KinematicTree:
-    """The moving links C of an arm with their parents P and inboard joints, a parent before its children.
+    """Moving links C of an arm with their parents P and inboard joints. Each parent precedes its children.
 
-    Joints that turn, slide and weld are one formula: with the joint's coordinate x = G q + c,
-    X_PC(x) = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3 and V_PC_C = H dx/dt.
+    The same formulas represent revolute, prismatic and fixed joints. They use the joint coordinate x = G q + c:
+
+        X_PC(x) = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3,    V_PC_C = H dx/dt.
 
     Attributes:
-        links: names of the l links.
-        parents: (l,) index of each link's parent, -1 for the base.
-        pose_terms: (l, 4, 3, 4) T0..T3, each a rotation part and a translation part [m].
-        hinges: (l, 6) H: angular, then linear velocity of Co per unit of the coordinate's rate, expressed in C.
-        G: (l, n) coordinates of the joints from the independent joint positions q; 0 for a weld.
-        c: (l,) offsets [rad, m].
-        affects: (l, n) True where an independent joint moves a link.
+        links: Names of the l links.
+        parents: Indices (l,) of the parents, -1 for the base.
+        pose_terms: Matrices T0 to T3 (l, 4, 3, 4), each with a rotation part and a translation part [m].
+        hinges: Hinge vectors H (l, 6), angular then linear velocity of Co per unit of dx/dt, expressed in C.
+        G: Matrix (l, n) from the independent joint positions q to the joint coordinates; 0 for fixed joints.
+        c: Offsets (l,) of the joint coordinates [rad, m].
+        affects: Mask (l, n), True where an independent joint moves a link.
     """
 
     links: tuple[str, ...]
@@ -42,10 +43,10 @@ class KinematicTree:
 
     @classmethod
     def from_plant(cls, plant: MultibodyPlant, arm: Arm) -> KinematicTree:
-        """Reads joint frames, axes and offsets from a finalized plant that holds `arm` alone.
+        """Reads joint frames, axes and offsets from a finalized plant that contains only `arm`.
 
         Raises:
-            ArmError: a joint neither turns about one axis, slides along one, nor is a weld.
+            ArmError: A joint is not revolute, prismatic or fixed.
         """
         inboard = {joint.child_body().name(): joint for joint in _joints(plant)}
         links = _parents_first([body.name() for body in moving_bodies(plant)], inboard)
@@ -76,7 +77,7 @@ def _joints(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ...]:
-    """The links in their order, but each after its parent."""
+    """Returns the links in their order, except that each link follows its parent."""
     ordered: list[str] = []
 
     def add(link: str) -> None:
@@ -92,7 +93,7 @@ def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ..
 
 
 def _axis(joint: Joint) -> NDArray[np.float64]:
-    """(3,) unit axis of a joint in its frames F and M alike; zero for a weld."""
+    """Returns the unit axis (3,) of a joint, which is equal in its frames F and M. It is zero for a fixed joint."""
     match joint.type_name():
         case "revolute":
             return joint.revolute_axis()
@@ -104,14 +105,14 @@ def _axis(joint: Joint) -> NDArray[np.float64]:
 
 
 def _pose_terms(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
-    """(4, 3, 4) T0..T3 of X_PC = X_PF X_FM(x) X_MC; the pose in the base where the parent is anchored to it."""
+    """Returns T0 to T3 (4, 3, 4) of X_PC = X_PF X_FM(x) X_MC. If P is anchored to the world, P is the base frame."""
     X_FM = joint.X_FM() if joint.type_name() == "weld" else RigidTransform()
     X_PF, X_MC = _pose_in_parent(plant, joint), joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     x, y, z = _axis(joint)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     terms = np.zeros((4, 4, 4))
     terms[0] = X_FM.GetAsMatrix4()
-    if joint.type_name() == "revolute":  # Rodrigues: R = 1 + sin(x) K + (1 - cos(x)) K^2
+    if joint.type_name() == "revolute":  # Rodrigues' formula R = 1 + sin(x) K + (1 - cos(x)) K^2
         terms[1, :3, :3], terms[2, :3, :3] = K, K @ K
     if joint.type_name() == "prismatic":
         terms[3, :3, 3] = x, y, z
@@ -125,7 +126,7 @@ def _pose_in_parent(plant: MultibodyPlant, joint: Joint) -> RigidTransform:
 
 
 def _hinge(joint: Joint) -> NDArray[np.float64]:
-    """(6,) V_PC_C per unit of rate, of the point Co."""
+    """Returns H (6,), the velocity V_PC_C of the point Co per unit of dx/dt."""
     X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     axis_C = X_CM.rotation() @ _axis(joint)
     if joint.type_name() == "prismatic":

@@ -1,4 +1,4 @@
-"""Kinematics of an arm: pose and Jacobian of one frame, and the PSM's inverse kinematics in closed form."""
+"""Forward kinematics of a frame of an arm, and closed-form inverse kinematics of the PSM."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_select
 
 
 def handle_frame(arm: Arm) -> str:
-    """Returns the name of the handle's frame, the last DH frame: dh_7 for an MTM, dh_6 for a PSM.
+    """Returns the name of the handle's frame. It is the last DH frame: dh_7 for an MTM, dh_6 for a PSM.
 
     Raises:
-        ArmError: the SDF has no frame dh_0, dh_1, ...
+        ArmError: The SDF has no frames dh_0, dh_1, ...
     """
     numbered = [name for name in _frame_names(shared_plant(arm)) if re.fullmatch(r"dh_\d+", name)]
     if not numbered:
-        raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; name the handle's frame")
+        raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; give the name of the handle's frame")
     return max(numbered, key=lambda name: int(name.removeprefix("dh_")))
 
 
 class ArmFrame:
-    """A frame F of an arm with base frame B; poses q are (n,), in the arm's order [rad; m on a prismatic joint].
+    """Kinematics of a frame F of an arm with base frame B.
 
-    It owns a context of the arm's plant, so threads must not share it.
+    Joint positions q are (n,) [rad; m for a prismatic joint]. An object must not be shared between threads.
     """
 
     def __init__(self, arm: Arm, frame_name: str) -> None:
@@ -46,7 +46,7 @@ class ArmFrame:
             raise ArmError(f'{arm.name}: its SDF has no frame "{frame_name}"; it has {known}')
         self._frame = self._plant.GetFrameByName(frame_name)
         self._context = self._plant.CreateDefaultContext()
-        # G maps rates of the independent joints to those of the plant's.
+        # G maps velocities of the independent joints to velocities of the plant.
         self._G = np.zeros((self._plant.num_velocities(), arm.num_joints))
         self._G[tree_selector(self._plant, arm)] = arm.linkage.matrix
 
@@ -56,7 +56,10 @@ class ArmFrame:
         return self._frame.CalcPoseInWorld(self._context)
 
     def jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Returns J (6, n) with V_BF = J v: angular velocity [rad/s], then velocity of F's origin [m/s], in B."""
+        """Returns the Jacobian J (6, n) with V_BF = J v, expressed in B.
+
+        V_BF consists of the angular velocity [rad/s] and the velocity of the origin of F [m/s].
+        """
         self._set(q)
         world = self._plant.world_frame()
         J = self._plant.CalcJacobianSpatialVelocity(
@@ -65,7 +68,7 @@ class ArmFrame:
         return J @ self._G
 
     def mass_matrix(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Mass matrix (n, n) of the independent joints, with all that moves along: G' M G."""
+        """Returns the mass matrix (n, n) of the independent joints, including the linkage."""
         self._set(q)
         return self._G.T @ self._plant.CalcMassMatrix(self._context) @ self._G
 
@@ -80,30 +83,33 @@ def _frame_names(plant: MultibodyPlant) -> list[str]:
 
 
 class PsmInverseKinematics:
-    """Joint positions of a PSM whose tip (the wrist yaw frame) is at a given pose.
+    """Closed-form inverse kinematics of a PSM for the pose of a frame on its wrist yaw link.
 
-    With the instrument inserted beyond the remote centre of motion (RCM) and |wrist_pitch| < 90 degrees there is one
-    solution, up to turns of the roll. The shaft's line passes through the RCM; the link between the two wrist axes, of
-    length L, lies in one plane with it and is perpendicular to the yaw axis. So the direction d from the pitch axis to
-    the yaw axis is that of the tip's position without its part along the yaw axis; p_wrist = p_tip - L d lies on the
-    shaft and gives yaw, pitch and insertion; what rotation remains is roll, wrist pitch and wrist yaw about z, x, y.
+    The solution is unique, except for full revolutions of the roll, if two conditions hold. The wrist centre is beyond
+    the remote centre of motion (RCM), and |wrist_pitch| < 90 degrees.
 
-    Lengths and the fixed tip frame are read from the arm's SDF.
+    The wrist link has the length L and connects the wrist pitch axis to the wrist yaw axis. It lies in a plane with the
+    shaft and is perpendicular to the yaw axis. Therefore the direction d of the wrist link is the direction of the tip
+    position without its component along the yaw axis. The wrist centre p_tip - L d lies on the shaft, which passes
+    through the RCM. It determines yaw, pitch and insertion. The remaining rotation consists of roll, wrist pitch and
+    wrist yaw about z, x and y.
+
+    Lengths and the pose of the frame on its link are read from the arm's SDF.
     """
 
     def __init__(self, arm: Arm, frame_name: str = "dh_6", min_depth: float = 1e-3) -> None:
-        """Creates the inverse kinematics of `arm` for a frame on its wrist yaw link.
+        """Creates the inverse kinematics of a frame.
 
         Args:
-            arm: a PSM.
-            frame_name: the tip.
-            min_depth: how far beyond the RCM the wrist centre must be to have a solution [m], above 0: at the RCM yaw
-            and pitch are not determined, near it they whirl.
+            arm: PSM.
+            frame_name: Name of a frame on the wrist yaw link.
+            min_depth: Minimum distance of the wrist centre beyond the RCM [m], greater than 0. Near the RCM, yaw and
+                pitch change fast, and at the RCM they are not determined.
 
         Raises:
-            ArmError: the arm has not the kinematics of a PSM.
+            ArmError: The arm does not have the kinematics of a PSM.
         """
-        not_a_psm = ArmError(f"{arm.name} has not the kinematics of a PSM with a wrist (roll, pitch, yaw)")
+        not_a_psm = ArmError(f"{arm.name} does not have the kinematics of a PSM with roll, wrist pitch and wrist yaw")
         if arm.num_joints < 6:
             raise not_a_psm
         plant = shared_plant(arm)
@@ -111,8 +117,10 @@ class PsmInverseKinematics:
         _, pitch_link, yaw_link = (plant.GetJointByName(name).child_body() for name in arm.joint_names[3:6])
         p_BWrist = pitch_link.EvalPoseInWorld(context).translation()
         p_BYaw = yaw_link.EvalPoseInWorld(context).translation()
-        #: Wrist centre below the RCM [m] at insertion 0; length between the wrist axes [m].
-        self.depth_at_zero, self.wrist_length = -p_BWrist[2], p_BWrist[2] - p_BYaw[2]
+        #: Distance of the wrist centre beyond the RCM at zero insertion [m].
+        self.depth_at_zero = -p_BWrist[2]
+        #: Distance between the wrist pitch axis and the wrist yaw axis [m].
+        self.wrist_length = p_BWrist[2] - p_BYaw[2]
         self._min_depth = min_depth
         frame = ArmFrame(arm, frame_name)
         self._X_LF = plant.GetFrameByName(frame_name).GetFixedPoseInBodyFrame()
@@ -125,11 +133,16 @@ class PsmInverseKinematics:
             raise not_a_psm
 
     def solve(self, X_BF: RigidTransform, q_near: ArrayLike) -> NDArray[np.float64] | None:
-        """Joint positions (6,) [rad, m], not limited to the arm's range; the roll is that turn which is nearest to
-        q_near's.
+        """Returns the joint positions (6,) [rad, m], or None if there is no solution.
 
-        None where the wrist centre would be nearer to the RCM than min_depth, the wrist pitch 90 degrees or more, or
-        the shaft point more than 45 degrees upward (|yaw| > 135 degrees): that is what a tip above the RCM comes to.
+        There is no solution if the wrist centre is closer to the RCM than `min_depth`, or if the wrist pitch is 90
+        degrees or more. |yaw| > 135 degrees, which corresponds to a tip above the RCM, is not a solution either. Joint
+        limits are not checked.
+
+        Args:
+            X_BF: Pose of the frame in the base frame.
+            q_near: Joint positions (n,). The returned roll differs from the roll of `q_near` by at most half a
+                revolution.
         """
         X_BL = X_BF @ self._X_LF.inverse()
         R_BL, p_BL = X_BL.rotation().matrix(), X_BL.translation()

@@ -1,4 +1,4 @@
-"""Computes links and rotors of an identified model for use in a simulator."""
+"""Computes inertial parameters of links and rotors from an identified model, for use in a simulator."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import shared_plant
 
 #: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to that of the SDF (see `nearest_links`).
-MIN_SHARE = 0.01
+MIN_EIGENVALUE_RATIO = 0.01
 #: Change of Z below which a link counts as unchanged.
 _ROUNDING = 1e-7
 _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
 
 
 def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
-    """Returns the physically consistent links nearest to those of the SDF whose gravity torque is Y(q) beta.
+    """Returns the links nearest to the SDF that are physically consistent and have the gravity torque Y(q) beta.
 
-    With the pseudo-inertia J0 = L L' of a link in the SDF, Z = L^-1 J L^-T is the identity for an unchanged link of any
-    size. The distance is the sum of |Z - 1|^2 (Frobenius norm) over the links. It is minimized subject to Z > MIN_SHARE
-    and the linear equations of the gravity torque. Distance and constraint do not depend on frames or units. The
-    distance is the second-order approximation at J0 of the one by Lee, Wensing and Park, "Geometric robot dynamic
-    identification" (2020).
+    Z = L^-1 J L^-T is the pseudo-inertia J of a link relative to the pseudo-inertia J0 = L L' in the SDF. It is the
+    identity for an unchanged link of any size. The distance to the SDF is the sum of |Z - 1|^2 (Frobenius norm) over
+    the links. It is minimized subject to Z > MIN_EIGENVALUE_RATIO and to the linear equations of the gravity torque.
+    Distance and constraints do not depend on frames or units. The distance is a second-order approximation at J0 of the
+    distance by Lee, Wensing and Park, "Geometric robot dynamic identification" (2020).
 
     Args:
         arm: Arm of the links.
@@ -46,21 +46,21 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
     """
     regressor = DynamicRegressor(arm)
     # phi of a link is a linear function of the ten elements z of its Z. Rotors are not changed.
-    maps = {i: _map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
+    maps = {i: _parameter_map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
-    if _least_eigenvalue(z) < MIN_SHARE:
-        z = _nearest_body(A, b)
-    z = _polished(A, b, z)
-    if _least_eigenvalue(z) < MIN_SHARE / 2:
-        raise ModelError(f"{arm.name}: no bodies were found that have these base parameters")
+    if _least_eigenvalue(z) < MIN_EIGENVALUE_RATIO:
+        z = _nearest_consistent(A, b)
+    z = _refine(A, b, z)
+    if _least_eigenvalue(z) < MIN_EIGENVALUE_RATIO / 2:
+        raise ModelError(f"{arm.name}: no physically consistent links have these base parameters")
     links = list(regressor.links)
     for (i, T), part in zip(maps.items(), z.reshape(-1, 10), strict=True):
         links[i] = LinkInertia(links[i].link, T @ part)
     return tuple(links)
 
 
-def _map(link: LinkInertia) -> NDArray[np.float64]:
+def _parameter_map(link: LinkInertia) -> NDArray[np.float64]:
     L = np.linalg.cholesky(link.pseudo_inertia())
     return np.column_stack([parameters_from_pseudo_inertia(L @ _symmetric(e) @ L.T) for e in np.eye(10)])
 
@@ -68,7 +68,7 @@ def _map(link: LinkInertia) -> NDArray[np.float64]:
 def _is_rotor(arm: Arm, link: str) -> bool:
     """Returns whether a link has no frame dh_<name>.
 
-    The centre of mass of such a link is on its axis (see `derive_gravity`) and must remain there.
+    Such a link is a rotor. Its centre of mass is on its axis (see `gravity_parameters`) and must remain there.
     """
     plant = shared_plant(arm)
     frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
@@ -112,31 +112,32 @@ def _nearest(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float
     return target + step / np.sqrt(weights)
 
 
-def _nearest_body(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the nearest z for which the eigenvalues of all Z are at least MIN_SHARE."""
+def _nearest_consistent(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the nearest z for which the eigenvalues of all Z are at least MIN_EIGENVALUE_RATIO."""
     weights, target = _weights(A.shape[1] // 10)
     program = MathematicalProgram()
     z = program.NewContinuousVariables(len(weights), "z")
     program.AddQuadraticCost(2 * np.diag(weights), -2 * weights * target, z, is_convex=True)
     program.AddLinearEqualityConstraint(A, b, z)
     for link in z.reshape(-1, 10):
-        shifted = [variable - MIN_SHARE * (i == k) for variable, (i, k) in zip(link, _UPPER, strict=True)]
+        shifted = [variable - MIN_EIGENVALUE_RATIO * (i == k) for variable, (i, k) in zip(link, _UPPER, strict=True)]
         program.AddPositiveSemidefiniteConstraint(_symmetric(np.array(shifted, dtype=object)))
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
-        raise ModelError(f"no bodies were found that have these base parameters: {result.get_solution_result().name}")
+        status = result.get_solution_result().name
+        raise ModelError(f"found no physically consistent links with these base parameters (Clarabel: {status})")
     return np.asarray(result.GetSolution(z))
 
 
-def _polished(A: NDArray[np.float64], b: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
+def _refine(A: NDArray[np.float64], b: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
     """Resets links that changed only by rounding, and satisfies the equations to machine precision with the others.
 
     Clarabel satisfies the equations to 1e-8. This correction is much smaller than the distance to the cone boundary.
     """
     _, target = _weights(A.shape[1] // 10)
-    moved = np.repeat(np.abs(z - target).reshape(-1, 10).max(axis=1) > _ROUNDING, 10)
-    z = np.where(moved, z, target)
-    z[moved] -= np.linalg.lstsq(A[:, moved], A @ z - b, rcond=None)[0]
+    changed = np.repeat(np.abs(z - target).reshape(-1, 10).max(axis=1) > _ROUNDING, 10)
+    z = np.where(changed, z, target)
+    z[changed] -= np.linalg.lstsq(A[:, changed], A @ z - b, rcond=None)[0]
     return z
 
 
@@ -157,9 +158,9 @@ class ModelBodies:
     """Parts of an identified model that a simulator can represent.
 
     Attributes:
-        links: All moving links. A rotor that turns together with a link is part of it, as in the SDF.
+        links: All moving links. A rotor that rotates with a link is part of this link, as in the SDF.
         rotors: Joint -> reflected rotor inertia [kg m^2; kg for a prismatic joint]. If empty, those of the SDF apply.
-        left_out: Descriptions of the terms of the model's torque that are not represented, one line each.
+        left_out: Descriptions of the terms of the model's torque that are not represented.
     """
 
     links: tuple[LinkInertia, ...]
@@ -182,18 +183,18 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
     if not np.allclose(arm.gravity, expected, atol=0.02):
         gravity = ", ".join(f"{x:.3f}" for x in arm.gravity)
         left_out.append(
-            f"gravity ({gravity}) m/s^2 in the base frame: set it in the world that the file is loaded into"
+            f"gravity ({gravity}) m/s^2 in the base frame; set this vector in the simulator that loads the file"
         )
     if model.dynamics is None:
         base_values = np.array([p.value for p in model.base_parameters])
         return ModelBodies(nearest_links(arm, base_values), {}, left_out)
     if effects := model.dynamics.effects:
         coordinates = dict.fromkeys(effect.coordinate for effect in effects)
-        left_out.append(f"{len(effects)} effects in the drive (friction, cables, springs): {', '.join(coordinates)}")
+        left_out.append(f"{len(effects)} drive effects (friction, cables, springs) along {', '.join(coordinates)}")
     links = {link.link: np.array(link.parameters) for link in model.dynamics.links}
-    rotors, lost = _place_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
-    if lost:
-        left_out.append(f"by what rotors couple joints, which SDF cannot say [kg m^2, largest]: {', '.join(lost)}")
+    rotors, couplings = _assign_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
+    if couplings:
+        left_out.append(f"rotor inertias that couple joints, largest element [kg m^2]: {', '.join(couplings)}")
     return ModelBodies(tuple(LinkInertia(name, phi) for name, phi in links.items()), rotors, left_out)
 
 
@@ -206,52 +207,55 @@ def _static_effects(model: IdentifiedModel) -> list[str]:
     return remarks
 
 
-def _place_rotors(
+def _assign_rotors(
     arm: Arm, links: dict[str, NDArray[np.float64]], inertias: list[float]
 ) -> tuple[dict[str, float], list[str]]:
-    """Assigns rotor inertias to joints, or adds them to `links` that turn with the rotor.
+    """Assigns rotor inertias to joints, or adds them to `links` that rotate with the rotor.
 
     A rotor adds I J_k' J_k to the mass matrix, where J_k is its row of the transmission. In SDF, a joint can represent
-    only the diagonal of this matrix. This is sufficient if a single joint moves the motor. If several joints do, the
-    inertia is added to a link that turns by J_k q, such as the crank and motor_4 links of the SDF. The inertia about
-    the two perpendicular axes is half of it, to be physically consistent.
+    only the diagonal of this matrix. This is sufficient if a single joint moves the motor. If several joints move the
+    motor, the inertia is added to a link that rotates by J_k q, such as crank_link or motor_4_link. Half of the inertia
+    is added about each perpendicular axis, so that the link remains physically consistent.
 
     Returns:
-        Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are lost.
+        Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are not represented.
     """
     plant = shared_plant(arm)
-    turning = _turning_links(plant, arm)
+    rotations = _rotation_rates(plant, arm)
     joints = np.zeros(arm.num_joints)
-    lost = []
+    couplings = []
     for name, row, inertia in zip(arm.joint_names, arm.transmission.matrix, inertias, strict=True):
-        same = [link for link, (rate, _) in turning.items() if np.allclose(rate, row, atol=1e-9)]
-        if np.count_nonzero(row) > 1 and same:
-            # All links in `same` turn at the same rate, so any of them can be used. The last is part of the linkage.
-            link = same[-1]
-            axis = turning[link][1]
-            links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _about(axis)])
+        candidates = [link for link, (rate, _) in rotations.items() if np.allclose(rate, row, atol=1e-9)]
+        if np.count_nonzero(row) > 1 and candidates:
+            # All candidates rotate at the same rate, so any of them can be used. The last is part of the linkage.
+            link = candidates[-1]
+            axis = rotations[link][1]
+            links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _unit_rotor_inertia(axis)])
             continue
         joints += inertia * row**2
         if np.count_nonzero(row) > 1 and inertia > 0:
             coupling = inertia * np.outer(row, row)
-            lost.append(f"{name} {np.abs(coupling - np.diag(np.diag(coupling))).max():.2g}")
-    return {name: float(x) for name, x in zip(arm.joint_names, joints, strict=True)}, lost
+            couplings.append(f"{name} {np.abs(coupling - np.diag(np.diag(coupling))).max():.2g}")
+    return {name: float(x) for name, x in zip(arm.joint_names, joints, strict=True)}, couplings
 
 
-def _about(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns Ixx .. Iyz (6,) of a rotor with inertia 1 about `axis` and 1/2 about perpendicular axes."""
+def _unit_rotor_inertia(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the rotational inertia (6,) of a rotor, in the order Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
+
+    The moment of inertia is 1 about `axis` and 1/2 about perpendicular axes.
+    """
     inertia = (np.eye(3) + np.outer(axis, axis)) / 2
     return np.concatenate([np.diag(inertia), inertia[[0, 0, 1], [1, 2, 2]]])
 
 
-def _turning_links(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def _rotation_rates(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Returns link -> (rate, axis) for links with a revolute joint.
 
     rate (n,) is the angular velocity about the joint axis per joint velocity. It includes parents with parallel axes.
     axis (3,) is the joint axis in the link's frame.
     """
     context = plant.CreateDefaultContext()
-    turning: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+    rotations: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
     axes: dict[str, NDArray[np.float64]] = {}
     for name, row in zip(arm.tree_joint_names, arm.linkage.matrix, strict=True):
         joint = plant.GetJointByName(name)
@@ -261,8 +265,8 @@ def _turning_links(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[n
         link, parent = joint.child_body(), joint.parent_body().name()
         axis_W = X_WM.rotation() @ joint.revolute_axis()
         X_WL = link.EvalPoseInWorld(context)
-        parallel = parent in turning and np.allclose(axes[parent], axis_W, atol=1e-9)
-        rate = row + turning[parent][0] if parallel else row
-        turning[link.name()] = rate, X_WL.rotation().inverse() @ axis_W
+        parallel = parent in rotations and np.allclose(axes[parent], axis_W, atol=1e-9)
+        rate = row + rotations[parent][0] if parallel else row
+        rotations[link.name()] = rate, X_WL.rotation().inverse() @ axis_W
         axes[link.name()] = axis_W
-    return turning
+    return rotations

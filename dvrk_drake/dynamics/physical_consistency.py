@@ -24,7 +24,7 @@ from dvrk_drake.models.sdf_model import compose_sdf
 
 @dataclass(frozen=True, eq=False)
 class BoundingBox:
-    """Box aligned with the axes of the frame of link L. `lower` and `upper` (3,) are its corners p_LoC_L [m]."""
+    """Axis-aligned box in the frame of a link, given by its lower and upper corners (3,) [m]."""
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
@@ -55,11 +55,11 @@ def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
         if not plant.IsAnchored(body):
             name = body.name()
-            stated = shapes[name].boxes.get(name)
-            if stated is None:
-                boxes[name] = _around_shapes(plant, scene_graph.model_inspector(), name, shapes[name].margin)
+            corners = shapes[name].boxes.get(name)
+            if corners is None:
+                boxes[name] = _box_around_shapes(plant, scene_graph.model_inspector(), name, shapes[name].margin)
             else:
-                boxes[name] = _stated(name, stated)
+                boxes[name] = _box_from_corners(name, corners)
     return boxes
 
 
@@ -69,13 +69,13 @@ def _shapes_of_links(arm: Arm) -> dict[str, BoundingShapes]:
     for url, shapes in zip(arm.sdf, arm.identification.bounding_shapes, strict=True):
         names = [link.get("name", "") for link in compose_sdf([url]).iterfind("model/link")]
         if unknown := set(shapes.boxes) - set(names):
-            raise ArmError(f"{arm.name}: bounding_shapes.boxes names {', '.join(sorted(unknown))}, no link of {url}")
+            raise ArmError(f"{arm.name}: bounding_shapes.boxes: {url} has no link {', '.join(sorted(unknown))}")
         for name in names:
             settings.setdefault(name, shapes)
     return settings
 
 
-def _around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: str, margin: float) -> BoundingBox:
+def _box_around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: str, margin: float) -> BoundingBox:
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
     frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(link).index())
     for geometry in inspector.GetGeometries(frame, Role.kProximity):
@@ -86,13 +86,13 @@ def _around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: 
         upper = np.maximum(upper, X_LB.translation() + half_width)
     if not np.all(np.isfinite(lower)):
         raise ArmError(
-            f"{link} has no <collision> in its SDF, so nothing says where its mass can be: give it a box in "
-            "bounding_shapes of the arm's mechanism or instrument file"
+            f"{link} has no <collision> in its SDF, so the bounds of its mass are unknown. Give it a box in "
+            "bounding_shapes.boxes of the arm's mechanism or instrument file"
         )
     return BoundingBox(lower - margin, upper + margin)
 
 
-def _stated(link: str, corners: BoxCorners) -> BoundingBox:
+def _box_from_corners(link: str, corners: BoxCorners) -> BoundingBox:
     lower, upper = np.array(corners.lower, float), np.array(corners.upper, float)
     if lower.shape != (3,) or upper.shape != (3,) or not np.all(lower < upper) or not np.isfinite(upper - lower).all():
         raise ArmError(f"bounding_shapes: lower and upper of {link} must be three numbers each, lower below upper [m]")
@@ -164,14 +164,14 @@ def consistent_parameters(
     definite. Parameters that R does not determine keep the values of the SDF.
 
     The mass of each link and the total mass are bounded relative to the SDF (`MASS_RANGE`, `TOTAL_MASS_TOLERANCE`).
-    The mass of a link must fit into its bounding box (`BoundingBox`): along each axis, the mean square distance from
-    the center of the box is at most the squared half width. This constraint is linear in J and implies that the centre
-    of mass is inside the box.
+    The mass of a link must fit into its bounding box (`BoundingBox`). This means that along each axis, the mean square
+    distance of the mass from the center of the box is at most the squared half width. This constraint is linear in J
+    and implies that the centre of mass is inside the box.
 
-    References: Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
-    identification" (2018) for the pseudo-inertia and the constraint trace(J Q) >= 0 of a bounding ellipsoid, applied
-    here to one degenerate ellipsoid per axis. Lee, Wensing and Park, "Geometric robot dynamic identification" (2020)
-    for the log-det prior.
+    Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter identification"
+    (2018) describe the pseudo-inertia and the constraint trace(J Q) >= 0 of a bounding ellipsoid. Here, each axis has
+    one degenerate ellipsoid. Lee, Wensing and Park, "Geometric robot dynamic identification" (2020) describe the
+    log-det prior.
 
     Args:
         R, b: Compressed regressor (p, p) and efforts (p,), e.g. from a QR decomposition, in units of their standard
@@ -184,9 +184,9 @@ def consistent_parameters(
         IdentificationError: The solver did not converge.
     """
     program = MathematicalProgram()
-    # With z = R x the cost is isotropic. In x its curvature varies by many orders of magnitude, also after scaling.
+    # With z = R x, the cost is isotropic. With x, its curvature would vary by many orders of magnitude, even if scaled.
     z = program.NewContinuousVariables(len(b), "z")
-    # With the links last, the triangular factor makes them depend on few z, so the matrices of Clarabel are sparse.
+    # With the links last, each of their parameters depends on few elements of z, and Clarabel's matrices are sparse.
     order = np.roll(np.arange(len(b)), -10 * len(links))
     Q, triangle = np.linalg.qr(R[:, order])
     to_x = np.empty_like(R)
@@ -194,8 +194,8 @@ def consistent_parameters(
     program.AddQuadraticCost(np.eye(len(b)), -Q.T @ b, z, is_convex=True)
     bounded = np.flatnonzero(np.isfinite(lower))
     size = np.linalg.norm(to_x[bounded], axis=1)
-    high = np.full(len(bounded), np.inf)
-    program.AddLinearConstraint(to_x[bounded] / size[:, None], lower[bounded] / size, high, z)
+    upper = np.full(len(bounded), np.inf)
+    program.AddLinearConstraint(to_x[bounded] / size[:, None], lower[bounded] / size, upper, z)
     for k, link in enumerate(links):
         to_link = to_x[10 * k : 10 * k + 10]
         own = np.flatnonzero(np.any(to_link, axis=0))
@@ -225,8 +225,8 @@ def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
         if result.is_success() and details.status == "Solved":
             return result
     raise IdentificationError(
-        f"the program for physically consistent parameters did not converge: Clarabel says {details.status} after "
-        f"{details.iterations} iterations; are efforts and positions this arm's?"
+        f"the identification did not converge (Clarabel: {details.status} after {details.iterations} iterations). "
+        "Usual causes: efforts of another arm, wrong units, or exchanged channels. Run: dvrk-drake check RECORDING"
     )
 
 
@@ -249,12 +249,12 @@ def least_eigenvalue_bound(link: LinkInertia) -> float:
     return min(MIN_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
-def room_in_box(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np.float64]:
+def box_margins(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np.float64]:
     """Returns 1 - (mean square distance from the center of the box) / (half width)^2 for each axis (3,).
 
     A negative value means that the mass does not fit into the box.
     """
-    return _room(box) @ parameters / parameters[0]
+    return _margin_matrix(box) @ parameters / parameters[0]
 
 
 def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: BoundingBox) -> list[str]:
@@ -264,7 +264,9 @@ def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: Boun
         for limit in MASS_RANGE
         if abs(parameters[0] / link.parameters[0] - limit) < _AT_BOUND * limit
     ]
-    sides = "".join(axis for axis, room in zip("xyz", room_in_box(parameters, box), strict=True) if room < _AT_BOUND)
+    sides = "".join(
+        axis for axis, margin in zip("xyz", box_margins(parameters, box), strict=True) if margin < _AT_BOUND
+    )
     if sides:
         bounds.append(f"mass fills its box along {sides}")
     return bounds
@@ -296,12 +298,12 @@ def _constrain_link(
     program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia, box: BoundingBox
 ) -> None:
     mass = link.parameters[0]
-    low, high = MASS_RANGE
-    program.AddLinearConstraint(to_link[:1] / mass, [low], [high], z)
-    program.AddLinearConstraint(_room(box) @ to_link / mass, np.zeros(3), np.full(3, np.inf), z)
+    lower_ratio, upper_ratio = MASS_RANGE
+    program.AddLinearConstraint(to_link[:1] / mass, [lower_ratio], [upper_ratio], z)
+    program.AddLinearConstraint(_margin_matrix(box) @ to_link / mass, np.zeros(3), np.full(3, np.inf), z)
 
 
-def _room(box: BoundingBox) -> NDArray[np.float64]:
+def _margin_matrix(box: BoundingBox) -> NDArray[np.float64]:
     """Returns a matrix (3, 10) that maps parameters to the integral of 1 - (x - c)^2 / w^2 over the mass, per axis.
 
     c and w are center and half width of the box.
@@ -321,6 +323,6 @@ def _check(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> None:
         least = float(np.linalg.eigvalsh(pseudo_inertia(x[10 * k : 10 * k + 10]))[0])
         if least < least_eigenvalue_bound(link):
             raise IdentificationError(
-                f"the program for physically consistent parameters left {link.link} with a pseudo-inertia of least "
-                f"eigenvalue {least:.2g}; it must be {least_eigenvalue_bound(link):.2g} or more"
+                f"the identified inertia of {link.link} is not physically consistent: the smallest eigenvalue of its "
+                f"pseudo-inertia is {least:.2g}, but must be {least_eigenvalue_bound(link):.2g} or more"
             )

@@ -1,9 +1,8 @@
-"""The compiled recursion that fills an arm's dynamic regressor, link by link; one compilation serves every arm.
+"""Compiled recursion over the links of an arm that computes the dynamic regressor. One compilation serves all arms.
 
-Samples are taken in blocks of `BLOCK`, and every number of the recursion is a row of that many samples, so that the
-compiler turns each loop over a block into vector instructions. It only does so where it sees that no two rows overlap
-and that no index is negative: a loop here writes rows of one array, row k is at [k * BLOCK + s], and the output is
-indexed from the start of the part to be written.
+The recursion processes blocks of `BLOCK` samples. Each quantity of the recursion is a row of that many samples, so that
+the compiler vectorises the loops over a block. The compiler does so only if it can prove that rows do not overlap and
+indices are not negative. Therefore each loop writes rows of one array, with sample s of row k at [k * BLOCK + s].
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ import numpy as np
 
 from dvrk_drake.dynamics.trigonometry import sin_cos
 
-#: Samples per block: enough to fill vector registers, few enough for the block's rows to stay in the fast caches.
+#: Samples per block: enough for vector instructions, and few enough that the rows of a block fit into fast caches.
 BLOCK = 64
 
-# contract: a product and a sum may be one fused instruction, which rounds once instead of twice.
+# "contract" allows fused multiply-add instructions, which round once instead of twice.
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
@@ -24,18 +23,19 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"c
 def fill_regressor(
     q, v, vd, gravity, parents, pose_terms, hinges, G, c, affects, rotors, out
 ):  # pragma: no cover - compiled
-    """Fills out (m, n, 10 l + r) for m samples of an arm with n independent joints, l links and r rotor parameters.
+    """Computes the regressor (m, n, 10 l + r) of an arm with n independent joints, l links and r rotor parameters.
 
-    Featherstone, "Rigid Body Dynamics Algorithms" (2008), 5.3, in link coordinates: from base to tip each link gets its
-    spatial velocity and acceleration V, A and the velocities J per unit rate of each independent joint. The torque of
-    joint j that a link needs is J_j' f, with the wrench f about its origin linear in its ten parameters.
+    From base to tip, the recursion computes three quantities of each link in the link frame. These are the spatial
+    velocity V, the spatial acceleration A, and the spatial velocity J_j per unit rate of each independent joint j. The
+    wrench f about the link's origin is linear in the ten parameters of the link. The torque of joint j due to the link
+    is J_j' f. Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008), 5.3.
 
     Args:
-        q, v, vd: (m, n) positions, velocities and accelerations of the independent joints.
-        gravity: (3,) in the base frame.
-        parents, pose_terms, hinges, G, c, affects: as in `KinematicTree`.
-        rotors: (r, 2, n) rows a, b: the torque is a (b . vd) + b (a . vd) per unit of the parameter.
-        out: any memory.
+        q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
+        gravity: Gravity vector (3,) in the base frame [m/s^2].
+        parents, pose_terms, hinges, G, c, affects: Attributes of `KinematicTree`.
+        rotors: Rows a and b (r, 2, n) of the rotor parameters. The torque is a (b . vd) + b (a . vd) per unit.
+        out: Array that receives the regressor. Previous values are overwritten.
     """
     num_links, n = G.shape
     motion = np.zeros((3, n * BLOCK))
@@ -44,13 +44,13 @@ def fill_regressor(
     links = np.empty((num_links, 21 * BLOCK))
     J = np.empty((num_links, n, 6 * BLOCK))
     torques = np.empty(10 * BLOCK)
-    # The base accelerates upwards instead of gravity, and no joint moves it.
+    # Gravity is represented by an upward acceleration of the base, which no joint moves.
     base, fixed = np.zeros(21 * BLOCK), np.zeros(6 * BLOCK)
     for k in range(3):
         base[(9 + k) * BLOCK : (10 + k) * BLOCK] = -gravity[k]
     for start in range(0, len(q), BLOCK):
         part = out[start : start + BLOCK]
-        part.reshape(-1)[:] = 0.0  # in order, which also fetches the memory that is written out of order below
+        part.reshape(-1)[:] = 0.0  # Sequential access, which also loads the memory into the cache.
         _to_rows(q[start : start + BLOCK], motion[0])
         _to_rows(v[start : start + BLOCK], motion[1])
         _to_rows(vd[start : start + BLOCK], motion[2])
@@ -84,7 +84,7 @@ def _from_rows(rows, samples):  # pragma: no cover - compiled
 
 @_compiled
 def _move_joint(G, c, motion, joint):  # pragma: no cover - compiled
-    """The joint's coordinate x = G q + c: rows x, sin(x), 1 - cos(x), dx/dt, d2x/dt2."""
+    """Fills `joint` with the rows x, sin(x), 1 - cos(x), dx/dt and d2x/dt2 of the joint coordinate x = G q + c."""
     joint[:] = 0.0
     for s in range(BLOCK):
         joint[s] = c
@@ -102,7 +102,7 @@ def _move_joint(G, c, motion, joint):  # pragma: no cover - compiled
 
 @_compiled
 def _pose(terms, joint, X):  # pragma: no cover - compiled
-    """X_PC rows: rotation and translation of the parent's frame row by row, (3, 4) flattened."""
+    """Fills X with 12 rows: the pose X_PC (3, 4) of the link in its parent, row by row."""
     for a in range(3):
         for b in range(4):
             t0, t1, t2, t3 = terms[0, a, b], terms[1, a, b], terms[2, a, b], terms[3, a, b]
@@ -113,7 +113,7 @@ def _pose(terms, joint, X):  # pragma: no cover - compiled
 
 @_compiled
 def _to_child(X, s, w0, w1, w2, u0, u1, u2):  # pragma: no cover - compiled
-    """Sample s of a spatial velocity of P's origin in P -> of C's, in C: R' w, R' (u + w x p)."""
+    """Transforms sample s of a spatial velocity (w, u) from P to C: returns R' w and R' (u + w x p)."""
     p0, p1, p2 = X[3 * BLOCK + s], X[7 * BLOCK + s], X[11 * BLOCK + s]
     u0, u1, u2 = u0 + w1 * p2 - w2 * p1, u1 + w2 * p0 - w0 * p2, u2 + w0 * p1 - w1 * p0
     r0, r1, r2 = X[s], X[4 * BLOCK + s], X[8 * BLOCK + s]
@@ -127,12 +127,12 @@ def _to_child(X, s, w0, w1, w2, u0, u1, u2):  # pragma: no cover - compiled
 
 @_compiled
 def _move_link(X, H, joint, P, C):  # pragma: no cover - compiled
-    """Rows of a link C from its parent's P.
+    """Fills the rows of link C from the rows of its parent P.
 
-    0..5    V, angular and linear
-    6..11   A = that of P + H d2x/dt2 + V x H dx/dt, the cross product of spatial velocities
-    12..14  acceleration of the origin less gravity: the spatial one plus w x v
-    15..20  [w]^2: xx, yy, zz, xy, xz, yz
+    0..5    spatial velocity V, angular then linear
+    6..11   spatial acceleration A = A_P + H d2x/dt2 + V x H dx/dt, where x is the cross product of spatial vectors
+    12..14  acceleration of the origin Co minus gravity: linear part of A plus w x v
+    15..20  elements xx, yy, zz, xy, xz, yz of [w]^2, where [w] is the cross product matrix of w
     """
     h0, h1, h2, h3, h4, h5 = H
     for s in range(BLOCK):
@@ -166,9 +166,10 @@ def _move_link(X, H, joint, P, C):  # pragma: no cover - compiled
 
 @_compiled
 def _torques(X, H, factor, J_P, C, J_C, torques):  # pragma: no cover - compiled
-    """A joint's torque per each of the ten parameters: J' f with J = that of P + factor H.
+    """Fills J_C, and `torques` with ten rows: the joint torque J_C' f per unit of each parameter of link C.
 
-    Force m a + [dw] h + [w]^2 h, moment h x a + I dw + w x I w.
+    J_C is J_P, shifted to Co, plus factor H. The wrench f has the force m a + [dw] h + [w]^2 h and the moment
+    h x a + I dw + w x I w.
     """
     h0, h1, h2, h3, h4, h5 = H[0] * factor, H[1] * factor, H[2] * factor, H[3] * factor, H[4] * factor, H[5] * factor
     for s in range(BLOCK):
@@ -196,7 +197,7 @@ def _torques(X, H, factor, J_P, C, J_C, torques):  # pragma: no cover - compiled
 
 @_compiled
 def _rotor_torques(a, b, vd, out):  # pragma: no cover - compiled
-    """Fills out (samples, n) with a (b . vd) + b (a . vd), where it is not 0."""
+    """Adds a (b . vd) + b (a . vd) to out (samples, n)."""
     for j in range(len(a)):
         for k in range(len(a)):
             inertia = a[j] * b[k] + b[j] * a[k]

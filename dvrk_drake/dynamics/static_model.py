@@ -33,7 +33,10 @@ class StaticModel:
 
     @cached_property
     def torque_into(self) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None]:
-        """Compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); for control loops."""
+        """Compiled function f(q, theta, out) for control loops, which writes the holding torque to `out`.
+
+        The arguments are C-contiguous float64 arrays (n,) [rad, m], (b + e,) and (n,) [N m, N].
+        """
         theta = sympy.symbols(f"theta0:{self.num_parameters}")
         terms = codegen.share_terms(sympy.Array(list(self._symbolic_regressor * sympy.Matrix(theta))))
         return codegen.compile_function("torque", [("q", self.gravity.q), ("theta", theta)], terms)
@@ -83,7 +86,7 @@ def _effect_columns(
         row = [_number(r) for r in joint_row(arm, effect.coordinate).tolist()]
         offset = arm.effect_coordinates[effect.coordinate] @ arm.transmission.offset
         x = sum((r * q for r, q in zip(row, joint_positions, strict=True)), _number(float(offset)))
-        columns.append(sympy.Matrix(row) * effect.of_position(x))
+        columns.append(sympy.Matrix(row) * effect.position_shape(x))
     return columns
 
 

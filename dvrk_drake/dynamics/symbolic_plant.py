@@ -1,4 +1,4 @@
-"""Symbolic plant of an arm: its frames and potential energy as functions of the independent joints."""
+"""Derives frames and potential energy of an arm as symbolic functions of the independent joint positions."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from dvrk_drake.models.plant import shared_plant, tree_selector
 
 
 class SymbolicPlant:
-    """`MultibodyPlant.ToSymbolic()` with the linkage substituted: every position is a function of q1..qn.
+    """Symbolic MultibodyPlant of an arm. All positions are functions of the independent joint positions q1, ..., qn.
 
     Attributes:
-        arm: the arm.
-        numeric: the same plant in numbers.
-        bodies: label ("1".."7", "crank", ...) -> moving body and the frame F its parameters are written in, X_BF.
-        q: the n joint positions as sympy symbols q1..qn [rad, m].
-        ring: of polynomials in them.
+        arm: Arm of the plant.
+        numeric: Numeric plant of the arm.
+        bodies: Label ("1" to "7", "crank", ...) -> moving body B and the pose X_BF of the frame F of its parameters.
+        q: Joint positions as sympy symbols q1, ..., qn [rad, m].
+        ring: Ring of polynomials in q and in sines and cosines of sums of q.
     """
 
     def __init__(self, arm: Arm, frames: str = "dh") -> None:
-        """Makes the plant symbolic and puts the linkage in.
+        """Converts the plant of an arm to symbolic form and substitutes the positions of the linkage.
 
         Args:
-            arm: the arm.
-            frames: prefix of the SDF's link frames, "dh" or another that the SDF has.
+            arm: Arm of the plant.
+            frames: Prefix of the link frames in the SDF, e.g. "dh".
 
         Raises:
-            ArmError: the SDF has no frames of that prefix.
+            ArmError: The SDF has no frames with this prefix.
         """
         self.arm, self._frames = arm, frames
         self.numeric = shared_plant(arm)
@@ -52,7 +52,7 @@ class SymbolicPlant:
         self._plant.SetPositions(self._context, q_plant)
 
     def frame_poses(self) -> dict[str, sympy.ImmutableDenseMatrix]:
-        """X_0F(q), the pose of every link frame in frame 0: label -> 4 x 4 (the paper's II.A and III.B) [m]."""
+        """Returns label -> pose X_0F(q) (4, 4) of each link frame in frame 0 [m] (paper, II.A and III.B)."""
         zero = self.numeric.GetFrameByName(f"{self._frames}_0")
         X_W0 = zero.CalcPoseInWorld(self.numeric.CreateDefaultContext())
         X_0W = _exact_matrix(X_W0.inverse())
@@ -70,18 +70,22 @@ class SymbolicPlant:
         return self.ring.to_sympy(self.ring.shortest(self.ring.from_drake(expression)))
 
     def potential_energy(self, label: str, axis: str) -> Polynomial:
-        """P per unit of a labelled link's mass (`axis` "") or of its first moment along "x", "y" or "z" of F.
+        """Returns the potential energy per unit of a parameter of a link, for gravity of 1 m/s^2.
 
-        P = -m g_W . p_WCcm is linear in m and m c: a unit of mass at the origin of F adds -g_W . p_WFo, a unit of
-        first moment along an axis of F adds -g_W . that axis. Summed over the links this is the plant's own
-        `CalcPotentialEnergy`, whose expanded form takes half a minute on an arm with a closed linkage.
+        The potential energy is linear in mass and first moments. A unit mass at the origin of F contributes
+        -g_W . p_WFo, and a unit first moment along an axis of F contributes -g_W . axis. This is much faster than
+        the symbolic `CalcPotentialEnergy` of an arm with a closed linkage.
+
+        Args:
+            label: Label of the link.
+            axis: "" for the mass, or "x", "y" or "z" for the first moment along this axis of F.
         """
         if label not in self._heights:
             g_W = exact_rotation(self.arm.gravity / np.linalg.norm(self.arm.gravity))
             X_WB = self._plant.EvalBodyPoseInWorld(
                 self._context, self._plant.get_body(self.bodies[label][0].index())
             ).GetAsMatrix4()
-            # Row -g_W' (R_WB, p_WBo); zeros are left out so that no term of theirs is carried along.
+            # Row -g_W' (R_WB, p_WBo). `_dot` omits zeros, so that they add no terms.
             self._heights[label] = [_dot(-g_W, X_WB[:3, j]) for j in range(4)]
         column = _exact_matrix(self.bodies[label][1])[:, "xyz".index(axis) if axis else 3]
         return self.ring.shortest(self.ring.from_drake(_dot(column, self._heights[label])))
@@ -93,7 +97,7 @@ def _dot(numbers: NDArray[np.float64], expressions: Sequence[symbolic.Expression
 
 
 def _exact_matrix(X: RigidTransform) -> NDArray[np.float64]:
-    """X as a matrix, (4, 4), with an exact rotation."""
+    """Returns the matrix (4, 4) of a pose, with the rotation of `exact_rotation`."""
     matrix = X.GetAsMatrix4()
     matrix[:3, :3] = exact_rotation(matrix[:3, :3])
     return matrix
@@ -107,12 +111,13 @@ def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expre
 
 
 def _parallel_sums(plant: MultibodyPlant, arm: Arm, q: Sequence[sympy.Symbol]) -> list[tuple[sympy.Expr, sympy.Expr]]:
-    """Pairs of angles that add up, base first: those of a body and of a joint on it with the same axis.
+    """Returns pairs of angles whose sums occur in link poses, from the base to the tip.
 
-    Both are sums of multiples of q, as the linkage has it: a bar that turns back adds the negative of what it undoes.
+    A pair consists of the rotation angle of a body and the angle of a revolute joint on the body with the same axis.
+    Both are linear combinations of q according to the linkage, so opposite rotations cancel in their sum.
     """
     context = plant.CreateDefaultContext()
-    turned: dict[str, tuple[NDArray[np.float64], sympy.Expr]] = {}  # body -> its axis and angle about it
+    rotations: dict[str, tuple[NDArray[np.float64], sympy.Expr]] = {}  # Body -> axis and rotation angle.
     sums = []
     for name, row in zip(arm.tree_joint_names, arm.linkage.matrix, strict=True):
         joint = plant.GetJointByName(name)
@@ -120,10 +125,10 @@ def _parallel_sums(plant: MultibodyPlant, arm: Arm, q: Sequence[sympy.Symbol]) -
             continue
         axis = joint.frame_on_parent().CalcPoseInWorld(context).rotation() @ joint.revolute_axis()
         angle = sympy.Add(*(exact_half(row[j]) * q[int(j)] for j in np.flatnonzero(row)))
-        parent_axis, parent_angle = turned.get(joint.parent_body().name(), (axis, sympy.Integer(0)))
+        parent_axis, parent_angle = rotations.get(joint.parent_body().name(), (axis, sympy.Integer(0)))
         if not np.allclose(axis, parent_axis, atol=1e-12):
             parent_angle = sympy.Integer(0)
         if parent_angle != 0 and (parent_angle, angle) not in sums:
             sums.append((parent_angle, angle))
-        turned[joint.child_body().name()] = axis, parent_angle + angle
+        rotations[joint.child_body().name()] = axis, parent_angle + angle
     return sums

@@ -1,4 +1,4 @@
-"""Polynomials in sines and cosines of angles, which represent the poses of a tree of links."""
+"""Polynomials in sines and cosines of joint angles, which represent the poses of links."""
 
 from __future__ import annotations
 
@@ -10,32 +10,37 @@ from operator import and_
 import pydrake.symbolic as symbolic
 import sympy
 
-#: Coefficients are 1 or lengths in metres: below this one is a difference of equals.
+#: Coefficients below this value are rounding errors. Other coefficients are 1 or lengths [m].
 ROUNDING = 1e-14
-#: Monomial -> coefficient. A monomial is the sorted indices of its variables, each as often as its power.
+#: Monomial -> coefficient. A monomial is the sorted tuple of the indices of its variables, repeated for powers.
 Polynomial = dict[tuple[int, ...], float]
 _Kind = symbolic.ExpressionKind
 
 
 class TrigonometricRing:
-    """The variables of such polynomials: positions, and the sine and cosine of each angle.
+    """Ring of polynomials in joint positions and in the sine and cosine of joint angles.
 
     Attributes:
-        q: the positions as sympy symbols q1..qn [rad, m].
+        q: Joint positions as symbols q1, ..., qn [rad, m].
     """
 
     def __init__(self, q: Sequence[sympy.Symbol], sums: Sequence[tuple[sympy.Expr, sympy.Expr]]) -> None:
-        """q: the positions; sums: pairs of angles that `shortest` adds up, in this order."""
+        """Creates the ring.
+
+        Args:
+            q: Joint positions as symbols q1, ..., qn [rad, m].
+            sums: Pairs of angles that `shortest` replaces by their sum, in this order.
+        """
         self.q = tuple(q)
         self._sums = sums
         self._symbols: list[sympy.Symbol] = []
         self._functions: dict[sympy.Symbol, sympy.Expr] = {}
         self._indices: dict[sympy.Expr, int] = {}
-        self._of_drake: dict[str, tuple[float, int]] = {}
+        self._variables: dict[str, tuple[float, int]] = {}
         self._memo: dict = {}
 
     def from_drake(self, expression: symbolic.Expression) -> Polynomial:
-        """A polynomial in Drake's variables q1..qn and in sines and cosines of their sums."""
+        """Converts an expression in Drake's variables q1, ..., qn and in sines and cosines of their sums."""
         polynomial: Polynomial = {}
         for term in _arguments(expression.Expand(), _Kind.Add):
             coefficient, monomial = 1.0, []
@@ -51,10 +56,10 @@ class TrigonometricRing:
                 coefficient *= sign**power
                 monomial += [index] * power
             _add(polynomial, tuple(sorted(monomial)), coefficient)
-        return _without_rounding(polynomial)
+        return _remove_rounding_errors(polynomial)
 
     def derivative(self, polynomial: Polynomial, q: sympy.Symbol) -> Polynomial:
-        """Returns the derivative with respect to a position."""
+        """Returns the derivative with respect to a joint position."""
         result: Polynomial = {}
         for monomial, coefficient in polynomial.items():
             for index, power in Counter(monomial).items():
@@ -68,21 +73,20 @@ class TrigonometricRing:
     def shortest(self, polynomial: Polynomial) -> Polynomial:
         """Returns an equal polynomial with the angles of parallel joints combined.
 
-        For a pair (a, b) of the ring's sums products such as sin a cos b + cos a sin b become sin(a + b) where that is
-        shorter; cos^2 is eliminated, so that what is identically zero becomes 0. Coefficients of rounding's size are
-        dropped, so the result equals the polynomial at every pose to that. sympy's own trigsimp does the same by search
-        and takes seconds.
+        For each pair (a, b) of `sums`, terms such as sin a cos b + cos a sin b become sin(a + b) if this shortens the
+        polynomial. Squared cosines are eliminated, so that an identically zero polynomial becomes 0.
+        Coefficients below `ROUNDING` are removed. sympy's trigsimp gives the same result, but its search takes seconds.
         """
-        result, shortest = polynomial, self._without_squared_cosines(polynomial)
+        result, shortest = polynomial, self._replace_squared_cosines(polynomial)
         for a, b in self._sums:
-            trial = self._add_up(result, a, b)
-            shorter = self._without_squared_cosines(trial)
+            trial = self._combine_angles(result, a, b)
+            shorter = self._replace_squared_cosines(trial)
             if _operations(shorter) <= _operations(shortest):
                 result, shortest = trial, shorter
-        return _without_rounding(shortest)
+        return _remove_rounding_errors(shortest)
 
     def to_sympy(self, polynomial: Polynomial) -> sympy.Expr:
-        """The expression in `q`; what all terms have in common is taken out, e.g. S s4 s5 + S c4 c5."""
+        """Converts a polynomial to an expression in `q`. Common factors of all terms are factored out."""
         common = reduce(and_, map(Counter, polynomial)) if len(polynomial) > 1 else Counter()
         sign = -1 if common and all(coefficient < 0 for coefficient in polynomial.values()) else 1
         terms = [
@@ -94,15 +98,15 @@ class TrigonometricRing:
         return sympy.Mul(*(self._symbols[index] ** power for index, power in powers.items()))
 
     def _variable(self, expression: symbolic.Expression) -> tuple[float, int]:
-        """Sign and variable that equal q, sin(angle) or cos(angle)."""
+        """Returns sign and variable index of an expression q, sin(angle) or cos(angle)."""
         key = expression.to_string()
-        if key not in self._of_drake:
-            ours = symbolic.to_sympy(expression, memo=self._memo)
-            ours = ours.xreplace({s: self.q[int(s.name[1:]) - 1] for s in ours.free_symbols})
-            ours = ours.xreplace({x: exact_half(float(x)) for x in ours.atoms(sympy.Float)})
-            sign = -1.0 if ours.could_extract_minus_sign() else 1.0
-            self._of_drake[key] = sign, self._index(int(sign) * ours)
-        return self._of_drake[key]
+        if key not in self._variables:
+            function = symbolic.to_sympy(expression, memo=self._memo)
+            function = function.xreplace({s: self.q[int(s.name[1:]) - 1] for s in function.free_symbols})
+            function = function.xreplace({x: exact_half(float(x)) for x in function.atoms(sympy.Float)})
+            sign = -1.0 if function.could_extract_minus_sign() else 1.0
+            self._variables[key] = sign, self._index(int(sign) * function)
+        return self._variables[key]
 
     def _index(self, function: sympy.Expr) -> int:
         if function not in self._indices:
@@ -112,7 +116,7 @@ class TrigonometricRing:
         return self._indices[function]
 
     def _slope(self, function: sympy.Expr, q: sympy.Symbol) -> tuple[list[int], float]:
-        """Variables and a number whose product is the derivative of a variable."""
+        """Returns the derivative of a variable's function as variable indices and a factor, which are multiplied."""
         if not function.args:
             return [], float(function == q)
         slope = float(function.args[0].coeff(q))
@@ -120,8 +124,8 @@ class TrigonometricRing:
             return [self._index(sympy.cos(function.args[0]))], slope
         return [self._index(sympy.sin(function.args[0]))], -slope
 
-    def _add_up(self, p: Polynomial, a: sympy.Expr, b: sympy.Expr) -> Polynomial:
-        """Puts sin(a + b) and cos(a + b) in for sin a cos b and cos a cos b in every monomial."""
+    def _combine_angles(self, p: Polynomial, a: sympy.Expr, b: sympy.Expr) -> Polynomial:
+        """Replaces sin a cos b and cos a cos b in every monomial by terms with sin(a + b) and cos(a + b)."""
         (sign_a, sa, ca), (sign_b, sb, cb), (sign, S, C) = (self._sine_and_cosine(angle) for angle in (a, b, a + b))
         if sa == sb:
             return p
@@ -129,13 +133,16 @@ class TrigonometricRing:
         return _eliminate_product(p, (ca, cb), {(C,): 1.0, (sa, sb): sign_a * sign_b})
 
     def _sine_and_cosine(self, angle: sympy.Expr) -> tuple[float, int, int]:
-        """(sign, s, c) with sin(angle) = sign s, the way sympy writes it, and cos(angle) = c."""
+        """Returns sign and the variable indices s and c, with sin(angle) = sign * s and cos(angle) = c.
+
+        sympy writes sin(-x) as -sin(x), so the sign can be negative.
+        """
         sine = sympy.sin(angle)
         sign = 1 if isinstance(sine, sympy.sin) else -1
         return float(sign), self._index(sign * sine), self._index(sympy.cos(angle))
 
-    def _without_squared_cosines(self, p: Polynomial) -> Polynomial:
-        """Writes 1 - s^2 for every c^2, so that equal polynomials look equal."""
+    def _replace_squared_cosines(self, p: Polynomial) -> Polynomial:
+        """Replaces every squared cosine by 1 - sine^2, so that equal polynomials have equal terms."""
         for c in {index for monomial in p for index in monomial}:
             function = self._functions[self._symbols[c]]
             if isinstance(function, sympy.cos):
@@ -145,12 +152,15 @@ class TrigonometricRing:
 
 
 def exact_half(x: float) -> sympy.Expr:
-    """x as an exact number if it is a multiple of one half."""
+    """Converts a multiple of 1/2 to an exact number, and any other x to a floating-point number."""
     return sympy.Rational(int(2 * x), 2) if float(2 * x).is_integer() else sympy.Float(x)
 
 
 def _arguments(expression: symbolic.Expression | float, kind: symbolic.ExpressionKind) -> list:
-    """The summands of a sum or the factors of a product, constants as float; of anything else itself alone."""
+    """Returns the terms of a sum (kind Add) or the factors of a product (kind Mul). Constants are floats.
+
+    For any other expression, the result contains only the expression.
+    """
     if isinstance(expression, float) or expression.get_kind() not in (kind, _Kind.Constant):
         return [expression]
     return list(expression.Unapply()[1])
@@ -164,30 +174,30 @@ def _add(polynomial: Polynomial, monomial: tuple[int, ...], coefficient: float) 
     polynomial[monomial] = polynomial.get(monomial, 0.0) + coefficient
 
 
-def _without_rounding(p: Polynomial) -> Polynomial:
-    """Leaves out the terms with a coefficient that is zero but for rounding, such as -0.4318 + 0.4162 + 0.0156."""
+def _remove_rounding_errors(p: Polynomial) -> Polynomial:
+    """Removes terms whose coefficients are rounding errors, such as -0.4318 + 0.4162 + 0.0156."""
     return {monomial: coefficient for monomial, coefficient in p.items() if abs(coefficient) > ROUNDING}
 
 
 def _eliminate_product(p: Polynomial, product: tuple[int, int], replacement: Polynomial) -> Polynomial:
-    """Replaces the product of two variables, or the square of one, in every monomial, until none is left."""
+    """Replaces the product of two variables, or the square of one variable, in every monomial until none is left."""
     a, b = product
     while True:
-        having = [m for m in p if (m.count(a) >= 2 if a == b else a in m and b in m)]
-        if not having:
+        affected = [m for m in p if (m.count(a) >= 2 if a == b else a in m and b in m)]
+        if not affected:
             return p
         p = dict(p)
-        for monomial in having:
+        for monomial in affected:
             coefficient, rest = p.pop(monomial), list(monomial)
             rest.remove(a)
             rest.remove(b)
-            for by, factor in replacement.items():
-                _add(p, tuple(sorted([*rest, *by])), coefficient * factor)
+            for variables, factor in replacement.items():
+                _add(p, tuple(sorted([*rest, *variables])), coefficient * factor)
         p = {monomial: coefficient for monomial, coefficient in p.items() if coefficient}
 
 
 def _operations(p: Polynomial) -> int:
-    """Number of additions, multiplications and powers; a sum of negative terms needs one more sign."""
+    """Returns the number of additions, multiplications, powers and a leading sign."""
     count = max(len(p) - 1, 0) + bool(p and all(coefficient < 0 for coefficient in p.values()))
     for monomial, coefficient in p.items():
         powers = Counter(monomial).values()

@@ -1,23 +1,20 @@
-"""Sine and cosine for compiled code: without branches and calls, so that the compiler vectorises loops that use them.
-
-The C library's functions take most of the time of a gravity regressor, and keep a loop from being vectorised.
-"""
+"""Sine and cosine for compiled code, without function calls and branches, so that the compiler can vectorise loops."""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
 
-# contract: a product and a sum may be one fused instruction, which rounds once instead of twice.
+# "contract" allows fused multiply-add instructions, which round once instead of twice.
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @_compiled
 def sin_cos(x):  # pragma: no cover - compiled
-    """(sin(x), cos(x)), each to 3e-16 for |x| < 1e6; NaN for a number that is not finite.
+    """Returns sin(x) and cos(x) with an error below 3e-16 for |x| < 1e6, or NaN if x is not finite.
 
-    x is reduced to the nearest multiple of pi/2, which is subtracted in three parts. Parts and polynomials are those of
-    Moshier's Cephes library (sin.c).
+    The nearest multiple of pi/2 is subtracted from x in three parts. These parts and the polynomials are from Moshier's
+    Cephes library (sin.c).
     """
     turns = np.floor(x * (2 / np.pi) + 0.5)
     y = ((x - turns * 1.57079625129699707031) - turns * 7.54978941586159635336e-8) - turns * 5.39030285815811905290e-15
@@ -36,11 +33,11 @@ def sin_cos(x):  # pragma: no cover - compiled
 
 @_compiled
 def sin(x):  # pragma: no cover - compiled
-    """As `sin_cos`; the compiler shares the work of both."""
+    """Returns sin(x), see `sin_cos`."""
     return sin_cos(x)[0]
 
 
 @_compiled
 def cos(x):  # pragma: no cover - compiled
-    """As `sin_cos`."""
+    """Returns cos(x), see `sin_cos`."""
     return sin_cos(x)[1]

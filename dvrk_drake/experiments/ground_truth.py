@@ -29,7 +29,7 @@ from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
@@ -47,29 +47,29 @@ MIN_TRAVEL, SETTLE, SAMPLES = 0.8, 1.0, 10
 SAMPLE_SPACING = 0.01
 
 
-def visiting_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
-    """Makes a trajectory through all poses that rests at each pose for the settling and sampling time.
+def pose_visit_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
+    """Makes a trajectory through all poses that stays at each pose for the settling and sampling time.
 
-    The trajectory is straight in joint space. It therefore satisfies all linear limits that the poses satisfy.
+    The trajectory is straight in joint space. Therefore it satisfies all linear limits that the poses satisfy.
 
     Args:
         arm: Arm whose joint types determine the maximum speeds.
-        poses: Poses (m, n) in the order of the visit.
+        poses: Poses (m, n) [rad, m] in the order of the trajectory.
 
     Returns:
-        The trajectory of q (n,), and the time (m,) at which each pose has settled.
+        Trajectory of q (n,), and times (m,) at which the arm has settled at the poses [s].
     """
     times, knots, settled = [0.0], [poses[0]], []
     speed = arm.per_joint(*TRAVEL_SPEED)
-    rest = SETTLE + SAMPLES * SAMPLE_SPACING
+    hold = SETTLE + SAMPLES * SAMPLE_SPACING
     for i, pose in enumerate(poses):
         if i:
-            # A cubic from rest to rest is 1.5 times as fast in its middle as on average.
+            # The maximum speed of a cubic from rest to rest is 1.5 times its mean speed.
             travel = max(MIN_TRAVEL, 1.5 * float(np.max(np.abs(pose - poses[i - 1]) / speed)))
             times.append(times[-1] + travel)
             knots.append(pose)
         settled.append(times[-1] + SETTLE)
-        times.append(times[-1] + rest)
+        times.append(times[-1] + hold)
         knots.append(pose)
     zero = np.zeros((poses.shape[1], len(knots)))
     return PiecewisePolynomial.CubicHermite(times, np.array(knots).T, zero), np.array(settled)
@@ -84,22 +84,22 @@ def collect_static_poses(
     generator: np.random.Generator,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
-    """Visits the given poses under position control and records the holding effort of each (steps 4 to 6).
+    """Moves an arm to poses under position control and records the holding effort at each (steps 4 to 6).
 
     Args:
         station: Simulated arm. It becomes part of a Diagram and cannot be used in another one.
         model: Model used by the controller. The integrator compensates its errors.
-        poses: Poses (m, n) inside the limits (steps 1 to 3).
-        effort_noise: Standard deviation of one effort sample as a share of the effort limit.
+        poses: Poses (m, n) [rad, m] inside the limits (steps 1 to 3).
+        effort_noise: Standard deviation of the noise of one effort sample, as a share of the effort limit.
         generator: Random generator of the noise.
         progress: Function called with the finished share, 0..1.
 
     Returns:
-        One row per pose: the mean of `SAMPLES` samples of position and effort.
+        Recording with one row per pose: means of `SAMPLES` samples of position and effort.
     """
     arm = station.arm
     name = arm.name.lower()
-    trajectory, settled = visiting_trajectory(arm, poses)
+    trajectory, settled = pose_visit_trajectory(arm, poses)
     builder = DiagramBuilder()
     desired = TrajectorySource(trajectory, output_derivative_order=1)
     add_closed_loop(builder, station, GravityPidController(model), desired)
@@ -125,12 +125,12 @@ SPREAD = 0.2
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """Ground-truth arm with all effects of a real arm, and its exact holding torque.
+    """Ground-truth arm with all effects of a real arm, and the exact model of its holding torque.
 
     Attributes:
-        arm: Arm to simulate. Its SDF is a file of the output folder, its `effects` are those of the real arm.
-        model: Model of the torque against gravity, cables and springs. It serves for evaluation, never for control.
-        is_paper_arm: Whether the arm is the one that the paper's parameters were identified on.
+        arm: Arm to simulate, with an SDF in the output folder and the `effects` of the real arm.
+        model: Exact model of the torque of gravity, cables and springs, used only for evaluation.
+        is_paper_arm: Whether the arm is identified from the paper's recording.
         origin: Origin of the arm, one sentence.
     """
 
@@ -141,31 +141,34 @@ class GroundTruth:
 
 
 def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
-    """Identifies the paper's MTM robustly from its recording and writes its SDF into `folder`.
+    """Identifies the paper's MTM from its recording and writes its SDF into `folder`.
 
-    The links are physically consistent, have the identified gravity, and are as close as possible to those of our SDF.
-    The cables and springs are the identified effects. The recording does not determine friction, stops, encoders,
-    motors and delays. They are taken from `mechanisms/mtm.yaml`. Friction that is larger in one direction leaves a
-    constant torque in static poses. Therefore the identified offset is omitted for joints with such friction.
+    The links are physically consistent and have the identified gravity torque. They are as close as possible to the
+    links of our SDF. Cables and springs are those of the identified model. Static poses do not determine friction,
+    stops, encoders, motors and delays. These are those of `mechanisms/mtm.yaml`. Friction that is larger in one
+    direction causes a constant torque in static poses. Therefore the identified offset of joints with such friction is
+    omitted.
 
     Raises:
         RecordingError, IdentificationError, ModelError: The recording is not of an MTM at rest.
     """
     arm = load_arm(PAPER_ARM)
     model = identify_static(recording, arm).model
-    one_sided = {law.coordinate for law in arm.effects.friction if law.kind == "presliding forward"}
-    lasting = [e for e in model.effects if not (e.kind == "offset" and _at_actuator(e.coordinate) in one_sided)]
+    direction_dependent = {law.coordinate for law in arm.effects.friction if law.kind == "presliding forward"}
+    kept_effects = [
+        e for e in model.effects if not (e.kind == "offset" and _at_actuator(e.coordinate) in direction_dependent)
+    ]
     statistics = [dataclasses.replace(joint, feedforward_scale=1.0) for joint in model.joints]
-    model = dataclasses.replace(model, joints=statistics, effects=lasting)
+    model = dataclasses.replace(model, joints=statistics, effects=kept_effects)
     laws = model.effects
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
     ground_truth_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (
         "The ground-truth arm is the paper's MTM as identified from the paper's 72 poses (gravity, cables, springs), "
         "with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are those of another "
-        "MTM. In that recording joint 6 has no torque beyond friction, and joint 7 has a constant one, the difference "
-        "of its friction between both directions. There the ground-truth arm needs less compensation than the real "
-        "one probably did."
+        "MTM. In the paper's recording, joint 6 has only friction torque. Joint 7 has a constant torque, which is the "
+        "difference of its friction between both directions. Therefore the ground-truth arm needs less compensation at "
+        "these joints than the real arm probably needs."
     )
     return GroundTruth(dataclasses.replace(ground_truth_arm, effects=effects), model, True, origin)
 
@@ -175,29 +178,28 @@ def _at_actuator(coordinate: str) -> str:
 
 
 def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
-    """Makes an arm whose links are up to `SPREAD` heavier or lighter than those of the SDF; writes its SDF.
+    """Makes a ground-truth arm by random changes of the SDF's link masses by up to `SPREAD`; writes its SDF.
 
-    The perturbed MTM has no wrist spring. The identified spring balances an identified wrist that is heavier than the
-    wrist of the SDF. With the SDF's wrist it would exceed the motor torque at a sixth of all poses.
+    The perturbed MTM has no wrist spring. The spring of the arm's file balances a heavier wrist than that of the SDF.
+    With the wrist of the SDF, it would exceed the motor torque at many poses.
     """
     arm = load_arm(name)
     links = perturbed_links(arm, np.random.default_rng(seed))
-    ground_truth_arm = with_links(
-        arm, links, folder / f"true_{name}.sdf", "no arm: each link's mass is drawn at random"
-    )
+    ground_truth_arm = with_links(arm, links, folder / f"true_{name}.sdf", "a simulated arm with random link masses")
     if name == PAPER_ARM:
         ground_truth_arm = dataclasses.replace(ground_truth_arm, effects=arm.effects.without("springs"))
     laws = [*ground_truth_arm.effects.cables, *ground_truth_arm.effects.springs]
     model = dataclasses.replace(IdentifiedModel.from_arm(ground_truth_arm, laws), arm=arm)
     origin = (
-        f"The ground-truth arm is the SDF's with each link up to {100 * SPREAD:.0f} % heavier or lighter (drawn "
-        f"with seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."
+        f"The ground-truth arm has the links of the SDF with random changes of their masses by up to "
+        f"{100 * SPREAD:.0f} % (seed {seed}). Its effects are those of `mechanisms/`: friction, cables, encoders, "
+        f"motors and delays."
     )
     return GroundTruth(ground_truth_arm, model, False, origin)
 
 
 def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0) -> list[LinkInertia]:
-    """Returns the links of an arm with masses changed by up to `SPREAD` and centres of mass by up to `shift` [m]."""
+    """Returns the links with random changes of the masses (up to `SPREAD`) and centres of mass (up to `shift` [m])."""
     links = []
     for link in link_inertias(arm):
         parameters = link.parameters
@@ -213,7 +215,7 @@ def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0
 
 
 def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) -> Arm:
-    """Returns the arm with other links; writes its SDF to `path` with the `origin` of the links as its comment."""
+    """Returns the arm with the given links; writes its SDF to `path`. A comment of the SDF contains their `origin`."""
     with atomic_write(path) as stream:
         stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
     return dataclasses.replace(arm, sdf=(str(path.resolve()),))
@@ -222,7 +224,7 @@ def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) 
 def damped_station(
     arm: Arm, ground_truth_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
 ) -> ArmStation:
-    """Makes a station of a ground-truth arm with these effects and with joint damping instead of friction."""
+    """Makes a station that simulates a ground-truth arm with effects, and with joint damping instead of friction."""
     damping = arm.per_joint(0.03, 0.3) * arm.effort_limits
 
     def damp(plant: MultibodyPlant) -> None:
@@ -233,10 +235,10 @@ def damped_station(
     )
 
 
-#: Distance from which a pose is approached from both sides, so that dry friction cancels [rad], [m].
+#: Distance between a pose and the starts of its two opposite approaches, in which dry friction cancels [rad], [m].
 APPROACH = 0.2, 0.02
 #: Margin at both ends of each joint range, as a share of the range; maximum angle of multi-turn joints [rad].
-MARGIN, REACH = 0.05, 1.6
+MARGIN, MAX_MULTI_TURN_ANGLE = 0.05, 1.6
 #: Number of poses that one worker collects at a time.
 _CHUNK = 10
 
@@ -249,15 +251,15 @@ def collect(
     executor: Executor,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
-    """Collects `count` poses of a ground-truth arm with all its effects, averaged over both approach directions.
+    """Collects poses of a ground-truth arm with all its effects, averaged over both approach directions.
 
-    The controller uses the model of the SDF. Chunks of poses run in parallel on the workers of the executor. Each
-    chunk has its own start pose and its own noise. The result does not depend on the number of workers.
+    The controller uses the model of the SDF. The workers of the executor collect chunks of poses in parallel. Each
+    chunk has a separate start pose and separate noise, so the result does not depend on the number of workers.
     """
     arm = load_arm(name)
     poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)
-    wide = (arm.position_upper - arm.position_lower > 4 * np.pi) & ~arm.prismatic
-    poses[:, wide] = np.clip(poses[:, wide], -REACH, REACH)
+    multi_turn = (arm.position_upper - arm.position_lower > 4 * np.pi) & ~arm.prismatic
+    poses[:, multi_turn] = np.clip(poses[:, multi_turn], -MAX_MULTI_TURN_ANGLE, MAX_MULTI_TURN_ANGLE)
     chunks = np.array_split(poses, -(-count // _CHUNK))
     futures = [executor.submit(_collect_chunk, name, truth.arm, c, seed + i) for i, c in enumerate(chunks)]
     rows = np.concatenate(await_results(futures, progress))
@@ -269,7 +271,7 @@ def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64],
     """Returns the means (m, 2n) of q and tau over both approach directions."""
     arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
-    visited = np.concatenate([[beside(arm, q, -offset), q, beside(arm, q, offset), q] for q in poses])
+    visited = np.concatenate([[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses])
     station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects, seed=seed)
     generator = np.random.default_rng(seed)
     nominal = IdentifiedModel.from_arm(arm)

@@ -37,11 +37,12 @@ class ControllerScenario:
     """Controller of the arm in a scenario.
 
     Attributes:
-        mode: "hold", "gravity" or "damped".
-        model: File of an identified model. If empty, the controller uses the model of the SDF.
-        compensated_effects: Effects of the arm, "cables" or "springs", that are added to the model of the SDF. Not
-            allowed with a model from a file.
-        gains: Gains kp, kd, ki, one number per joint, that replace those of the arm. A file can also name a gains file.
+        mode: Mode of the controller: "hold", "gravity" or "damped".
+        model: Path of a model file. If empty, the controller uses the model of the SDF.
+        compensated_effects: Effects of the arm ("cables", "springs") that are added to the model of the SDF. Not
+            allowed together with `model`.
+        gains: Gains kp, kd, ki, one number per joint, instead of those of the arm. In a scenario file, this can be the
+            path of a gains file.
         friction_ratio: Share of the arm's friction that is compensated, in mode "gravity" only; see `check_ratios`.
         hysteresis_ratio: Share of the elastic part of the friction that is compensated, in mode "gravity" only.
         parameter_error: Relative error of the model. Each base parameter is multiplied by a random factor between
@@ -59,7 +60,12 @@ class ControllerScenario:
 
 @dataclass
 class Target:
-    """Desired rest of the arm at `time` [s] in `pose` [rad, m], one number per joint."""
+    """Pose of the arm at a given time, at which it is at rest.
+
+    Attributes:
+        time: Time [s].
+        pose: Positions (n,) of the joints [rad, m].
+    """
 
     time: float = field(default=0.0, metadata=within(0.0, MAX_LENGTH, "s"))
     pose: list[float] = field(default_factory=list, metadata=_POSITIONS)
@@ -69,12 +75,13 @@ class Target:
 class HandScenario:
     """Hand that grasps the arm at a frame and moves it along a path; see `systems.hand`.
 
-    The hand follows the pose that `frame` has while the joints pass the poses of `path` at their times. It holds the
-    arm from the first to the last of these times. With an empty path no hand touches the arm.
+    The hand moves `frame` along the poses that the frame has for the joint positions of `path`. The hand holds the arm
+    from the first to the last time of the path. With an empty path there is no hand.
 
     Attributes:
-        path: Joint poses and their times.
-        frame: Frame of the arm's SDF. The handle of an MTM is dh_7, the instrument of a PSM is dh_6.
+        path: Joint positions and times.
+        frame: Frame of the arm's SDF that the hand holds: dh_7 for the handle of an MTM, dh_6 for the instrument of a
+            PSM.
         stiffness, damping, rotational_stiffness, rotational_damping, max_force, max_torque: Parameters of the `Grip`.
     """
 
@@ -97,7 +104,7 @@ class HandScenario:
 
 @dataclass
 class Scenario(ArmConfig):
-    """Schema of a scenario file. Simulations of one scenario are identical bit for bit.
+    """Schema of a scenario file. Repeated simulations of a scenario give bitwise identical results.
 
     The fields of `ArmConfig` describe the arm. `seed` is also the seed of the controller's parameter error.
 
@@ -106,10 +113,10 @@ class Scenario(ArmConfig):
         duration: Duration of the simulation [s].
         sample_period: Sample period of the recording [s].
         controller: Controller of the arm.
-        start: Start pose, at rest. Default: zero, or the nearest pose inside the limits.
-        targets: Desired poses and their times, in mode "hold" only. The arm is at rest in each of them.
+        start: Start pose (n,) [rad, m], at rest. Default: zero, or the nearest pose inside the limits.
+        targets: Desired poses at which the arm is at rest, with their times. Only in mode "hold".
         hand: Hand that moves the arm.
-        effort_noise: Standard deviation of recorded efforts, as a share of the effort limits.
+        effort_noise: Standard deviation of the noise of recorded efforts, as a share of the effort limits.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -133,20 +140,22 @@ class Scenario(ArmConfig):
     def model(self) -> IdentifiedModel:
         """Model used by the controller."""
         file, error = self.controller.model, self.controller.parameter_error
-        known = [
+        effects = [
             effect for part in self.controller.compensated_effects for effect in getattr(self.mounted_arm.effects, part)
         ]
         model = (
-            IdentifiedModel.load(file, self.mounted_arm) if file else IdentifiedModel.from_arm(self.mounted_arm, known)
+            IdentifiedModel.load(file, self.mounted_arm)
+            if file
+            else IdentifiedModel.from_arm(self.mounted_arm, effects)
         )
         if error == 0.0:
             return model
-        # Use a separate random stream; the seed alone is used for the noise.
+        # Use another random stream than that of the noise, which uses only the seed.
         generator = np.random.default_rng([self.seed, 1])
         return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
 
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the times (m,) and poses (m, n) of desired rest: the start, then the targets."""
+        """Returns the times (m,) [s] and poses (m, n) [rad, m] of the start and the targets."""
         arm = self.mounted_arm
         home = np.clip(0.0, arm.position_lower, arm.position_upper)
         poses = [home if self.start is None else self.start, *(target.pose for target in self.targets)]
@@ -174,15 +183,17 @@ class Scenario(ArmConfig):
             _check_choice("controller.compensated_effects", part, ("cables", "springs"))
         if self.controller.compensated_effects and self.controller.model:
             raise ScenarioError(
-                "controller.compensated_effects is of a model from the arm's files; controller.model names another"
+                "controller.compensated_effects and controller.model exclude each other. Remove one of them."
             )
         if (gains := self.controller.gains) and (fault := arm.gains_fault(gains)):
             raise ScenarioError(f"controller.{fault}")
         for name in ("friction_ratio", "hysteresis_ratio"):
             if getattr(self.controller, name) and self.controller.mode != "gravity":
-                raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
+                raise ScenarioError(
+                    f'controller.{name} requires controller.mode "gravity"; the mode is "{self.controller.mode}"'
+                )
         if self.targets and self.controller.mode != "hold":
-            raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
+            raise ScenarioError(f'targets require controller.mode "hold"; the mode is "{self.controller.mode}"')
         _ = self.model  # raises an error for a model of another arm
 
     def _check_targets(self, name: str, targets: list[Target], after: float) -> None:
@@ -191,7 +202,7 @@ class Scenario(ArmConfig):
             if not after < target.time <= self.duration:
                 earliest = "0 s or later" if after < 0 else f"after {after:g} s"
                 raise ScenarioError(
-                    f"{name}[{i}].time = {target.time:g} s must be {earliest} and at most the duration, "
+                    f"{name}[{i}].time is {target.time:g} s; allowed: {earliest}, up to the duration of "
                     f"{self.duration:g} s"
                 )
             after = target.time
@@ -201,7 +212,9 @@ class Scenario(ArmConfig):
             return
         ArmFrame(self.mounted_arm, self.hand.frame)
         if len(self.hand.path) < 2:
-            raise ScenarioError("hand.path needs two poses or more: from when to when the hand holds on")
+            raise ScenarioError(
+                "hand.path must have 2 or more poses. The hand grasps the arm at the first and releases it at the last."
+            )
 
 
 def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
@@ -210,7 +223,7 @@ def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
 
 
 def check_pose(name: str, pose: list[float], arm: Arm) -> None:
-    """Checks that a pose is inside the limits of `arm`; `name` begins the error message.
+    """Checks that a pose is inside the limits of `arm`. Error messages start with `name`.
 
     Raises:
         ScenarioError: The pose does not have n finite numbers, or it is outside the limits.
@@ -226,18 +239,18 @@ def check_pose(name: str, pose: list[float], arm: Arm) -> None:
         message = f"{name}: {'; '.join(violations)} [rad, m] of {arm.name}"
         far = arm.prismatic & (np.abs(q) > 2 * arm.position_upper)
         if np.any(far) and np.all(np.abs(q[far]) / 1000 <= arm.position_upper[far]):
-            message += f"; is {arm.joint_names[int(np.argmax(far))]} in mm? It must be in m"
+            message += f". Give {arm.joint_names[int(np.argmax(far))]} in m, not in mm."
         raise ScenarioError(message)
 
 
 def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     """Reads a scenario, applies settings to it, and checks it.
 
-    For an arm instead of a scenario file, the scenario is that the arm holds its home pose.
+    For an arm instead of a scenario file, the controller regulates the home pose.
 
     Args:
-        arm_or_file: Path of a scenario's YAML file, or the name of an arm or the path of its YAML file.
-        settings: Settings "key=value" in YAML. A dot separates a group from its key: "controller.mode=gravity".
+        arm_or_file: Path of a scenario file, name of an arm, or path of an arm file.
+        settings: Settings "key=value" in YAML. A dot separates a group from a key, e.g. "controller.mode=gravity".
 
     Raises:
         ScenarioError: The file cannot be read, has an unknown key, or has an invalid value.
@@ -257,7 +270,7 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
         content = {"arm": arm_or_file}
     if isinstance(content, dict):
         for setting in settings:
-            _change(content, setting)
+            _apply_setting(content, setting)
         _load_gains_of(content)
     scenario = typed_content(Scenario, content, arm_or_file, ScenarioError, "a scenario")
     try:
@@ -268,20 +281,22 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
 
 
 def _load_gains_of(content: dict[str, Any]) -> None:
-    """Replaces the name of a gains file by the contents of the file."""
+    """Replaces the path of a gains file by the contents of the file."""
     controller = content.get("controller")
     if isinstance(controller, dict) and isinstance(controller.get("gains"), str):
         controller["gains"] = dataclasses.asdict(load_gains(controller["gains"]))
 
 
-def _change(content: dict[str, Any], setting: str) -> None:
+def _apply_setting(content: dict[str, Any], setting: str) -> None:
     key, equals, value = setting.partition("=")
     if not equals or not key:
-        raise ScenarioError(f'--set {setting}: must be key=value, e.g. "duration=2" or "controller.mode=gravity"')
+        raise ScenarioError(
+            f'--set {setting}: a setting must be key=value, e.g. "duration=2" or "controller.mode=gravity"'
+        )
     *groups, last = key.strip().split(".")
     group: Any = content
     for name in groups:
         group = group.setdefault(name, {})
         if not isinstance(group, dict):
-            raise ScenarioError(f"--set {setting}: {name} has no keys of its own")
+            raise ScenarioError(f"--set {setting}: {name} is not a group and has no keys")
     group[last] = parse_yaml(value, f"--set {setting}", ScenarioError)

@@ -1,4 +1,4 @@
-"""Simulation of a controlled arm with a recording, and sampling of simulations in general."""
+"""Simulates a controlled arm and records it; functions for sampling simulations."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Simulation:
     """Result of `simulate`.
 
     Attributes:
-        recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects` they are exact, except for the
-            scenario's noise on tau.
-        state_true: True state (m, 2n): q, then v.
+        recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects` the measurements are exact, except
+            for the noise of tau.
+        state_true: True state (m, 2n): positions [rad, m], then velocities [rad/s, m/s].
         hand: Torque [N m], then force [N] (m, 6) of the hand on the arm at the grasped frame, expressed in the base
             frame. Zero without a hand.
-        desired: Desired positions (m, n), or None in modes other than "hold".
+        desired: Desired positions (m, n) [rad, m]. None in modes other than "hold".
     """
 
     recording: Recording
@@ -68,47 +68,49 @@ def simulate(
     meshcat: Meshcat | None = None,
     progress: Progress | None = None,
 ) -> Simulation:
-    """Simulates a controlled arm and records it. The same arguments give the same numbers, bit for bit.
+    """Simulates a controlled arm and records it. The same arguments give bitwise identical results.
 
-    The desired motion between two poses is a cubic in time along a straight line in joint space. It therefore stays
+    The desired motion between two poses is a cubic in time along a straight line in joint space. Therefore it stays
     inside linear limits.
 
     Args:
-        what: Arm that holds a pose or moves to `targets`, or a scenario. A scenario defines all settings below itself.
-        controller: Model for a `GravityPidController`, by default that of the arm's SDF; or a System with an input
-            port `state_estimated` (2n) and an output port `effort` (n), e.g. a `GravityPidController`. It moves to
-            `targets` only if it has an input port `desired_state` (2n). A System can be used only once.
-        effects: Whether the simulated arm has the effects of a real one (friction, cables, stops, encoders and motors),
-            or the names of the effects that it has. Default: True.
+        what: Arm that is regulated at a pose or moves to `targets`, or a scenario. A scenario contains all settings
+            from `controller` to `seed`.
+        controller: Model for a `GravityPidController`, by default that of the arm's SDF. Or a System with an input port
+            `state_estimated` (2n) and an output port `effort` (n), e.g. a `GravityPidController`. `targets` have an
+            effect only if the System has an input port `desired_state` (2n). A System can be used only once.
+        effects: Whether to simulate the effects of a real arm (friction, cables, stops, encoders, motors), or the names
+            of the effects to simulate. Default: True.
         duration: Duration of the simulation [s]. Default: 5.
         start: Start pose (n,), at rest [rad, m]. Default: zero, or the nearest pose inside the limits.
-        targets: Times [s] and poses (n,) [rad, m] of desired rest.
+        targets: Times [s] and poses (n,) [rad, m] at which the arm is at rest.
         sample_period: Sample period of the recording [s]. Default: 0.01.
         seed: Seed of the effects' noise. Default: 0.
         meshcat: Meshcat that shows the arm in real time, and the recorded animation at the end.
-        progress: Function called with the step, "simulating", and its finished share 0..1.
+        progress: Function called with the step, "simulating", and its finished share, 0..1.
 
     Returns:
-        Measured times, positions, velocities and efforts in `recording`, and the true state in `state_true`.
+        Recording of the measurements, true states, forces of the hand, and desired positions.
 
     Raises:
-        ScenarioError: The simulation is not possible, e.g. because of a pose outside the limits or because an argument
-            was given together with a scenario.
+        ScenarioError: An argument is invalid, e.g. a pose is outside the limits, or a setting is given together with a
+            scenario.
         ArmError: An effect does not exist.
 
     Example:
         >>> import dvrk_drake as dvrk
         >>> arm = dvrk.load_arm("mtmr")
         >>> run = dvrk.simulate(arm, controller=dvrk.IdentifiedModel.from_arm(arm), effects=False, duration=0.5)
-        >>> run.recording.q.shape, bool(abs(run.recording.q).max() < 1e-3)  # holds its home pose
+        >>> run.recording.q.shape, bool(abs(run.recording.q).max() < 1e-3)  # regulates its home pose
         ((51, 7), True)
     """
     if not isinstance(what, Arm | Scenario):
-        raise ScenarioError(f'what is a {type(what).__name__}; allowed: an Arm, e.g. load_arm("mtml"), or a Scenario')
+        raise ScenarioError(f'`what` is a {type(what).__name__}; allowed: an Arm, e.g. load_arm("mtml"), or a Scenario')
     if not isinstance(controller, IdentifiedModel | System | None):
         kind = type(controller).__name__
         raise ScenarioError(
-            f"controller is a {kind}; allowed: an IdentifiedModel (the `model` of a result) or a System"
+            f"`controller` is a {kind}; allowed: an IdentifiedModel (attribute `model` of an identification result) or "
+            "a System"
         )
     given: dict[str, Any] = {"duration": duration, "sample_period": sample_period, "seed": seed}
     if isinstance(what, Arm):
@@ -119,12 +121,17 @@ def simulate(
         scenario.mounted_arm = what
         if isinstance(controller, IdentifiedModel):
             if controller.arm.name != what.name:
-                raise ScenarioError(f"controller is a model of {controller.arm.name}, not of {what.name}")
+                raise ScenarioError(
+                    f"`controller` is a model of {controller.arm.name}, but the simulated arm is {what.name}. "
+                    f"Use a model of {what.name}."
+                )
             scenario.model = controller
     else:
         given |= {"controller": controller, "effects": effects, "start": start, "targets": targets}
-        if beside := [name for name, value in given.items() if value is not None]:
-            raise ScenarioError(f"a scenario states {beside[0]} itself; change the scenario, or give an arm")
+        if extra := [name for name, value in given.items() if value is not None]:
+            raise ScenarioError(
+                f"`{extra[0]}` cannot be given with a scenario. Set it in the scenario, or give an arm."
+            )
         scenario = what
     return _simulate(scenario, controller if isinstance(controller, System) else None, meshcat, progress)
 
@@ -132,7 +139,7 @@ def simulate(
 def _simulate(
     scenario: Scenario, system: System | None, meshcat: Meshcat | None, progress: Progress | None
 ) -> Simulation:
-    """Simulates a scenario, with `system` instead of the scenario's controller if it is given."""
+    """Simulates a scenario. `system` replaces the scenario's controller unless it is None."""
     report = step_progress(progress, "simulating")
     scenario.check()
     arm = scenario.mounted_arm
@@ -180,25 +187,25 @@ def _simulate(
 
 
 def sample_times(duration: float, period: float) -> NDArray[np.float64]:
-    """Returns the sample times (m,) 0, period, ... up to `duration` [s] of a `LogVectorOutput` with this period."""
-    # Use multiples, not sums. Accumulated rounding errors could shift a sample before or after a time step.
+    """Returns the sample times (m,) [s] of a `LogVectorOutput` with this period: 0, period, ..., up to `duration`."""
+    # Use multiples, not sums, since accumulated rounding errors could shift a sample across a time step.
     return period * np.arange(1 + int(duration / period + 1e-9), dtype=np.float64)
 
 
 def advance(
     simulator: Simulator, times: NDArray[np.float64], progress: Callable[[float], object] = lambda share: None
 ) -> None:
-    """Advances a simulation to each of `times` (m,) [s] and calls `progress` with the finished share of the total."""
+    """Advances a simulation to each of `times` (m,) [s] and calls `progress` with the finished share, 0..1."""
     for t in times:
         if t > 0:
             simulator.AdvanceTo(t)
-        else:  # AdvanceTo(0) would already perform the first step of the plant
+        else:  # AdvanceTo(0) would perform the first step of the plant
             simulator.Initialize()
         progress(t / times[-1])
 
 
 def samples(log: VectorLogSink, simulator: Simulator) -> NDArray[np.float64]:
-    """Returns the data of a `LogVectorOutput`, one row per sample."""
+    """Returns the data (m, k) of a `LogVectorOutput`, one row per sample."""
     return np.array(log.FindLog(simulator.get_context()).data().T)
 
 
@@ -216,7 +223,7 @@ def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
 def scenario_of_arm(
     arm: Arm, effects: bool | Sequence[str], start: ArrayLike | None, targets: Sequence[tuple[float, ArrayLike]]
 ) -> Scenario:
-    """Returns the scenario of `simulate` for an arm; the arguments are those of `simulate`."""
+    """Returns the scenario of an arm for the arguments of `simulate`."""
     if isinstance(effects, bool):
         effects = ["all"] if effects else []
     return Scenario(
@@ -229,19 +236,19 @@ def scenario_of_arm(
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:
-    """Returns a trajectory that rests at each pose at its time, and at the last pose until the end."""
+    """Returns a trajectory that is at rest at each pose at its time, and stays at the last pose."""
     times, poses = np.append(times, max(duration, times[-1]) + 1.0), np.vstack([poses, poses[-1:]])
     return PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
 
 
 def _friction(scenario: Scenario) -> FrictionCompensator | None:
-    wanted = scenario.controller
-    if not (wanted.friction_ratio or wanted.hysteresis_ratio):
+    controller = scenario.controller
+    if not (controller.friction_ratio or controller.hysteresis_ratio):
         return None
     return FrictionCompensator(
         Friction.of_arm(scenario.mounted_arm),
-        ratio=wanted.friction_ratio,
-        hysteresis_ratio=wanted.hysteresis_ratio,
+        ratio=controller.friction_ratio,
+        hysteresis_ratio=controller.hysteresis_ratio,
         holding_error=holding_error(scenario.model),
         period=scenario.time_step,
     )
@@ -253,10 +260,10 @@ def _add_hand(builder: DiagramBuilder, station: ArmStation, scenario: Scenario) 
         return None
     poses = np.array([target.pose for target in path])
     times = [target.time for target in path]
-    way = PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
+    trajectory = PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
     hand = builder.AddNamedSystem("hand", Hand(arm, frame, scenario.hand.grip, scenario.time_step))
-    wants = builder.AddNamedSystem("hand_path", HandPath(arm, frame, way))
-    builder.Connect(wants.get_output_port(), hand.GetInputPort("X_BG_desired"))
+    hand_path = builder.AddNamedSystem("hand_path", HandPath(arm, frame, trajectory))
+    builder.Connect(hand_path.get_output_port(), hand.GetInputPort("X_BG_desired"))
     name = arm.name.lower()
     builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.GetInputPort("state_estimated"))
     builder.Connect(hand.GetOutputPort("effort_disturbance"), station.GetInputPort(f"{name}.effort_disturbance"))

@@ -28,21 +28,21 @@ from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 
 #: Sample period of the recorded signals [s].
 SAMPLE_PERIOD = 5e-3
-#: Initial transient of the grasp, which is excluded from the evaluation [s].
+#: Duration of the initial transient of the grasp, which is excluded from the evaluation [s].
 GRASP_TIME = 1.0
-#: Maximum excess over the joint limits; a motion with a larger excess was not recorded on this arm [rad, m].
+#: Maximum excess over the joint limits [rad, m]. A recording with a larger excess is not of this arm.
 MAX_LIMIT_EXCESS = 0.1
 
 
 @dataclass(frozen=True)
 class Compensation:
-    """Compensation by the motors: none, gravity, or gravity and a share of the friction.
+    """Compensation by the motors: none, gravity only, or gravity and a share of the friction.
 
     Attributes:
         name: Name in tables and plots.
-        model: Model of the gravity torque, or None for unpowered motors.
+        model: Model of the gravity torque. None for unpowered motors.
         friction_ratio: Compensated share of the friction, within `safe_ratios`.
-        friction: Friction model, by default that of the arm's files.
+        friction: Friction model. None for that of the arm's file.
     """
 
     name: str
@@ -59,7 +59,7 @@ class OperatorForces:
         name: Name of the compensation.
         time: Times (m,) [s].
         torque, force: Torque and force (m, 3) of the hand on the arm at the handle, in the base frame [N m], [N].
-        deviation: Distance (m,) of the handle from its desired position [m].
+        deviation: Distances (m,) of the handle from its desired positions [m].
     """
 
     name: str
@@ -80,14 +80,21 @@ class OperatorForces:
 
     def peak(self) -> tuple[float, float]:
         """Returns the 95th percentiles of force [N] and torque [N m]."""
-        late = self.time >= GRASP_TIME
-        norms = (np.linalg.norm(x[late], axis=1) for x in (self.force, self.torque))
+        evaluated = self.time >= GRASP_TIME
+        norms = (np.linalg.norm(x[evaluated], axis=1) for x in (self.force, self.torque))
         force, torque = (float(np.percentile(norm, 95)) for norm in norms)
         return force, torque
 
 
 def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
-    """Makes a smooth joint motion through random poses at the speed of a hand; substitutes a recorded motion."""
+    """Makes a smooth joint motion through random poses, at the speed of a hand.
+
+    Args:
+        arm: Arm whose limits apply.
+        poses: Number of poses.
+        seconds_each: Time between two poses [s].
+        seed: Seed of the poses.
+    """
     q = arm.sample_poses(poses, np.random.default_rng(seed), margin=0.25)
     times = seconds_each * np.arange(poses, dtype=float)
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
@@ -96,30 +103,30 @@ def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int =
 
 
 def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> PiecewisePolynomial:
-    """Returns the motion of a recording, clipped to the arm's limits and accelerated by the factor `speed`.
+    """Returns the motion of a recording, clipped to the arm's limits and played at `speed` times its original speed.
 
     Raises:
-        ScenarioError: The recording has no times, the speed is not positive, or the motion exceeds the limits by more
-            than 0.1 rad or m.
-        RecordingError: The recording has another number of joints.
+        ScenarioError: The recording has no times, the speed is out of range, or the motion exceeds the limits by more
+            than `MAX_LIMIT_EXCESS`.
+        RecordingError: The number of joints differs from that of the arm.
     """
     recording = recording.in_joint_coordinates(arm)
     if recording.t is None:
-        raise ScenarioError(f"{recording.source}: has no times; a path needs column t")
+        raise ScenarioError(f"{recording.source}: the recording has no times; column t is required")
     if not 0 < speed <= 10:
         raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
     A, lower, upper = arm.limit_matrix()
-    outside = np.max(np.maximum(lower - recording.q @ A.T, recording.q @ A.T - upper), axis=0)
-    if np.any(outside > MAX_LIMIT_EXCESS):
-        j = int(np.argmax(outside))
+    excess = np.max(np.maximum(lower - recording.q @ A.T, recording.q @ A.T - upper), axis=0)
+    if np.any(excess > MAX_LIMIT_EXCESS):
+        j = int(np.argmax(excess))
         name = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)][j]
         raise ScenarioError(
-            f"{recording.source}: {name} leaves the limits of {arm.name} by {outside[j]:.2g} rad or m; is it a motion "
-            f"of this arm's joints, not of another arm's or of actuators?"
+            f"{recording.source}: {name} exceeds the limits of {arm.name} by {excess[j]:.2g} rad or m. Check that the "
+            "recording is of this arm and contains joint positions, not actuator positions."
         )
     t, keep = np.unique(recording.t, return_index=True)
     if len(t) < 3:
-        raise ScenarioError(f"{recording.source}: has {len(t)} different times; a path needs 3 or more")
+        raise ScenarioError(f"{recording.source}: the recording has {len(t)} different times; 3 or more are required")
     q = np.clip(recording.q[keep], arm.position_lower, arm.position_upper)
     return PiecewisePolynomial.CubicShapePreserving((t - t[0]) / speed, q.T, zero_end_point_derivatives=True)
 
@@ -141,9 +148,9 @@ def simulate_operator(
         arm: Arm to simulate.
         path: Joint positions [rad, m] over time from 0 [s]. The hand follows the handle pose of these positions.
         compensation: Compensation by the motors.
-        effects: Simulated effects of the real arm, e.g. `arm.effects`. Default: none.
-        grip: Grip of the hand.
-        frame_name: Frame of the handle, by default `handle_frame`.
+        effects: Simulated effects of the real arm, e.g. `arm.effects`. None for no effects.
+        grip: Grip of the hand. None for the default grip.
+        frame_name: Frame of the handle. If empty, that of `handle_frame`.
         seed: Seed of the effects' noise.
         progress: Function called with the finished share, 0..1.
     """
@@ -156,8 +163,8 @@ def simulate_operator(
         controller = GravityPidController(compensation.model, mode="gravity")
         connect_controller(builder, station, controller, friction=_friction(arm, compensation))
     hand = builder.AddSystem(Hand(arm, frame_name, grip))
-    way = PiecewisePose.MakeLinear(knots, poses)
-    source = builder.AddSystem(PoseTrajectorySource(way))
+    handle_path = PiecewisePose.MakeLinear(knots, poses)
+    source = builder.AddSystem(PoseTrajectorySource(handle_path))
     builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.GetInputPort("state_estimated"))
     builder.Connect(source.get_output_port(), hand.GetInputPort("X_BG_desired"))
     builder.Connect(hand.GetOutputPort("effort_disturbance"), station.GetInputPort(f"{name}.effort_disturbance"))
@@ -170,8 +177,8 @@ def simulate_operator(
     advance(simulator, times, progress)
     forces, state = (samples(log, simulator)[1:] for log in logs)
     positions = np.array([frame.pose(q).translation() for q in state[:, : arm.num_joints]])
-    wanted = np.array([way.GetPose(min(t, way.end_time())).translation() for t in times])
-    deviation = np.linalg.norm(wanted - positions, axis=1)
+    desired = np.array([handle_path.GetPose(min(t, handle_path.end_time())).translation() for t in times])
+    deviation = np.linalg.norm(desired - positions, axis=1)
     return OperatorForces(compensation.name, times, forces[:, :3], forces[:, 3:], deviation)
 
 

@@ -1,4 +1,4 @@
-"""Gravity compensation formula of the dVRK's controller for a master arm, and its file from an identified model."""
+"""Implements the gravity compensation of the dVRK's controller for an MTM, and computes its file from a model."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, NUM_PARAMETERS, GravityCompensationFile
 from dvrk_drake.models.arm import Arm
 
-#: Effects of a drive that remain at low sliding speed.
+#: Kinds of effects that model dry friction.
 DRY_KINDS = ("coulomb", "presliding")
-#: Gravity by which the controller multiplies its ten gravity columns [m/s^2].
+#: Factor of the controller's gravity columns [m/s^2].
 CONTROLLER_GRAVITY = 9.81
+#: Number of gravity columns.
 NUM_GRAVITY = 10
+#: Order of the polynomials.
 ORDER = 4
-#: Meaning of the first two columns at the shoulder.
-_FIRST = ("cable sine", "cable cosine")
+#: Effects that the first two columns represent at the shoulder.
+_FIRST_EFFECTS = ("cable sine", "cable cosine")
 MTM_JOINTS = (
     "outer_yaw",
     "shoulder_pitch",
@@ -35,13 +37,13 @@ MTM_JOINTS = (
 
 @dataclass(frozen=True)
 class CompensationOptions:
-    """Entries of the controller's file that a model does not contain.
+    """Entries of the controller's file that a model does not contain, and the accepted error.
 
     Attributes:
-        coulomb: Coulomb friction (7,) of each joint [N m], of which `friction_ratio` is compensated in motion.
-        friction_ratio: Compensated share (7,), 0..1. Defaults to the values of dVRK files in use.
-        dead_band, saturation: Speeds (7,) [rad/s]. Default to the values of dVRK files in use.
-        tolerance: Accepted error [N m] of the approximation of the model by the file.
+        coulomb: Coulomb friction (7,) of the joints [N m].
+        friction_ratio: Compensated shares (7,) of the Coulomb friction in motion, 0 to 1.
+        dead_band, saturation: Speeds (7,) [rad/s], see `GravityCompensationFile`. The defaults are from dVRK files.
+        tolerance: Accepted torque error of the file [N m].
     """
 
     coulomb: tuple[float, ...] = (0.0,) * NUM_JOINTS
@@ -52,7 +54,7 @@ class CompensationOptions:
 
 
 def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
-    """Returns the regressor R (m, 7, 40) at poses q (m, 7) [rad]. R times the parameters is a torque [N m].
+    """Returns the regressor R (m, 7, 40) at poses q (m, 7) [rad]. R times the parameters (40,) is the torque [N m].
 
     Source: sawIntuitiveResearchKit, robGravityCompensationMTM.
     """
@@ -98,13 +100,19 @@ def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
 
 
 def polynomial_columns(joint: int) -> slice:
-    """Returns the columns of 1, q, .. q^4 of a joint 0..5."""
+    """Returns the columns of 1, q, ..., q^4 for a joint index 0 to 5."""
     first = NUM_GRAVITY + (ORDER + 1) * joint
     return slice(first, first + ORDER + 1)
 
 
 def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Returns the torque (m, 7) [N m] of the file at poses q (m, 7) [rad], velocities v (m, 7) [rad/s] or at rest."""
+    """Returns the torque (m, 7) [N m] of the file before clipping.
+
+    Args:
+        file: Content of the file.
+        q: Poses (m, 7) [rad].
+        v: Velocities (m, 7) [rad/s]. None means at rest.
+    """
     R = controller_regressor(q)
     v = np.zeros(R.shape[:2]) if v is None else np.atleast_2d(np.asarray(v, dtype=np.float64))
     share = np.clip((np.abs(v) - file.dead_band) / (file.saturation - file.dead_band), 0.0, 1.0)
@@ -113,7 +121,7 @@ def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike |
 
 
 def controller_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Returns `unclipped_torque` limited to the file's range, as the controller applies it."""
+    """Returns the torque (m, 7) [N m] that the controller applies: `unclipped_torque` within the limits of the file."""
     return np.clip(unclipped_torque(file, q, v), file.torque_lower, file.torque_upper)
 
 
@@ -122,11 +130,11 @@ def compensation_from_model(
 ) -> GravityCompensationFile:
     """Converts a model to the file of the controller.
 
-    The ten columns span the gravity of an upright MTM whose last link is balanced about its axis. They follow exactly
-    from the base parameters. The additional gravity of a tilted base is approximated by polynomials in the joint
-    positions. The offset of a joint is its constant, and the cable torque of the shoulder uses the first two columns.
-    Other effects are approximated by polynomials over the joint's range. Torque limits are the required range over the
-    joint box plus a tenth, at most the arm's effort limits. Joint 7 has no torque.
+    The ten gravity columns represent exactly an upright MTM whose last link is balanced about its axis. Polynomials in
+    the joint positions approximate the additional gravity torque of a tilted base. The constant of a polynomial
+    represents the offset of a joint. The first two columns represent the cable torque of the shoulder, and polynomials
+    approximate other effects. The torque limits are the torque range within the joint limits plus 10 % at both ends.
+    They do not exceed the effort limits of the arm. Joint 7 has no torque.
 
     Raises:
         ModelError: The model is not of an MTM, options have the wrong length, or the error exceeds `options.tolerance`.
@@ -134,41 +142,43 @@ def compensation_from_model(
     options = options or CompensationOptions()
     arm = model.arm
     if arm.joint_names != MTM_JOINTS:
-        raise ModelError(f"{arm.name}: the controller's gravity-compensation file is one of an MTM; joints differ")
+        raise ModelError(
+            f"{arm.name} is not an MTM, so the format dvrk-gc is not possible. A PSM needs dvrk-kinematic-gc"
+        )
     check_tolerance(options.tolerance)
     poses = arm.sample_poses(20000, np.random.default_rng(0))
     gravity, effects = _gravity_parameters(model, poses[:4000]), _effect_parameters(model, arm)
-    _refuse_errors(model, gravity, effects, poses[:4000], options.tolerance)
+    _check_errors(model, gravity, effects, poses[:4000], options.tolerance)
     parameters = gravity + effects
-    coulomb = _seven("coulomb", options.coulomb)
+    coulomb = _checked_values("coulomb", options.coulomb)
     friction = np.zeros(NUM_PARAMETERS)
     friction[[polynomial_columns(j).start for j in range(NUM_JOINTS - 1)]] = coulomb[:-1]
-    needed = controller_regressor(poses) @ parameters
-    lower, upper = _torque_limits(arm, needed.min(axis=0) - coulomb, needed.max(axis=0) + coulomb)
+    torque = controller_regressor(poses) @ parameters
+    lower, upper = _torque_limits(arm, torque.min(axis=0) - coulomb, torque.max(axis=0) + coulomb)
     file = GravityCompensationFile(
         positive=parameters + friction,
         negative=parameters - friction,
         torque_lower=lower,
         torque_upper=upper,
-        dead_band=_seven("dead_band", options.dead_band),
-        saturation=_seven("saturation", options.saturation),
-        friction_ratio=_seven("friction_ratio", options.friction_ratio),
+        dead_band=_checked_values("dead_band", options.dead_band),
+        saturation=_checked_values("saturation", options.saturation),
+        friction_ratio=_checked_values("friction_ratio", options.friction_ratio),
     )
     file.check()
     return file
 
 
 def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
-    """Returns the Coulomb friction [N m] of each joint when it moves alone, from the effects of the model's dynamics.
+    """Returns the Coulomb friction (7,) [N m] of each joint if only this joint moves.
 
-    Smoothed Coulomb terms and presliding elements, which friction is once they slip, add up; along a coordinate of the
-    drive that several joints move, each of them has its share.
+    The friction is the sum of the Coulomb and presliding effects of the model's dynamics. An effect along a coordinate
+    that several joints move contributes to each of these joints.
 
     Raises:
         ModelError: The model has no dynamics.
     """
     if model.dynamics is None:
-        raise ModelError("the model has no dynamics, so it has no friction; give it with --coulomb")
+        raise ModelError("the model has no dynamics, so its friction is unknown. Give the friction with --coulomb")
     arm = model.arm
     friction = np.zeros(arm.num_joints)
     for effect in model.dynamics.effects:
@@ -178,7 +188,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
 
 
 def largest_differences(file: GravityCompensationFile, model: IdentifiedModel) -> NDArray[np.float64]:
-    """Returns the largest differences (7,) [N m] between the torques of file and model at rest over the joint box."""
+    """Returns the largest torque differences (7,) [N m] of file and model at rest, within the joint limits."""
     poses = model.arm.sample_poses(4000, np.random.default_rng(1))
     return np.asarray(np.abs(controller_torque(file, poses) - model.holding_torque(poses)).max(axis=0))
 
@@ -190,19 +200,20 @@ def _gravity_torque(model: IdentifiedModel, q: NDArray[np.float64]) -> NDArray[n
 
 
 def _gravity_parameters(model: IdentifiedModel, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the parameters (40,), with the ten gravity columns fitted over full turns of all joints.
+    """Returns parameters (40,) that approximate the gravity torque of the model.
 
-    The residual, which is small unless the base is tilted, is approximated by polynomials over the joint box.
+    The ten gravity parameters are fitted at random poses without joint limits. The polynomials approximate the residual
+    at `poses` (m, 7), which is small unless the base is tilted.
     """
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (400, NUM_JOINTS))
     R = controller_regressor(q)[:, :, :NUM_GRAVITY]
     solution = np.linalg.lstsq(R.reshape(-1, NUM_GRAVITY), _gravity_torque(model, q).ravel(), rcond=None)[0]
     parameters = np.concatenate([solution, np.zeros(NUM_PARAMETERS - NUM_GRAVITY)])
     R = controller_regressor(poses)
-    left = _gravity_torque(model, poses) - R @ parameters
+    residual = _gravity_torque(model, poses) - R @ parameters
     for joint in range(NUM_JOINTS - 1):
         columns = polynomial_columns(joint)
-        parameters[columns] = np.linalg.lstsq(R[:, joint, columns], left[:, joint], rcond=None)[0]
+        parameters[columns] = np.linalg.lstsq(R[:, joint, columns], residual[:, joint], rcond=None)[0]
     return parameters
 
 
@@ -210,15 +221,15 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
     parameters = np.zeros(NUM_PARAMETERS)
     for estimate in model.holding_effects:
         row = joint_row(arm, estimate.coordinate)
-        # The file has nothing for the last joint, nor for what moves with two: _refuse_errors measures what that costs.
+        # The file has no torque at the last joint and no functions of two joints. _check_errors includes that error.
         for joint in map(int, np.flatnonzero(row[:-1])):
             value = float(model.feedforward_scale[joint] * estimate.coefficient * row[joint])
             if estimate.kind == "offset":
                 parameters[polynomial_columns(joint).start] += value
             elif np.count_nonzero(row) > 1:
                 continue
-            elif joint == 1 and estimate.scale == 1.0 and estimate.kind in _FIRST:
-                parameters[_FIRST.index(estimate.kind)] += value / CONTROLLER_GRAVITY
+            elif joint == 1 and estimate.scale == 1.0 and estimate.kind in _FIRST_EFFECTS:
+                parameters[_FIRST_EFFECTS.index(estimate.kind)] += value / CONTROLLER_GRAVITY
             else:
                 parameters[polynomial_columns(joint)] += value * _best_polynomial(
                     ActuatorEffect.of(estimate), arm, joint
@@ -227,9 +238,11 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
 
 
 def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np.float64]:
-    """Returns coefficients (5,) of 1 .. q^4 that approximate an effect over a joint's range, nearly minimax."""
-    lower, upper = arm.position_lower[joint], arm.position_upper[joint]
+    """Returns coefficients (5,) of 1, q, ..., q^4 that approximate an effect over a joint's range.
 
+    Interpolation at Chebyshev nodes makes the largest error nearly minimal.
+    """
+    lower, upper = arm.position_lower[joint], arm.position_upper[joint]
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     x = chebyshev.chebpts1(ORDER + 1)
     along = position_along(arm, effect.coordinate, (middle + half * x)[:, None] * np.eye(NUM_JOINTS)[joint])
@@ -238,59 +251,60 @@ def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np
     return np.resize(np.append(polynomial.coef, np.zeros(ORDER + 1)), ORDER + 1)
 
 
-def _refuse_errors(
+def _check_errors(
     model: IdentifiedModel,
     gravity: NDArray[np.float64],
     effects: NDArray[np.float64],
     poses: NDArray[np.float64],
     tolerance: float,
 ) -> None:
-    """Raises ModelError with the errors of the gravity and effect parameters (40,) over the joint box."""
+    """Raises ModelError if the error of gravity and effect parameters (40,) at `poses` (m, 7) exceeds `tolerance`."""
     R, tau = controller_regressor(poses), _gravity_torque(model, poses)
-    gravity_off = np.abs(R @ gravity - tau).max(axis=0)
-    effects_off = np.abs(R @ effects - (model.holding_torque(poses) - tau)).max(axis=0)
+    gravity_error = np.abs(R @ gravity - tau).max(axis=0)
+    effects_error = np.abs(R @ effects - (model.holding_torque(poses) - tau)).max(axis=0)
     error = np.abs(R @ (gravity + effects) - model.holding_torque(poses)).max(axis=0)
     if not error.max() > tolerance:
         return
     least = min(tolerance, 1e-6)
-    off = ", ".join(f"{name} {e:.2g}" for name, e in zip(MTM_JOINTS, error, strict=True) if e > least)
+    errors = ", ".join(f"{name} {e:.2g}" for name, e in zip(MTM_JOINTS, error, strict=True) if e > least)
     down = model.arm.gravity
-    lean = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
+    tilt = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
     limits = ["a last link balanced about its roll axis"]
-    if lean > 0.05:
-        limits.append(f"an upright base, here tilted by {lean:.1f} deg")
+    if tilt > 0.05:
+        limits.append(f"an upright base instead of one tilted by {tilt:.1f} deg")
     if np.any((model.feedforward_scale != 0) & (model.feedforward_scale != 1)):
-        limits.append("no feedforward scale below 1")
+        limits.append("feedforward scales of 0 or 1")
     reasons = {
-        f"gravity {gravity_off.max():.2g} (the file supports {', '.join(limits)})": gravity_off.max(),
-        f"effects {effects_off.max():.2g} (it supports polynomials of order 4 in a joint's own position, nothing at "
-        "joint 7)": effects_off.max(),
+        f"gravity {gravity_error.max():.2g} N m (the file requires {', '.join(limits)})": gravity_error.max(),
+        f"effects {effects_error.max():.2g} N m (the file supports polynomials of order 4 in a joint's own position, "
+        "and no torque at joint 7)": effects_error.max(),
     }
     raise ModelError(
-        "the controller's file cannot hold this model: over the joint box it would be off by up to "
-        f"{off} N m. Of that: {', '.join(reason for reason, size in reasons.items() if size > least)}. "
-        f"{_estimates_note(model)}To accept it, repeat the command with --gc-tolerance {round_up(error.max()):g}"
+        f"the controller's file cannot represent this model: the largest errors are {errors} N m. "
+        f"Errors by cause: {', '.join(reason for reason, size in reasons.items() if size > least)}. "
+        f"{_estimates_note(model)}To accept the errors, repeat the command with "
+        f"--gc-tolerance {round_up(error.max()):g}"
     )
 
 
 def _estimates_note(model: IdentifiedModel) -> str:
-    """Returns a note for a model that was not identified and uses estimated masses."""
+    """Returns advice for a model with the masses of the SDF, or "" for an identified model."""
     if model.provenance.method != "nominal":
         return ""
     return (
-        "The masses are estimates of the SDF, not of your arm: better identify it first (dvrk-drake identify) and "
-        "export that model. "
+        "This model has the estimated masses of the SDF. Identify your arm first (dvrk-drake identify) and export the "
+        "identified model. "
     )
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raises ModelError unless the tolerance is a non-negative number."""
+    """Raises ModelError unless the tolerance is finite and not negative."""
     if not 0 <= tolerance < np.inf:
-        raise ModelError(f"--gc-tolerance is {tolerance:g}; allowed: a number of N m from 0")
+        raise ModelError(f"--gc-tolerance is {tolerance:g}; allowed: a finite number of 0 or more [N m, N]")
 
 
 def round_up(x: float) -> float:
-    """Returns x rounded up to two digits."""
+    """Returns x rounded up to two significant digits."""
     unit = 10.0 ** (np.floor(np.log10(x)) - 1)
     return float(np.ceil(x / unit) * unit)
 
@@ -305,7 +319,7 @@ def _torque_limits(
     return lower, upper
 
 
-def _seven(name: str, values: tuple[float, ...]) -> NDArray[np.float64]:
+def _checked_values(name: str, values: tuple[float, ...]) -> NDArray[np.float64]:
     if len(values) != NUM_JOINTS or not np.all(np.isfinite(values)) or min(values) < 0:
         raise ModelError(f"{name} must be {NUM_JOINTS} numbers of 0 or more, one per joint")
     return np.array(values, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Compares the dVRK's installed gravity compensation of a master arm with an identified model."""
+"""Compares a gravity-compensation file of the dVRK's controller for an MTM with an identified model."""
 
 from __future__ import annotations
 
@@ -19,22 +19,24 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
 from dvrk_drake.models.arm import known_arms
 
-#: Signs of the joints and their torques in the mirror image of an arm. The wrist of a left MTM mirrors that of a right.
+#: Signs of joint positions and torques in the mirror image of an arm. MTML and MTMR have mirrored wrists.
 _MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
-#: Joints whose torque distinguishes left from right: shoulder_pitch, elbow_pitch and wrist_platform.
-_TELLS_SIDE = slice(1, 4)
-#: The mirror image fits clearly better if its error is below this share; of the four public files the wrong
-#: side has 1.8 to 2.1 times the error of the right one.
-_CLEARLY_BETTER = 0.8
+#: Joints with different torques on MTML and MTMR: shoulder_pitch, elbow_pitch and wrist_platform.
+_SIDE_JOINTS = slice(1, 4)
+#: Largest ratio of errors at which the mirror image fits clearly better. For the four public files, the error of a
+#: model of the wrong side is 1.8 to 2.1 times the error of a model of the correct side.
+_MAX_ERROR_RATIO = 0.8
+#: Number of poses inside the sweep of the file that are required to compare the sides only there.
 _MIN_POSES = 200
 #: Smallest torque whose sign is compared, as a share of the model's largest torque on that joint.
 SIGN_SHARE = 0.1
+#: Number of random poses.
 POSES = 20000
 
 
 @dataclass(frozen=True)
 class JointComparison:
-    """Comparison of one joint over the joint box, at rest. Torques are in N m, shares of the poses are 0..1.
+    """Comparison of one joint at rest, within the joint limits. Torques are in N m. Shares of the poses are 0 to 1.
 
     Attributes:
         name: Name of the joint.
@@ -42,13 +44,13 @@ class JointComparison:
         file_lower, file_upper: Range of the file's torque before clipping.
         clip_lower, clip_upper: Torque limits of the file.
         clipped: Share of poses at which the torque of the file is at a limit and therefore constant.
-        opposed: share of poses at which file (clipped) and model push opposite ways, both by more than a tenth of the
-            model's largest torque.
-        runaway: share of poses at which the file (unclipped) lies outside the model's range widened by half of it on
-            both sides: a torque that the model has nowhere on this joint. Not of the last joint, which no file has.
+        opposed: Share of poses at which the torques of the file after clipping and of the model have opposite signs.
+            Both must exceed `SIGN_SHARE` of the model's largest torque.
+        runaway: Share of poses at which the torque of the file before clipping is far outside the model's range. The
+            range is widened by half of its width at both ends. 0 for the last joint, which has no torque in the file.
         polynomial: Largest |torque| of the file's polynomial in the joint position, without the constant.
-        rms_inside, rms_outside: RMS of file (clipped) less model inside and outside of the sweep that the file says
-            its data are from; if it does not say, all poses are outside. NaN where there are no such poses.
+        rms_inside, rms_outside: RMS difference between file (clipped) and model at poses inside and outside the file's
+            sweep. Without a sweep, all poses are outside. NaN if there are no such poses.
     """
 
     name: str
@@ -96,16 +98,16 @@ class CompensationComparison:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about the file, one line each."""
+        """Warnings about the file."""
         if not self.other_side:
             return ()
         return (
-            "the mirror image of the model fits better: the file is probably one of the other side's arm, not of "
-            f"{self.model.arm.name}. Check ARM_NAME and the serial number",
+            "the mirror image of the model fits better. The file is probably of an arm of the other side (left or "
+            f"right), not of {self.model.arm.name}. Check ARM_NAME and the serial number",
         )
 
     def as_dict(self) -> dict:
-        """Returns the comparison for JSON. NaN becomes None."""
+        """Returns the comparison as a dictionary for JSON, with None instead of NaN."""
         joints = [{k: None if v != v else v for k, v in asdict(j).items()} for j in self.joints]
         return {
             "poses": len(self.q),
@@ -116,33 +118,33 @@ class CompensationComparison:
 
 
 def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) -> CompensationComparison:
-    """Compares file and model at random poses, uniform in the joint box and inside the coupled limits.
+    """Compares the torques of file and model at random poses, uniformly distributed within the joint limits.
 
     Raises:
-        ModelError: The model is not of an MTM, or the name in the file is that of another arm of this project.
+        ModelError: The model is not of an MTM, or the file is of another arm.
     """
     arm = model.arm
     if arm.joint_names != MTM_JOINTS:
-        raise ModelError(f"{arm.name}: a gravity-compensation file of the dVRK is one of an MTM; joints differ")
+        raise ModelError(f"{arm.name} is not an MTM; only the gravity-compensation file of an MTM can be compared")
     known = [name.upper() for name in known_arms()]
     if file.arm_name.upper() != arm.name.upper() and {file.arm_name.upper(), arm.name.upper()} <= set(known):
         raise ModelError(
-            f"the file is of {file.arm_name}, by its ARM_NAME or its file name, but the model is of {arm.name}, and "
-            f"their torques differ. Use a model of {file.arm_name}; if the name is wrong, correct it in the file"
+            f"the file is of {file.arm_name} (ARM_NAME or file name), but the model is of {arm.name}. "
+            f"Use a model of {file.arm_name}, or correct ARM_NAME in the file"
         )
     q = arm.sample_poses(POSES, np.random.default_rng(0))
     tau_model, tau_raw, tau_clipped = model.holding_torque(q), unclipped_torque(file, q), controller_torque(file, q)
     half_range = 0.5 * np.ptp(tau_model, axis=0)
-    least = SIGN_SHARE * np.abs(tau_model).max(axis=0)
+    threshold = SIGN_SHARE * np.abs(tau_model).max(axis=0)
     clipped = tau_raw != tau_clipped
-    opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > least) & (np.abs(tau_clipped) > least)
+    opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > threshold) & (np.abs(tau_clipped) > threshold)
     runaway = (tau_raw < tau_model.min(axis=0) - half_range) | (tau_raw > tau_model.max(axis=0) + half_range)
-    # A joint without gravity has no range to leave, and for the last joint the file says nothing.
-    judged = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
-    runaway, opposed = runaway & judged, opposed & judged
+    # A joint without gravity torque has no range, and the file does not compensate the last joint.
+    compared = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
+    runaway, opposed = runaway & compared, opposed & compared
     in_sweep = np.zeros(len(q), dtype=bool)
     if file.sweep is not None:
-        # The last joint does not enter the file's torque.
+        # The torque of the file does not depend on the last joint.
         in_sweep = np.all(
             (q >= file.sweep[0]) & (q <= file.sweep[1]), axis=1, where=np.arange(NUM_JOINTS) < NUM_JOINTS - 1
         )
@@ -185,21 +187,24 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
 def _is_of_other_side(
     model: IdentifiedModel, q: NDArray[np.float64], tau_file: NDArray[np.float64], in_sweep: NDArray[np.bool_]
 ) -> bool:
-    """Returns whether the mirror image of the model fits a file's torque clearly better, where the file has data."""
+    """Returns whether the mirror image of the model fits the torque of a file clearly better than the model.
+
+    Only poses inside the file's sweep are compared, if there are at least `_MIN_POSES` of them.
+    """
     if np.count_nonzero(in_sweep) >= _MIN_POSES:
         q, tau_file = q[in_sweep], tau_file[in_sweep]
-    own, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
-    return _side_error(tau_file, mirrored) < _CLEARLY_BETTER * _side_error(tau_file, own)
+    unmirrored, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
+    return _side_error(tau_file, mirrored) < _MAX_ERROR_RATIO * _side_error(tau_file, unmirrored)
 
 
 def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:
-    """Returns the RMS error over the joints that distinguish the sides, relative to the RMS of the file's torque."""
-    size = np.sqrt(np.mean(tau_file[:, _TELLS_SIDE] ** 2, axis=0)) + 1e-12
-    return _rms((tau_file - tau_model)[:, _TELLS_SIDE] / size)
+    """Returns the RMS error over `_SIDE_JOINTS`, relative to the RMS torque of the file."""
+    size = np.sqrt(np.mean(tau_file[:, _SIDE_JOINTS] ** 2, axis=0)) + 1e-12
+    return _rms((tau_file - tau_model)[:, _SIDE_JOINTS] / size)
 
 
 def _polynomial_torque(file: GravityCompensationFile, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the torque (m, 7) of the powers q .. q^4 at rest [N m]."""
+    """Returns the torque (m, 7) of the file's polynomials at rest, without their constants [N m]."""
     parameters = (file.positive + file.negative) / 2
     parameters[:NUM_GRAVITY] = 0.0
     parameters[NUM_GRAVITY::5] = 0.0

@@ -1,4 +1,4 @@
-"""File of the dVRK controller for gravity compensation of a master arm: `gc-MTML-<serial>.json`."""
+"""Gravity-compensation file `gc-MTML-<serial>.json` of the dVRK's controller for an MTM."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from dvrk_drake.models.schema_fault import number_fault, within
 
 VERSION = "2.0"
 NUM_JOINTS = 7
-#: Ten gravity terms, then 1, q, q^2, q^3, q^4 of each of the first six joints.
+#: Number of parameters: ten of gravity, then five polynomial coefficients of each of the first six joints.
 NUM_PARAMETERS = 40
 _CONTROLLER = "GC_controller"
-#: Information for users. The controller does not read it.
+#: Key of the arm's name. The controller does not read it.
 _ARM_NAME = "ARM_NAME"
-#: Our names -> the file's, one of which is misspelled in the controller's source.
+#: Field of `GravityCompensationFile` -> key in the file. "sat_vec_vec" is spelled as in the controller's source.
 _KEYS = {
     "positive": "gc_dynamic_params_pos",
     "negative": "gc_dynamic_params_neg",
@@ -32,25 +32,25 @@ _KEYS = {
     "friction_ratio": "fric_comp_ratio_vec",
 }
 _LENGTHS = {"positive": NUM_PARAMETERS, "negative": NUM_PARAMETERS}
-#: Not read by the controller: the sweep in which the file's data were collected [deg].
+#: Keys of the joint ranges of the recording [deg]. The controller does not read them.
 _SWEEP_KEYS = ("joint_position_lower_limit", "joint_position_upper_limit")
 
-#: An MTM's are up to 24 N m: of the polynomials in the joint positions.
+#: Allowed range of the parameters. Polynomial coefficients in public files are up to 24 N m.
 _PARAMETERS = within(-1e4, 1e4, "N m")
 
 
 @dataclass(frozen=True, eq=False)
 class GravityCompensationFile:
-    """Content of the file. `export.dvrk_mtm_gravity_compensation` has the controller's formula.
+    """Content of the file. `unclipped_torque` and `controller_torque` implement the controller's formula.
 
     Attributes:
-        positive, negative: Parameters (40,) for positive and negative joint velocity.
-        torque_lower, torque_upper: Limits (7,) of the torque [N m].
-        dead_band: Speeds (7,) [rad/s] up to which both parameters have equal weight.
-        saturation: Speeds (7,) [rad/s] from which the weights differ by the full `friction_ratio`.
-        friction_ratio: Share (7,), 0..1, of the friction that is compensated in motion.
-        sweep: Lower and upper joint positions (2, 7) [rad] of the data of the file, if the file states them.
-        arm_name: Name of the arm in the file (ARM_NAME), otherwise in the file name. Empty if neither has one.
+        positive, negative: Parameters (40,) for positive and negative joint velocities.
+        torque_lower, torque_upper: Torque limits (7,) [N m].
+        dead_band: Speeds (7,) [rad/s] below which both parameter vectors have equal weight.
+        saturation: Speeds (7,) [rad/s] above which the weights differ by `friction_ratio`.
+        friction_ratio: Compensated shares (7,) of the friction in motion, 0 to 1.
+        sweep: Lower and upper joint positions (2, 7) [rad] of the recording. None if the file does not contain them.
+        arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if both are missing.
     """
 
     positive: NDArray[np.float64] = field(metadata=_PARAMETERS)
@@ -64,10 +64,10 @@ class GravityCompensationFile:
     arm_name: str = ""
 
     def check(self) -> None:
-        """Checks lengths, finite numbers and order, which the controller does not check before it commands motors.
+        """Checks lengths, ranges and order of all fields. The controller commands motors without these checks.
 
         Raises:
-            ModelError: A field is invalid. The message contains its name and the accepted values.
+            ModelError: A field is invalid. The message contains the key and the allowed values.
         """
         for name, key in _KEYS.items():
             length = _LENGTHS.get(name, NUM_JOINTS)
@@ -77,10 +77,18 @@ class GravityCompensationFile:
         if fault := number_fault(self):
             name = fault.split("[")[0]
             raise ModelError(fault.replace(name, _KEYS.get(name, name), 1))
-        if not np.all(self.torque_lower <= self.torque_upper):
-            raise ModelError("safe_lower_torque_limit must not exceed safe_upper_torque_limit")
-        if not np.all(self.dead_band < self.saturation):
-            raise ModelError("db_vel_vec must be below sat_vec_vec [rad/s]")
+        for joint in range(NUM_JOINTS):
+            lower, upper = self.torque_lower[joint], self.torque_upper[joint]
+            if lower > upper:
+                raise ModelError(
+                    f"safe_lower_torque_limit[{joint}] ({lower:g}) must not exceed "
+                    f"safe_upper_torque_limit[{joint}] ({upper:g}) [N m]"
+                )
+            dead_band, saturation = self.dead_band[joint], self.saturation[joint]
+            if dead_band >= saturation:
+                raise ModelError(
+                    f"db_vel_vec[{joint}] ({dead_band:g}) must be below sat_vec_vec[{joint}] ({saturation:g}) [rad/s]"
+                )
 
     @classmethod
     def load(cls, path: str | Path) -> GravityCompensationFile:
@@ -92,11 +100,11 @@ class GravityCompensationFile:
         content = read_json_input(path, ModelError)
         controller = content.get(_CONTROLLER) if isinstance(content, dict) else None
         if not isinstance(controller, dict):
-            raise ModelError(f"{path}: has no {_CONTROLLER}: not a gravity-compensation file of the dVRK")
+            raise ModelError(f"{path}: has no key {_CONTROLLER}, so it is not a gravity-compensation file of an MTM")
         if content.get("version") != VERSION:
-            raise ModelError(f'{path}: version is {content.get("version")!r}, this reads "{VERSION}"')
+            raise ModelError(f'{path}: version is {content.get("version")!r}; allowed: "{VERSION}"')
         if missing := [key for key in _KEYS.values() if key not in controller]:
-            raise ModelError(f"{path}: {_CONTROLLER} lacks {', '.join(missing)}")
+            raise ModelError(f"{path}: keys missing in {_CONTROLLER}: {', '.join(missing)}")
         file = cls(
             **{name: _numbers(controller[key]) for name, key in _KEYS.items()},
             sweep=_sweep(controller),
@@ -109,15 +117,15 @@ class GravityCompensationFile:
         return file
 
     def save(self, path: str | Path, arm_name: str, origin: str) -> None:
-        """Writes the file at once or not at all.
+        """Writes the file atomically.
 
         Args:
-            path: where to.
-            arm_name: as the dVRK names the arm, e.g. "MTML"; for people, the controller does not read it.
-            origin: what the numbers come from, likewise.
+            path: Path of the file.
+            arm_name: Name of the arm, e.g. "MTML". The controller does not read it.
+            origin: Source of the parameters. The controller does not read it.
 
         Raises:
-            ModelError: the numbers are not what the controller needs.
+            ModelError: `check` failed.
         """
         self.check()
         lines = [f'    "{key}": {json.dumps(getattr(self, name).tolist())}' for name, key in _KEYS.items()]
@@ -132,13 +140,13 @@ def _numbers(value: object) -> NDArray[np.float64]:
     try:
         return np.atleast_1d(np.array(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
-        return np.empty(0)  # refused by check(), which names the field
+        return np.empty(0)  # check() rejects this length with the key in the message
 
 
-def _arm_name(stated: object, file_name: str) -> str:
-    """Returns the stated name, or that of an arm of this project in the name of the file."""
-    if isinstance(stated, str) and stated:
-        return stated
+def _arm_name(value: object, file_name: str) -> str:
+    """Returns the value of ARM_NAME, or else the name of an arm of this package in the file name, or ""."""
+    if isinstance(value, str) and value:
+        return value
     return next((name.upper() for name in known_arms() if name in file_name.lower()), "")
 
 

@@ -1,10 +1,12 @@
-"""The file that the dVRK's controller compensates the gravity of a PSM with: its linkage as a chain of seven links.
+"""Gravity-compensation file of the dVRK's controller for a PSM, which models the linkage as a serial chain.
 
-The controller moves the chain by [q1, 0, q2, -q2, q2, q3/2, q3/2], computes the torques t1..t7 that hold it, and takes
-[t1, t3 - t4 + t5, t7] for yaw, pitch and insertion. So link 3 is the back crank, link 4 the bar, link 5 the end link;
-the parallelograms' other bars and the counterweight, which the chain lacks, are moments of these. Link 7 is all that
-the insertion lifts, less the counterweight; link 6 weighs nothing, as the weight that it would add at half the speed
-is not in t7.
+The chain has seven links. The controller sets its joint positions to [q1, 0, q2, -q2, q2, q3/2, q3/2], where q1..q3 are
+yaw, pitch and insertion. From the holding torques t1..t7 of the chain, it uses [t1, t3 - t4 + t5, t7] for these joints.
+
+Link 3 is the back crank, link 4 the bottom bar and link 5 the end link. The chain has no links for the other bars of
+the parallelograms and for the counterweight. The first moments of the other links therefore include these parts. The
+mass of link 7 is the mass that the insertion joint carries minus the counterweight. Link 6 has no mass: it moves at
+half of the insertion speed, and t7 does not include its weight.
 """
 
 from __future__ import annotations
@@ -33,28 +35,32 @@ CHAIN_FROM_ARM = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0], [0, 1, 0
 #: Matrix from the joint torques of the chain to those of yaw, pitch and insertion.
 ARM_FROM_CHAIN = np.array([[1, 0, 0, 0, 0, 0, 0], [0, 0, 1, -1, 1, 0, 0], [0, 0, 0, 0, 0, 0, 1]])
 PRISMATIC = np.array([False] * 5 + [True] * 2)
-#: Link of the chain -> bodies of the arm whose mass it gets.
+#: Index of a link of the chain -> bodies of the arm that it represents.
 _BODIES = {
     0: ("yaw_link",),
     2: ("back_crank_link", "front_crank_link"),
     3: ("bottom_bar_link", "top_bar_link"),
     4: ("end_link",),
 }
-#: Links of the chain whose first moments are fitted; that of the last is that of what the insertion carries.
+#: Links of the chain whose first moments are fitted. The last link has those of the bodies on the insertion joint.
 _FITTED = tuple(_BODIES)
 _LAST = 6
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicCompensation:
-    """Modified DH, X_(i-1)i = Rx(alpha) Tx(A) Rz(theta) Tz(D), and the mass of each of the seven links.
+    """Chain of seven links for the dVRK's controller, in modified DH convention.
+
+    The pose of link i in link i - 1 is Rx(alpha) Tx(A) Rz(theta) Tz(D).
 
     Attributes:
         alpha, A, theta, D: DH parameters (7,) at zero joint positions [rad, m].
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
-        error: (3,) largest difference from the model over the joint box, instrument straight [N m, N m, N].
-        wrist: (3,) largest torque that the instrument's own joints add or take, which the file cannot represent.
+        error: Largest torque errors (3,) of yaw, pitch and insertion within the joint limits, with a straight
+            instrument [N m, N m, N].
+        wrist: Largest torques (3,) on yaw, pitch and insertion due to the positions of the instrument joints, which the
+            file does not represent [N m, N m, N].
     """
 
     alpha: NDArray[np.float64]
@@ -67,7 +73,7 @@ class KinematicCompensation:
     wrist: NDArray[np.float64]
 
     def save(self, path: str | Path) -> None:
-        """Writes the file at once or not at all."""
+        """Writes the file atomically."""
         joints = [
             {
                 "name": name,
@@ -88,32 +94,38 @@ class KinematicCompensation:
 
 
 def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> KinematicCompensation:
-    """Converts gravity on yaw, pitch and insertion, with a straight instrument, to the controller's file.
+    """Converts the gravity torque of yaw, pitch and insertion, with a straight instrument, to the controller's file.
+
+    Args:
+        model: Model of a PSM.
+        tolerance: Accepted torque error [N m, N], e.g. due to joint effects or a feedforward scale below 1.
 
     Raises:
-        ModelError: not the model of a PSM, a counterweight that outweighs all that the insertion carries, or an error
-            above `tolerance` [N m, N]: joint effects, feedforward scale below 1.
+        ModelError: The model is not of a PSM, the net mass on the insertion joint is not positive, or the error exceeds
+            `tolerance`.
     """
     arm = model.arm
     plant = shared_plant(arm)
     if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
-        raise ModelError(f"{arm.name}: the controller's kinematic compensation file is one of a PSM; joints differ")
+        raise ModelError(
+            f"{arm.name} is not a PSM, so the format dvrk-kinematic-gc is not possible. An MTM needs dvrk-gc"
+        )
     check_tolerance(tolerance)
     alpha, A, theta, D = _chain(plant)
     q = arm.sample_poses(600, np.random.default_rng(0))
     straight = np.where(np.arange(arm.num_joints) < 3, q, 0.0)
     beta = np.array([p.value for p in model.base_parameters])
     tau = (model.feedforward_scale * (model.static_model.regressor(straight)[:, :, : len(beta)] @ beta))[:, :3]
-    # (m, 3, 7, 4) torque on yaw, pitch and insertion per mass and first moment of each link of the chain.
+    # (m, 3, 7, 4): torque on yaw, pitch and insertion per unit of mass and first moments of each link of the chain.
     frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
     Y = np.array([_regressor(X, arm.gravity) for X in frames])
-    mass, moment = _prior(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
-    lifted = Y[:, 2, _LAST, 0]
-    mass_7 = float(lifted @ tau[:, 2] / (lifted @ lifted))
+    mass, moment = _initial_links(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
+    mass_column = Y[:, 2, _LAST, 0]
+    mass_7 = float(mass_column @ tau[:, 2] / (mass_column @ mass_column))
     if not mass_7 > 0:
         raise ModelError(
-            f"{arm.name}: the counterweight outweighs what the insertion carries by {-mass_7:.3g} kg; the controller's "
-            "file has no negative mass"
+            f"{arm.name}: the net mass on the insertion joint is {mass_7:.3g} kg because of the counterweight. The "
+            "controller's file requires a positive mass; check the base parameters of the model"
         )
     moment[_LAST] *= mass_7 / mass[_LAST]
     mass[_LAST] = mass_7
@@ -124,11 +136,11 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     tau_model = model.holding_torque(straight)[:, :3]
     error = np.abs(np.einsum("mjlk,lk->mj", Y, known) - tau_model).max(axis=0)
     if error.max() > tolerance:
-        off = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
+        errors = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
         raise ModelError(
-            f"the controller's file cannot hold this model: over the joint box it would be off by up to {off} "
-            "(N m; N on insertion). It has gravity only, and no feedforward scale below 1; left out: "
-            f"{_left_out(model, straight)}. To accept it, repeat the command with "
+            f"the controller's file cannot represent this model: the largest errors are {errors} [N m, N]. "
+            "The file supports only gravity with a feedforward scale of 1. Effects that are not represented: "
+            f"{_omitted_effects(model, straight)}. To accept the errors, repeat the command with "
             f"--gc-tolerance {round_up(error.max()):g}"
         )
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
@@ -136,16 +148,19 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     return KinematicCompensation(alpha, A, theta, D, mass, center, error, wrist)
 
 
-def _left_out(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
-    """Lists the effects on yaw, pitch and insertion at rest, with the largest torque of each at poses q (m, n)."""
+def _omitted_effects(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
+    """Returns the effects on yaw, pitch and insertion as text, with their largest torques at poses q (m, n)."""
     gravity = len(model.base_parameters)
     tau = np.abs(model.static_model.regressor(q)[:, :3, gravity:] * model.theta[gravity:]).max(axis=(0, 1))
-    said = [f"{ActuatorEffect.of(e)} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
-    return ", ".join(said) or "no effects"
+    described = [f"{ActuatorEffect.of(e)} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
+    return ", ".join(described) or "none"
 
 
 def _chain(plant: MultibodyPlant) -> tuple[NDArray[np.float64], ...]:
-    """alpha, A, theta, D from where the SDF's joints are at home; the linkage lies in the plane x = 0."""
+    """Returns alpha, A, theta and D (7,) from the joint frames of the SDF at zero positions.
+
+    The linkage moves in the plane x = 0 of the base frame.
+    """
     context = plant.CreateDefaultContext()
     p_A, p_B, p_E = (
         plant.GetJointByName(name).frame_on_child().CalcPoseInWorld(context).translation()
@@ -153,7 +168,7 @@ def _chain(plant: MultibodyPlant) -> tuple[NDArray[np.float64], ...]:
     )
     p_3 = plant.GetFrameByName("dh_3").CalcPoseInWorld(context).translation()
     crank, bar = p_B - p_A, p_E - p_B
-    # Frame 2 stands in the remote centre of motion, x to the rear (-y), y up, z along the pitch axis (-x).
+    # Frame 2 has its origin at the remote centre of motion. Its x, y and z axes are -y, z and -x of the base frame.
     crank_angle, bar_angle = (np.arctan2(v[2], -v[1]) for v in (crank, bar))
     half, whole = np.pi / 2, np.pi
     alpha = np.array([half, -half, 0, 0, 0, -half, 0])
@@ -189,7 +204,10 @@ def _frames(
 
 
 def _regressor(X: NDArray[np.float64], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 7, 4) torque on yaw, pitch, insertion per mass and first moment of each link that holds the chain at X."""
+    """Returns holding torques (3, 7, 4) of yaw, pitch and insertion per unit of mass and first moments of each link.
+
+    X (7, 4, 4) are the poses of the link frames, and `gravity` (3,) is in the base frame [m/s^2].
+    """
     chain = np.zeros((len(NAMES), len(NAMES), 4))
     for joint in range(len(NAMES)):
         z, origin = X[joint, :3, 2], X[joint, :3, 3]
@@ -198,20 +216,24 @@ def _regressor(X: NDArray[np.float64], gravity: NDArray[np.float64]) -> NDArray[
             if PRISMATIC[joint]:
                 chain[joint, link, 0] = -z @ gravity
             else:
-                # -z . (r x g) = -(g x z) . r of the point r = p - origin, or per axis of the first moment
+                # The torque of a unit mass at r = p - origin is -z . (r x g) = -(g x z) . r, which is linear in r.
                 lever = -np.cross(gravity, z)
                 chain[joint, link] = lever @ (p - origin), *(lever @ R)
     return np.einsum("jk,klm->jlm", ARM_FROM_CHAIN, chain)
 
 
-def _prior(
+def _initial_links(
     links: tuple[LinkInertia, ...], plant: MultibodyPlant, home: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Masses (7,) and first moments (7, 3) in the DH frames of the bodies that the chain's links stand for, at home."""
+    """Returns masses (7,) [kg] and first moments (7, 3) [kg m] of the links of the chain, before the fit.
+
+    Each link has the mass of the bodies that it represents. First moments are at zero positions, in the DH frames with
+    the poses `home` (7, 4, 4).
+    """
     context = plant.CreateDefaultContext()
     by_name = {link.link: link.parameters for link in links}
     if missing := {name for names in _BODIES.values() for name in names} - set(by_name):
-        raise ModelError(f"the SDF has no link {', '.join(sorted(missing))}, as every PSM of the dVRK has")
+        raise ModelError(f"the SDF has no link {', '.join(sorted(missing))}, which a PSM must have")
     others = set(by_name) - {name for names in _BODIES.values() for name in names} - {"counterweight_link"}
     mass, moment = np.zeros(7), np.zeros((7, 3))
     for i, names in {**_BODIES, _LAST: tuple(others)}.items():

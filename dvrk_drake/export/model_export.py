@@ -22,14 +22,14 @@ Format = Literal["sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc"]
 
 @dataclass(frozen=True, eq=False)
 class ModelExport:
-    """Model converted to a file format.
+    """Content of an exported file.
 
     Attributes:
         model: Model that is exported.
         format: Format of the file.
         origin: Source of the model, written to the file.
-        bodies: Links and rotors of an SDF or URDF, and effects that these formats cannot represent. Otherwise None.
-        compensation: Content of a file of the dVRK's controller. Otherwise None.
+        bodies: Links, rotors and omitted effects of an SDF or URDF. None for other formats.
+        compensation: Content of a file for the dVRK's controller. None for SDF and URDF.
     """
 
     model: IdentifiedModel
@@ -39,14 +39,14 @@ class ModelExport:
     compensation: GravityCompensationFile | KinematicCompensation | None = None
 
     def write(self, path: str | Path) -> None:
-        """Writes the file at once or not at all; an existing one is replaced.
+        """Writes the file atomically and replaces an existing file.
 
         Args:
-            path: the file. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside it.
+            path: Path of the file. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside the file.
 
         Raises:
-            DvrkDrakeError: the file cannot be written.
-            ModelError: something in the arm's SDF that URDF cannot state.
+            DvrkDrakeError: The file cannot be written.
+            ModelError: URDF does not support a part of the arm's SDF.
         """
         arm = self.model.arm
         if self.bodies is not None:
@@ -69,7 +69,7 @@ def prepare_export(
     dead_band: Sequence[float] | None = None,
     saturation: Sequence[float] | None = None,
 ) -> ModelExport:
-    """Computes the content of the file of `export_model`, which documents arguments and errors."""
+    """Returns the content that `export_model` writes. See `export_model` for arguments and errors."""
     origin = origin or f"a model of {model.arm.name}"
     if format in ("sdf", "urdf"):
         return ModelExport(model, format, origin, bodies=model_bodies(model))
@@ -107,19 +107,22 @@ def export_model(
 
     Args:
         model: Model from `identify`, `IdentifiedModel.load`, or `IdentifiedModel.from_arm`.
-        path: Path of the file. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside it.
-        format: "sdf", "urdf", or a file of the dVRK's controller: "dvrk-gc", the gravity compensation of an MTM, or
-            "dvrk-kinematic-gc", that of a PSM. By default what the path ends in: .sdf or .urdf.
+        path: Path of the file. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside the file.
+        format: "sdf", "urdf", "dvrk-gc" or "dvrk-kinematic-gc". The last two are the gravity-compensation files of the
+            dVRK's controller for an MTM and for a PSM. None selects SDF or URDF by the file name extension.
         origin: Source of the model, written to the file.
-        tolerance: error [N m; N] that is accepted where a file of the dVRK cannot state what the model states. Default:
+        tolerance: Accepted torque error [N m, N] of a dVRK file that does not represent the model exactly. None means
             1e-6.
-        friction: for "dvrk-gc": compensate the dry friction of the model's dynamics, or these (7,) values [N m].
-        friction_ratio, dead_band, saturation: for "dvrk-gc": (7,) shares of it to compensate [1], and speeds between
-            which the compensation rises [rad/s]. Default: as in files in use.
+        friction: Coulomb friction (7,) [N m] to compensate, for "dvrk-gc". True uses the dry friction of the model's
+            dynamics, False no friction.
+        friction_ratio: Compensated share (7,) of the friction, 0 to 1, for "dvrk-gc". None uses typical values.
+        dead_band: Speeds (7,) [rad/s] below which no friction is compensated, for "dvrk-gc". None uses typical values.
+        saturation: Speeds (7,) [rad/s] above which the full share is compensated, for "dvrk-gc". None uses typical
+            values.
         overwrite: Replaces an existing file.
 
     Returns:
-        What was written: `bodies` with what an SDF or URDF cannot state as `bodies.left_out`, or `compensation`.
+        Content of the written file. `bodies.left_out` describes effects that an SDF or URDF does not represent.
 
     Raises:
         ModelError: The format is unknown or cannot represent the model.
@@ -135,7 +138,7 @@ def export_model(
     if format is None:
         suffix = Path(path).suffix
         if suffix not in (".sdf", ".urdf"):
-            raise ModelError(f"{path}: its format is not clear; state one of {', '.join(get_args(Format))}")
+            raise ModelError(f"{path}: the format is not given; give one of {', '.join(get_args(Format))}")
         format = "sdf" if suffix == ".sdf" else "urdf"
     refuse_existing(path, overwrite)
     if format in ("sdf", "urdf"):

@@ -1,4 +1,4 @@
-"""SDF of an arm with identified inertial parameters."""
+"""Writes the SDF of an arm with identified inertial parameters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
 from dvrk_drake.models.sdf_model import DRAKE, PACKAGE_URL, compose_sdf, local_path
 
-#: Relative change of rounding errors, below which the text of a link is kept.
+#: Relative change of a parameter below which a link counts as unchanged.
 _UNCHANGED = 1e-12
 
 
@@ -29,7 +29,7 @@ class LinkChange:
 
     Attributes:
         link: Name of the link.
-        before, after: Inertias about the link's origin.
+        before, after: Inertias in the arm's SDF and in the exported file.
     """
 
     link: str
@@ -48,24 +48,25 @@ def changed_links(arm: Arm, links: Sequence[LinkInertia]) -> list[LinkChange]:
     if unknown := set(names) - set(before):
         raise ModelError(f"{arm.name} has no moving link {', '.join(sorted(unknown))}; it has {', '.join(before)}")
     if len(set(names)) < len(names):
-        raise ModelError(f"{arm.name}: a link is given twice: {', '.join(names)}")
+        raise ModelError(f"{arm.name}: each link may be given only once; got {', '.join(names)}")
     changes = (LinkChange(inertia.link, before[inertia.link], inertia) for inertia in links)
-    return [c for c in changes if not _same(c.before.parameters, c.after.parameters)]
+    return [c for c in changes if not _equal_parameters(c.before.parameters, c.after.parameters)]
 
 
 def with_inertias(
     arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mapping[str, float] | None = None
 ) -> ElementTree.Element:
-    """Returns the arm's SDF with instrument as one model with the inertias of `links`. Other links are unchanged.
+    """Returns the SDF of arm and instrument as one model, with the inertias of `links`. Other links are unchanged.
 
     Args:
         arm: Arm whose SDF is changed.
-        links: Inertias of any of its moving links.
-        rotor_inertias: Rotor inertia by joint, as seen at the joint [kg m^2; kg if prismatic], for joints that are
-            driven by one motor alone. Gear ratios are unchanged.
+        links: Inertias of all or some moving links.
+        rotor_inertias: Joint name -> rotor inertia reflected to the joint [kg m^2; kg if prismatic]. The joint must be
+            moved by a single motor. Gear ratios are unchanged. None keeps the rotor inertias of the SDF.
 
     Raises:
-        ModelError: A link does not belong to the arm, an inertia is not physical, or a rotor inertia is negative.
+        ModelError: A link does not belong to the arm, an inertia is not physically consistent, or a rotor inertia is
+            negative.
     """
     root = compose_sdf(arm.sdf, arm.mirrored_links)
     elements = {link.get("name"): link for link in root.iterfind("model/link")}
@@ -88,16 +89,16 @@ def write_sdf(
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
 ) -> None:
-    """Writes `with_inertias`, at once or not at all, and copies of the meshes into the folder <name>_meshes beside it.
+    """Writes the SDF of `with_inertias` atomically, and copies its meshes into the folder <name>_meshes beside it.
 
     Args:
-        arm, links, rotor_inertias: as of `with_inertias`.
-        path: the SDF to write.
-        origin: where the numbers come from, for the comment at its head.
+        arm, links, rotor_inertias: Arguments of `with_inertias`.
+        path: Path of the SDF.
+        origin: Source of the inertias, written as a comment into the first lines.
 
     Raises:
-        ModelError: see `with_inertias`.
-        DvrkDrakeError: a file cannot be written.
+        ModelError: `with_inertias` raises it.
+        DvrkDrakeError: A file cannot be written.
     """
     target = Path(path)
     root = with_inertias(arm, links, rotor_inertias)
@@ -108,7 +109,7 @@ def write_sdf(
 
 
 def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mapping[str, float] | None = None) -> str:
-    """Returns the unified diff from the arm's composed SDF to that of `with_inertias`, empty if nothing changes."""
+    """Returns the unified diff from the arm's SDF to the SDF of `with_inertias`, or "" if nothing changes."""
     before, after = (
         to_text(root).splitlines(keepends=True)
         for root in (compose_sdf(arm.sdf, arm.mirrored_links), with_inertias(arm, links, rotor_inertias))
@@ -117,20 +118,22 @@ def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mappi
 
 
 def to_text(root: ElementTree.Element, comment: str = "") -> str:
-    """Returns the XML file of a model, indented."""
+    """Returns the indented XML text of a model."""
     ElementTree.indent(root)
     head = '<?xml version="1.0"?>\n' + (f"<!-- {comment.replace('--', '- -')} -->\n" if comment else "")
     return head + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def inertial_element(inertia: LinkInertia) -> ElementTree.Element:
-    """Returns `<inertial>` with mass, centre of mass, and inertia about it in the link's axes, in full precision.
+    """Returns the element `<inertial>` in full precision, with the rotational inertia about the centre of mass.
 
     Raises:
-        ModelError: The inertia is not physical.
+        ModelError: The inertia is not physically consistent.
     """
     if not np.linalg.eigvalsh(inertia.pseudo_inertia()).min() > 0:
-        raise ModelError(f"{inertia.link}: no body has this inertia: its pseudo-inertia must be positive definite")
+        raise ModelError(
+            f"{inertia.link}: the inertia is not physically consistent; its pseudo-inertia must be positive definite"
+        )
     M_LLo_L = inertia.to_spatial_inertia()
     p_LoLcm_L = M_LLo_L.get_com()
     I_LLcm_L = M_LLo_L.Shift(p_LoLcm_L).CalcRotationalInertia()
@@ -163,13 +166,13 @@ def _add(parent: ElementTree.Element, tag: str, text: str) -> None:
 
 
 def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
-    """Formats numbers in full precision. Rounding errors relative to the largest number become 0."""
-    least = 1e-15 * max(abs(x) for x in values)
-    return [repr(float(x)) if abs(x) > least else "0" for x in values]
+    """Formats numbers in full precision. Numbers below 1e-15 of the largest one are rounding errors and become 0."""
+    threshold = 1e-15 * max(abs(x) for x in values)
+    return [repr(float(x)) if abs(x) > threshold else "0" for x in values]
 
 
-def _same(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    """Compares mass, first moments and inertia, each relative to its own size."""
+def _equal_parameters(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Returns whether mass, first moments and rotational inertia are equal, each relative to its magnitude."""
     parts = (slice(0, 1), slice(1, 4), slice(4, 10))
     return all(np.abs(a[p] - b[p]).max() <= _UNCHANGED * np.abs(a[p]).max() for p in parts)
 
@@ -178,27 +181,33 @@ _FILE_URL = "file://"
 
 
 def mesh_folder(model_path: Path) -> str:
-    """Returns the name of the mesh folder beside an exported model."""
+    """Returns the name of the mesh folder of an exported model."""
     return f"{model_path.stem}_meshes"
 
 
 def refuse_existing_meshes(model_path: str | Path, overwrite: bool) -> None:
-    """Raises DvrkDrakeError if the folder for a model's meshes contains files, unless they may be replaced."""
+    """Raises DvrkDrakeError if the mesh folder of a model contains files and `overwrite` is False."""
     folder = Path(model_path).with_name(mesh_folder(Path(model_path)))
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise DvrkDrakeError(
-            f"{folder}: holds files already; name another model file, or write into it with --overwrite"
+            f"{folder}: the folder contains files already; give another model file, or replace them with --overwrite"
         )
 
 
 def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, Path]:
-    """Makes every `<uri>` of a composed model relative to `model_path`: meshes in `mesh_folder`.
+    """Replaces every mesh `<uri>` in a composed model by a path in `mesh_folder`, relative to the model.
+
+    URIs of other packages are not changed.
+
+    Args:
+        root: Composed model, which is modified.
+        model_path: Path of the file to which the model will be written.
 
     Returns:
-        file to copy -> where to; what a glTF file refers to comes along. Packages other than ours stay as they are.
+        Source -> target of each file to copy, including the files to which glTF files refer.
 
     Raises:
-        ArmError: a mesh does not exist.
+        ArmError: A mesh does not exist, or two meshes would have the same target.
     """
     copies: dict[Path, Path] = {}
     for uri in root.iter("uri"):
@@ -206,22 +215,25 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
         if source is None:
             continue
         if not os.path.isfile(source):
-            raise ArmError(f"{source}: no such mesh")
+            raise ArmError(f"{source}: the mesh file does not exist")
         relative = Path(mesh_folder(model_path)) / source.parent.name / source.name
         target = model_path.parent / relative
         if copies.setdefault(source, target) != target or list(copies.values()).count(target) > 1:
-            raise ArmError(f"{source}: another mesh of the model has the same name and folder name; rename one")
-        for part in _parts_of(source):
-            copies[source.parent / part] = target.parent / part
+            raise ArmError(f"{source}: another mesh of the model has the same name and folder name; rename one of them")
+        for file in _referenced_files(source):
+            copies[source.parent / file] = target.parent / file
         uri.text = relative.as_posix()
     return copies
 
 
 def copy_meshes(copies: dict[Path, Path]) -> None:
-    """Copies files, each at once or not at all.
+    """Copies each file atomically.
+
+    Args:
+        copies: Source -> target.
 
     Raises:
-        DvrkDrakeError: a file cannot be written.
+        DvrkDrakeError: A file cannot be written.
     """
     for source, target in copies.items():
         if str(source) == os.path.realpath(target):
@@ -229,7 +241,7 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise DvrkDrakeError(f"{target.parent}: cannot be made a folder: {error.strerror}") from error
+            raise DvrkDrakeError(f"{target.parent}: the folder cannot be created: {error.strerror}") from error
         with open_input(source, ArmError) as stream, atomic_write(target, "wb") as copy:
             shutil.copyfileobj(stream, copy)
 
@@ -240,16 +252,16 @@ def _local_path(uri: str) -> Path | None:
     return local_path(uri.removeprefix(_FILE_URL))
 
 
-def _parts_of(mesh: Path) -> list[str]:
-    """Returns the external buffers and images of a glTF file."""
+def _referenced_files(mesh: Path) -> list[str]:
+    """Returns paths of the buffers and images of a glTF file, relative to its folder. Other meshes have none."""
     if mesh.suffix != ".gltf":
         return []
     content = read_json_input(mesh, ArmError, MAX_BINARY)
     try:
-        uris = [part.get("uri", "data:") for kind in ("buffers", "images") for part in content.get(kind, [])]
+        uris = [file.get("uri", "data:") for kind in ("buffers", "images") for file in content.get(kind, [])]
         names = [uri for uri in uris if not uri.startswith("data:")]
     except (AttributeError, TypeError) as error:
-        raise ArmError(f"{mesh}: not a glTF file: its buffers and images must be lists of tables with a uri") from error
+        raise ArmError(f"{mesh}: not a valid glTF file; its buffers and images must be objects with a uri") from error
     if outside := [name for name in names if Path(name).is_absolute() or ".." in Path(name).parts]:
-        raise ArmError(f"{mesh}: refers to {outside[0]}, which is not in its folder; move it there")
+        raise ArmError(f"{mesh}: refers to {outside[0]}, which is outside the folder of the mesh; move that file there")
     return names

@@ -1,4 +1,4 @@
-"""URDF of an arm: the tree of its links, with mimic joints for the linkage."""
+"""Writes the URDF of an arm with identified inertial parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, read_sdf_facts
 
-#: Speed limit for joints whose SDF states none, because URDF requires one [rad/s, m/s].
+#: Speed limit of joints without one in the SDF, because URDF requires a limit [rad/s, m/s].
 NO_SPEED_LIMIT = "1000"
 
 
@@ -27,18 +27,18 @@ def write_urdf(
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
 ) -> None:
-    """Writes the URDF at once or not at all, and copies of the meshes into the folder <name>_meshes beside it.
+    """Writes the URDF atomically, and copies its meshes into the folder <name>_meshes beside it.
 
-    Joints of the linkage become mimic joints. URDF has no closed loops, so only the mimic joints constrain the linkage.
-    A capsule becomes a cylinder and two spheres because URDF has no capsules. Rotor inertias, gear ratios, named frames
-    and collision filters are written as Drake's extensions, which other readers ignore.
+    Dependent joints of the linkage become mimic joints, because URDF does not support closed loops. A capsule becomes a
+    cylinder and two spheres, because URDF does not support capsules. Rotor inertias, gear ratios, named frames and
+    collision filters are written as Drake's extensions, which other readers ignore.
 
     Args:
-        arm, links, path, origin, rotor_inertias: as of `sdf_export.write_sdf`.
+        arm, links, path, origin, rotor_inertias: Arguments of `write_sdf`.
 
     Raises:
-        ModelError: An inertia is not physical, or URDF cannot represent a part of the SDF.
-        DvrkDrakeError: a file cannot be written.
+        ModelError: An inertia is not physically consistent, or URDF does not support a part of the SDF.
+        DvrkDrakeError: A file cannot be written.
     """
     target = Path(path)
     root = with_inertias(arm, links, rotor_inertias)
@@ -50,10 +50,10 @@ def write_urdf(
 
 
 def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
-    """Converts a composed SDF model to `<robot>`.
+    """Converts a composed SDF model to the element `<robot>`.
 
     Raises:
-        ModelError: a joint with a frame of its own, or a shape that URDF does not have.
+        ModelError: URDF does not support a part of the SDF, such as a `<pose>` in a joint, a spring or a shape.
     """
     (model,) = root.findall("model")
     facts = read_sdf_facts(root)
@@ -97,23 +97,30 @@ def _add_shape(out: ElementTree.Element, kind: str, link: str, shape: ElementTre
     name, X_LG = shape.get("name", ""), _pose(shape)
     parts: list[tuple[str, RigidTransform, str, dict[str, str]]] = []
     geometry = shape.find("geometry")
-    what = next(iter(geometry)) if geometry is not None and len(geometry) else None
-    tag = "nothing" if what is None else what.tag
-    if what is not None and tag == "mesh":
-        parts.append((name, X_LG, "mesh", {"filename": _text(what, "uri"), "scale": what.findtext("scale", "1 1 1")}))
-    elif what is not None and tag == "box":
-        parts.append((name, X_LG, "box", {"size": _text(what, "size")}))
-    elif what is not None and tag == "sphere":
-        parts.append((name, X_LG, "sphere", {"radius": _text(what, "radius")}))
-    elif what is not None and tag in ("cylinder", "capsule"):
-        radius, length = _text(what, "radius"), _text(what, "length")
+    shape_element = next(iter(geometry)) if geometry is not None and len(geometry) else None
+    tag = "none" if shape_element is None else shape_element.tag
+    if shape_element is not None and tag == "mesh":
+        parts.append(
+            (
+                name,
+                X_LG,
+                "mesh",
+                {"filename": _text(shape_element, "uri"), "scale": shape_element.findtext("scale", "1 1 1")},
+            )
+        )
+    elif shape_element is not None and tag == "box":
+        parts.append((name, X_LG, "box", {"size": _text(shape_element, "size")}))
+    elif shape_element is not None and tag == "sphere":
+        parts.append((name, X_LG, "sphere", {"radius": _text(shape_element, "radius")}))
+    elif shape_element is not None and tag in ("cylinder", "capsule"):
+        radius, length = _text(shape_element, "radius"), _text(shape_element, "length")
         parts.append((name, X_LG, "cylinder", {"radius": radius, "length": length}))
         if tag == "capsule":
             for end, sign in (("end", 1), ("start", -1)):
                 X_GS = RigidTransform(np.array([0.0, 0.0, sign * float(length) / 2]))
                 parts.append((f"{name}_{end}", X_LG @ X_GS, "sphere", {"radius": radius}))
     else:
-        raise ModelError(f"{link}: URDF has no shape like {tag} of {name}")
+        raise ModelError(f"link {link}, {kind} {name}: URDF does not support the shape {tag}")
     for part_name, X_LP, part_tag, attributes in parts:
         element = ElementTree.SubElement(out, kind, name=part_name)
         _add_origin(element, X_LP)
@@ -129,10 +136,10 @@ def _add_joint(
 ) -> None:
     name, kind = joint.get("name", ""), joint.get("type", "")
     if joint.find("pose") is not None:
-        raise ModelError(f"joint {name} has a <pose>; URDF has a joint's frame at the child link's only")
+        raise ModelError(f"joint {name} has a <pose>; in URDF, the joint frame must equal the frame of the child link")
     parent, child = _text(joint, "parent"), _text(joint, "child")
     if missing := {parent, child} - set(X_ML):
-        raise ModelError(f"joint {name}: no link {', '.join(sorted(missing))} in the SDF")
+        raise ModelError(f"joint {name}: the SDF has no link {', '.join(sorted(missing))}")
     out = ElementTree.SubElement(robot, "joint", name=name, type=kind)
     ElementTree.SubElement(out, "parent", link=parent)
     ElementTree.SubElement(out, "child", link=child)
@@ -152,7 +159,7 @@ def _add_joint(
     dynamics = joint.find("axis/dynamics")
     if dynamics is not None:
         if float(dynamics.findtext("spring_stiffness", "0")) != 0:
-            raise ModelError(f"joint {name}: URDF has no joint springs")
+            raise ModelError(f"joint {name}: spring_stiffness is not 0; URDF does not support joint springs")
         ElementTree.SubElement(out, "dynamics", damping=dynamics.findtext("damping", "0"))
 
 
@@ -177,12 +184,12 @@ def _add_filter_group(robot: ElementTree.Element, group: ElementTree.Element) ->
 
 
 def _pose(element: ElementTree.Element) -> RigidTransform:
-    """Returns the pose of an element, or the identity without `<pose>`."""
+    """Returns the pose of an element, which is the identity if the element has no `<pose>`."""
     pose = element.find("pose")
     if pose is None or not (pose.text or "").strip():
         return RigidTransform()
     if pose.get("relative_to"):
-        raise ModelError(f"{element.get('name')}: <pose relative_to> cannot be written as URDF here; leave it out")
+        raise ModelError(f"{element.get('name')}: URDF does not support <pose relative_to>; remove relative_to")
     x, y, z, roll, pitch, yaw = map(float, (pose.text or "").split())
     angles = np.array([roll, pitch, yaw])
     if pose.get("degrees") == "true":
@@ -204,5 +211,5 @@ def _xyz_rpy(X: RigidTransform) -> tuple[str, str]:
 def _text(element: ElementTree.Element, path: str) -> str:
     text = element.findtext(path)
     if text is None or not text.strip():
-        raise ModelError(f"the SDF's {element.tag} {element.get('name', '')} lacks <{path}>")
+        raise ModelError(f"the SDF's {element.tag} {element.get('name', '')} has no <{path}>")
     return text.strip()

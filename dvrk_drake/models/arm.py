@@ -30,18 +30,18 @@ from dvrk_drake.models.arm_schema import (
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.schema_fault import RANGE, Range, meant, number_fault, within
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, suggest_name, within
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 _ARMS = MODELS_FOLDER / "arms"
 #: Maximum length of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0
-#: Position errors [rad, m] that define the maximum gains. A gain is too large if this error demands the whole effort
-#: limit of the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
+#: Position errors [rad, m] that define the maximum gains. A gain is too large if this error causes the maximum effort
+#: of the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
 _MIN_ERROR = (1e-4, 1e-5)
 #: Shares of the effort limit that define the minimum gains. A gain is too small if an error as large as the range of
-#: the joint demands less than this share: for kp immediately, for kd if the error arises within 1 s, for ki if it lasts
+#: the joint causes less than this share: for kp immediately, for kd if the error arises within 1 s, for ki if it lasts
 #: for 1 s.
 _MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
@@ -57,10 +57,10 @@ class Arm:
 
     Attributes:
         name: Name of the arm in the dVRK, e.g. "MTML".
-        source: Argument with which `load_arm` loads the arm: "mtml", or the absolute path of its YAML file.
+        source: Argument of `load_arm` for this arm: a name such as "mtml", or the absolute path of the YAML file.
         joint_names: Names of the n independent joints.
         tree_joint_names: Names of all joints of the SDF tree, including the linkage.
-        sdf: Package URLs or paths of the model files: the arm, then its instrument if it has one.
+        sdf: Package URLs or paths of the SDF files: first the arm, then its instrument if there is one.
         mirrored_links: Mapping from a URL in `sdf` to the links of that file that are mirrored for this arm.
         position_lower, position_upper: Position limits (n,) of this arm.
         effort_limits: Limits (n,) of the joint torques, from the SDF.
@@ -68,12 +68,12 @@ class Arm:
         coupled_limits: Limits of sums of joint positions.
         linkage: Map q_tree = G q + c, from the `drake:mimic` tags of the SDF.
         transmission: Map a = J q from joint positions q to actuator positions a.
-        loop_closures: Pairs of frames whose origins must coincide.
+        loop_closures: Pairs of frames whose origins coincide at every pose of the linkage.
         gravity: Gravity vector (3,) in the base frame [m/s^2].
         gains: Default gains of the controller.
         friction_coordinates: Mapping from a name to the joint coefficients (n,) of an additional friction coordinate,
             for friction that acts neither at a joint nor at an actuator.
-        identification: Settings for recordings of the arm, and bounds of its links.
+        identification: Settings for recordings of the arm, and bounds of the mass distribution of the links.
         effects: Friction, cable and sensor effects of the real arm. A simulation includes them only on request.
 
     Example:
@@ -127,8 +127,8 @@ class Arm:
     def gains_fault(self, gains: Gains) -> str:
         """Returns a message on the first gain that is not accepted for this arm and the accepted values, or "".
 
-        A gain must be large enough to move its joint. It must be so small that the resolution of the position
-        measurement does not demand the whole effort limit. See `_MIN_SHARE` and `_MIN_ERROR`.
+        A gain must be large enough to move its joint. It must be small enough that a position error of the size of
+        the sensor resolution does not cause the maximum effort. See `_MIN_SHARE` and `_MIN_ERROR`.
         """
         if fault := _count_fault("gains.", vars(gains), self.joint_names):
             return fault
@@ -142,7 +142,7 @@ class Arm:
             for i, gain in enumerate(getattr(gains, name)):
                 allowed = Range(float(lowest[i]), float(highest[i]), also=() if name == "kp" else (0.0,))
                 if fault := allowed.fault(f"gains.{name}[{i}]", float(gain)):
-                    return f"{fault} for the range and effort limit of {self.joint_names[i]}"
+                    return f"{fault} for the position range and effort limit of {self.joint_names[i]}"
         return ""
 
     def _faults(self) -> Iterator[str]:
@@ -157,11 +157,11 @@ class Arm:
             yield coupled_limit_fault(self, limit)
         for name, row in self.friction_coordinates.items():
             if not np.any(row):
-                yield f"friction_coordinates.{name} has no coefficient other than 0"
+                yield f"friction_coordinates.{name}: all coefficients are 0; allowed: at least one other value"
         yield number_fault(self)
         _checked_gravity(self.gravity)
         if len(self.coupled_limits) > 1 and not can_meet_coupled_limits(self):
-            yield "coupled_limits: no pose inside position_limits meets them all"
+            yield "coupled_limits: no pose within position_limits meets all coupled limits; widen the limits"
 
     @property
     def num_joints(self) -> int:
@@ -237,14 +237,17 @@ class Arm:
         while len(poses) < count:
             tries += 1
             if tries > 100 and len(poses) < tries:
-                raise ArmError(f"{self.name}: hardly any pose inside its position limits meets its coupled limits")
+                raise ArmError(
+                    f"{self.name}: almost no pose within the position limits meets the coupled limits. Check "
+                    "coupled_limits in the arm file, or reduce the margin."
+                )
             q = generator.uniform(lower[:n], upper[:n], (2 * count + 8, n))
             value = q @ A.T
             poses = np.vstack([poses, q[np.all((value >= lower) & (value <= upper), axis=1)]])
         return poses[:count]
 
     def with_gravity(self, gravity: Sequence[float]) -> Arm:
-        """Returns the same arm, mounted so that `gravity` (3,) [m/s^2] is the gravity vector in its base frame.
+        """Returns the same arm with the gravity vector `gravity` (3,) in the base frame [m/s^2].
 
         Raises:
             ArmError: `gravity` is not three numbers, or its length exceeds 30 m/s^2.
@@ -276,14 +279,14 @@ def known_arms() -> list[str]:
 def load_arm(name: str | Path) -> Arm:
     """Loads an arm. Repeated calls return the same Arm object until the file changes.
 
-    Changes of the files that it refers to (mechanism, instrument, SDF) require a new process.
+    Changes of other files of the arm (mechanism, instrument, SDF) take effect in a new process.
 
     Args:
-        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive), or path or package URL of an arm's YAML
-            file.
+        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive), or path or package URL of the YAML file
+            of an arm.
 
     Raises:
-        ArmError: The arm does not exist, or its files contradict each other.
+        ArmError: The arm does not exist, or its files are invalid or inconsistent.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -294,7 +297,7 @@ def load_arm(name: str | Path) -> Arm:
     """
     name = os.fspath(name)
     if "\0" in name:
-        raise ArmError(f"{name!r}: is not the name of a file")
+        raise ArmError(f"{name!r} is not a valid file name")
     if not name.endswith((".yaml", ".yml")):
         return _load_arm(name.lower())
     path = Path(os.path.realpath(local_path(name)))
@@ -309,14 +312,16 @@ def load_arm(name: str | Path) -> Arm:
 
 @cache
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
-    """Loads an arm by name or absolute path; `state` identifies the version of its file in the cache."""
+    """Loads an arm by name or absolute path. `state` identifies the version of the YAML file in the cache."""
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():
-            near = meant(name, known_arms())
-            raise ArmError(f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}; or name a YAML file')
+            near = suggest_name(name, known_arms())
+            raise ArmError(
+                f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}, or the path of a YAML file'
+            )
         path = _ARMS / f"{name}.yaml"
-    description = load_typed_yaml(ArmDescription, path, ArmError, "an arm's file")
+    description = load_typed_yaml(ArmDescription, path, ArmError, "an arm file")
     mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
     instrument = Instrument()
     if description.instrument:
@@ -333,13 +338,13 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
 
 
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
-    what = f"an arm's {kind}"
+    what = f"{'an' if kind == 'instrument' else 'a'} {kind} file"
     if name.endswith((".yaml", ".yml")):
         if "\0" in name:
-            raise ArmError(f"{arm_path}: {kind} {name!r} is not the name of a file")
+            raise ArmError(f"{arm_path}: {kind} {name!r} is not a valid file name")
         path = Path(os.path.realpath(arm_path.parent / name))
         if not os.path.lexists(path):
-            raise ArmError(f"{arm_path}: {kind} {path}: no such file")
+            raise ArmError(f"{arm_path}: {kind} {path} does not exist")
         part = load_typed_yaml(schema, path, ArmError, what)
         if part.sdf and not part.sdf.startswith(PACKAGE_URL):
             part.sdf = str(path.parent / part.sdf)
@@ -358,17 +363,17 @@ def _build_arm(
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     if not joints or len({*joints}) < len(joints):
-        raise ArmError(f"{path}: the joints of its mechanism and instrument must be different names, at least one")
+        raise ArmError(f"{path}: the mechanism and instrument must have at least one joint, and no joint name twice")
     if not mechanism.sdf:
-        raise ArmError(f"{path}: its mechanism names no sdf")
+        raise ArmError(f"{path}: the mechanism file has no sdf")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
     mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
     facts = read_sdf_facts(compose_sdf(sdf, mirrored))
     position_limits = {**instrument.position_limits, **description.position_limits}
     if set(joints) != set(position_limits):
-        raise ArmError(f"{path}: position_limits must name exactly {', '.join(mechanism.joints)}")
+        raise ArmError(f"{path}: position_limits must have one entry for each of {', '.join(mechanism.joints)}")
     if missing := set(joints) - set(facts.joint_names):
-        raise ArmError(f"{path}: its SDF has no joint {', '.join(sorted(missing))}")
+        raise ArmError(f"{path}: the SDF has no joint {', '.join(sorted(missing))}")
     limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
     gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
     G = np.zeros((len(facts.joint_names), len(joints)))
@@ -376,7 +381,7 @@ def _build_arm(
     for row, name in enumerate(facts.joint_names):
         leader, multiplier, offset = facts.mimics.get(name, (name, 1.0, 0.0))
         if leader not in joints:
-            raise ArmError(f"{path}: joint {name} of its SDF is neither independent nor a mimic of one that is")
+            raise ArmError(f"{path}: joint {name} of the SDF must be in the list joints, or a mimic of a joint in it")
         G[row, joints.index(leader)], c[row] = multiplier, offset
     return Arm(
         name=description.name,
@@ -405,14 +410,16 @@ def _build_arm(
 
 
 def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:
-    """Returns the settings of the mechanism, extended by those of the instrument. Defaults are 20 Hz and no delay."""
+    """Returns the settings of the mechanism and the instrument. The defaults are 20 Hz and no delay."""
     both: dict[str, list[float]] = {}
     for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
         both[which] = []
         for part in (mechanism, instrument):
             values = getattr(part.motion, which)
             if values and len(values) != len(part.joints):
-                raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
+                raise ArmError(
+                    f"{path}: motion.{which} has {len(values)} numbers; allowed: {len(part.joints)}, one per joint"
+                )
             both[which] += values or [default] * len(part.joints)
     known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
     return IdentificationSettings(
@@ -452,13 +459,15 @@ def _checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
     vector = np.asarray(gravity, float)
     if vector.shape != (3,) or not np.linalg.norm(vector) <= MAX_GRAVITY:
         numbers = ", ".join(f"{x:g}" for x in vector.ravel())
-        raise ArmError(f"gravity ({numbers}) must be three numbers of a size up to {MAX_GRAVITY:g} m/s^2; on Earth 9.8")
+        raise ArmError(
+            f"gravity ({numbers}) must be a vector of three numbers with a length up to {MAX_GRAVITY:g} m/s^2"
+        )
     return vector
 
 
 def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np.float64]:
     if missing := [joint for joint in joints if joint not in facts.effort_limits]:
-        raise ArmError(f"{path}: joint {missing[0]} of its SDF needs a positive <axis><limit><effort> [N m, N]")
+        raise ArmError(f"{path}: joint {missing[0]} of the SDF needs a positive <axis><limit><effort> [N m, N]")
     return np.array([facts.effort_limits[joint] for joint in joints])
 
 
@@ -478,7 +487,7 @@ def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrumen
 
 def _index(path: Path, key: str, joint: str, joints: list[str]) -> int:
     if joint not in joints:
-        raise ArmError(f"{path}: {key} names {joint}; allowed: {', '.join(joints)}")
+        raise ArmError(f'{path}: {key}: unknown joint "{joint}"; allowed: {", ".join(joints)}')
     return joints.index(joint)
 
 
@@ -487,11 +496,11 @@ def _row(path: Path, key: str, terms: dict[str, float], joints: list[str]) -> ND
     for joint, coefficient in terms.items():
         row[_index(path, key, joint, joints)] = coefficient
     if not np.any(row):
-        raise ArmError(f"{path}: {key} has no coefficient other than 0; allowed: one at least")
+        raise ArmError(f"{path}: {key}: all coefficients are 0; allowed: at least one other value")
     return row
 
 
 def _inverted(path: Path, key: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     if not np.linalg.cond(matrix) < 1e9:
-        raise ArmError(f"{path}: {key}: its rows depend on each other, so that positions do not follow from it")
+        raise ArmError(f"{path}: {key}: the matrix is singular, because its rows are linearly dependent")
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

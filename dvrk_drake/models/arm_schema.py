@@ -18,12 +18,12 @@ ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-2.0, 2.0, "m")
 ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 2.0, "m")
 #: Accepted efforts of a joint: 0.023 N m at the roll joint of an MTM, 330 N m at the shoulder of a UR10e.
 EFFORTS = Range(0.001, 2000.0, "N m or N")
-#: Accepted positions if the joint type is not known yet. `Arm` checks them with `ANGLES` or `TRAVELS`.
+#: Accepted positions in files, for any joint type. `Arm` checks the narrower range `ANGLES` or `TRAVELS`.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
 #: Accepted coefficients that relate joint and actuator positions: 0.6..1.6 on a dVRK, 32..48 with the gears of a TX40.
 COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
-#: Positions, velocities and efforts of this size or larger are refused [rad, m, rad/s, m/s, N m, N]. No arm reaches
-#: them in any unit, and products of smaller numbers with gains stay finite. The limit applies to inputs and recordings.
+#: Largest accepted position, velocity and effort in inputs and recordings [rad, m, rad/s, m/s, N m, N]. No arm reaches
+#: this value in any unit. Products of smaller numbers with gains remain finite.
 IMPLAUSIBLE = 1e6
 #: Accepted components of the gravity vector, for 9.81 m/s^2 in any direction. `Arm` checks the length of the vector.
 GRAVITIES = within(-30.0, 30.0, "m/s^2")
@@ -84,7 +84,7 @@ class MotionSettings:
 
 @dataclass
 class BoxCorners:
-    """Box aligned with the axes of a link's frame: its lower and upper corner [m]."""
+    """Axis-aligned box in a link frame, given by its lower and upper corners (3,) [m]."""
 
     lower: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
     upper: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
@@ -92,11 +92,11 @@ class BoxCorners:
 
 @dataclass
 class BoundingShapes:
-    """Bounds of the mass distribution of the links of one SDF file: the box around a link's collision shapes, widened.
+    """Bounds of the mass distribution of the links of one SDF file.
 
-    `margin` [m] is added on all sides for parts that are not drawn, such as covers, screws and cables. `boxes` replace
-    the collision shapes of links that have none, or whose shapes do not represent their mass. No margin is added to
-    `boxes`.
+    The bound of a link is the box around its collision shapes, enlarged by `margin` [m] on all sides. The margin is for
+    parts without a collision shape, such as covers, screws and cables. `boxes` define the bounds of links without
+    collision shapes, or whose shapes do not represent their mass. No margin is added to `boxes`.
     """
 
     margin: float = field(default=0.04, metadata=within(0.0, 1.0, "m"))
@@ -105,7 +105,7 @@ class BoundingShapes:
 
 @dataclass(kw_only=True)
 class IdentificationSettings(MotionSettings):
-    """Settings for recordings of an arm, and bounds of its links.
+    """Settings for recordings of an arm, and bounds of the mass distribution of the links.
 
     Attributes:
         effort_cut_off: Cut-off frequency of the low-pass filter for measured and modelled efforts [Hz].
@@ -138,7 +138,7 @@ class Mechanism:
 
 @dataclass
 class Instrument:
-    """Schema of `instruments/*.yaml`: an exchangeable instrument, whose joints follow those of the arm.
+    """Schema of `instruments/*.yaml`: an exchangeable instrument. Its joints follow the joints of the arm.
 
     `joint_from_actuator` is the disc coupling as defined by the dVRK: joint = sum of coefficient * actuator.
     `friction_coordinates` are additional coordinates of friction besides joints and actuators: name -> sum of
@@ -177,24 +177,26 @@ class ArmDescription:
 
 
 def load_gains(path: str | Path) -> Gains:
-    """Reads kp, kd and ki with one number per joint. The controller checks whether they are valid for an arm.
+    """Reads a gains file with kp, kd and ki, one number per joint. The controller checks the range of each gain.
 
     Raises:
-        ControllerError: The file does not exist, is not a file of gains, or has a gain outside the range of `Gains`.
+        ControllerError: The file does not exist, is not a gains file, or has a gain outside the range of `Gains`.
     """
-    gains = load_typed_yaml(Gains, path, ControllerError, "a file of gains")
+    gains = load_typed_yaml(Gains, path, ControllerError, "a gains file")
     for name, values in dataclasses.asdict(gains).items():
         if not values:
-            raise ControllerError(f"{path}: {name} is missing; a file of gains has kp, kd and ki, one number a joint")
+            raise ControllerError(
+                f"{path}: {name} is missing; a gains file has kp, kd and ki with one number per joint"
+            )
     return gains
 
 
 def save_gains(gains: Gains, path: str | Path, remark: str) -> None:
-    """Writes a file of gains that begins with a remark of one line.
+    """Writes a gains file. Its first line is the comment `remark`, a text of one line.
 
     Raises:
         DvrkDrakeError: The file cannot be written.
     """
     with atomic_write(path) as stream:
-        stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m on a joint that slides.\n")
+        stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m for a prismatic joint.\n")
         stream.write(yaml_dump(dataclasses.asdict(gains)))

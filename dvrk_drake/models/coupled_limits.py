@@ -20,7 +20,7 @@ def coupled_limit_fault(arm: Arm, limit: CoupledLimit) -> str:
     row = np.array([limit.coefficients.get(name, 0.0) for name in arm.joint_names])
     coupled = row != 0
     if not np.any(coupled):
-        return f"{key}: coefficients are all 0; allowed: a joint with another coefficient at least"
+        return f"{key}: all coefficients are 0; allowed: at least one other value"
     slides = bool(np.all(arm.prismatic[coupled]))
     if fault := number_fault(limit):
         return f"{key}.{fault}"
@@ -29,7 +29,7 @@ def coupled_limit_fault(arm: Arm, limit: CoupledLimit) -> str:
     ends = np.sort(row * [arm.position_lower, arm.position_upper], axis=0).sum(axis=1)
     if ends[1] < limit.lower or ends[0] > limit.upper:
         return (
-            f"{key}: no pose inside position_limits meets {limit.lower:g}..{limit.upper:g}; "
+            f"{key}: no pose within position_limits meets {limit.lower:g}..{limit.upper:g}; "
             f"allowed: limits that overlap {ends[0]:.4g}..{ends[1]:.4g}"
         )
     return ""
@@ -56,7 +56,7 @@ def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
     return widths.fault(f"{key}: upper - lower", upper - lower)
 
 
-def beside(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+def offset_pose(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns pose + offset (n,), with the offset of each joint shortened so that no limit of `arm` is violated."""
     A, lower, upper = arm.limit_matrix()
     change = A @ offset

@@ -20,7 +20,7 @@ _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
 
 @dataclass
 class DriveEffect:
-    """One effect along a coordinate of the drive, specified in an arm's file or identified.
+    """One effect along a coordinate of the drive, read from an arm file or identified.
 
     Attributes:
         coordinate: "actuator.<name>", "joint.<name>", or one of the arm's `friction_coordinates`.
@@ -28,7 +28,7 @@ class DriveEffect:
         scale: Shape parameter of the kind: width of the smoothed sign function [rad/s, m/s], breakaway displacement
             [rad, m], or periods per revolution.
         coefficient: Size of the effect [N m; N m s/rad, ...; N and m for a prismatic coordinate].
-        standard_error: Standard error of the coefficient, in its unit; 0 if it was not identified.
+        standard_error: Standard error of the coefficient, in the same unit; 0 if the effect was not identified.
     """
 
     coordinate: str = ""
@@ -103,7 +103,7 @@ class DelayEffect:
 
 @dataclass
 class ArmEffects:
-    """Effects of a real arm. Each field is an effect group that can be switched on or off by its name.
+    """Effects of a real arm. Each field is an effect group that a simulation can include by name.
 
     Attributes:
         friction: Dry and viscous friction, as elements of the plant's own solver.
@@ -151,7 +151,7 @@ class ArmEffects:
         return self.only([other for other in EFFECT_NAMES if other != name])
 
     def joined(self, other: "ArmEffects") -> "ArmEffects":
-        """Returns the effects with lists and tables extended by those of an instrument. Scalars are unchanged."""
+        """Returns the effects, extended by the lists and mappings in the effects of an instrument."""
         return ArmEffects(**{name: _joined(getattr(self, name), getattr(other, name)) for name in EFFECT_NAMES})
 
     def check(self, joint_names: Sequence[str]) -> None:
@@ -170,20 +170,22 @@ class ArmEffects:
             tables |= {f"effort.{key}": value for key, value in vars(self.effort).items()}
         for table, values in tables.items():
             if unknown := sorted(set(values) - set(joint_names)):
-                raise ArmError(f"{table}: unknown actuator {unknown[0]}; actuators: {', '.join(joint_names)}")
+                raise ArmError(f"{table}: unknown actuator {unknown[0]}; allowed: {', '.join(joint_names)}")
         for effect in self.friction:
-            where = f"friction: {effect.coordinate} {effect.kind}"
+            where = f"friction of {effect.coordinate}"
             if effect.kind not in FRICTION_KINDS:
-                raise ArmError(f'friction: kind "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
+                raise ArmError(f'{where}: kind is "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
             if effect.coefficient < 0 and effect.kind != "presliding forward":
-                raise ArmError(f"{where} has coefficient {effect.coefficient:g}; it must not be negative")
+                raise ArmError(f"{where}: coefficient of {effect.kind} is {effect.coefficient:g}; allowed: 0 or more")
             if effect.kind != "viscous" and effect.scale == 0:
-                raise ArmError(f"{where} has scale 0; it must be positive")
+                raise ArmError(f"{where}: scale of {effect.kind} is 0; allowed: more than 0")
             if effect.fall_speed and effect.kind != "presliding":
-                raise ArmError(f"{where} has fall_speed {effect.fall_speed:g}; allowed: 0, others only of presliding")
-        for law in [*self.cables, *self.springs]:
-            if law.kind not in POSITION_KINDS:
-                raise ArmError(f'cables, springs: kind "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
+                raise ArmError(f"{where}: fall_speed of {effect.kind} is {effect.fall_speed:g}; allowed: 0")
+        for group, laws in (("cables", self.cables), ("springs", self.springs)):
+            for law in laws:
+                if law.kind not in POSITION_KINDS:
+                    where = f"{group} of {law.coordinate}"
+                    raise ArmError(f'{where}: kind is "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
 
 
 #: Kinds that `friction` accepts: dissipative effects that a solver can apply at the end of a step.

@@ -49,19 +49,19 @@ def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | Non
     except FileNotFoundError as cause:
         raise error(f"{path}: no such file") from cause
     except IsADirectoryError as cause:
-        raise error(f"{path}: is not a file but a folder") from cause
+        raise error(f"{path} is not a file but a folder") from cause
     except OSError as cause:
-        raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+        raise error(f"{path} cannot be read: {cause.strerror}") from cause
     except ValueError as cause:  # null character in the path
-        raise error(f"{str(path)!r}: is not the name of a file: {cause}") from cause
+        raise error(f"{str(path)!r} is not a valid file name: {cause}") from cause
     status = os.fstat(file.fileno())
     if not stat.S_ISREG(status.st_mode):
         file.close()
-        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
-        raise error(f"{path}: is not a file but {kind}; write its content into a file first")
+        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "of unknown type")
+        raise error(f"{path} is not a file but {kind}; copy its content to a file first")
     if largest is not None and status.st_size > largest:
         file.close()
-        raise error(f"{path}: has {status.st_size / 1e6:.1f} MB; allowed: at most {largest / 1e6:g} MB")
+        raise error(f"{path} has {status.st_size / 1e6:.1f} MB; allowed: at most {largest / 1e6:g} MB")
     return file
 
 
@@ -75,9 +75,9 @@ def read_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX
         try:
             content = file.read(largest + 1)
         except OSError as cause:
-            raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+            raise error(f"{path} cannot be read: {cause.strerror}") from cause
     if len(content) > largest:  # file grew after opening, or its size was unknown
-        raise error(f"{path}: is larger than {largest / 1e6:g} MB, which is the most that is allowed")
+        raise error(f"{path} is too large; allowed: at most {largest / 1e6:g} MB")
     return content
 
 
@@ -91,7 +91,7 @@ def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as cause:
-        raise error(f"{path}: not a text file in UTF-8: {cause.reason} at byte {cause.start}") from cause
+        raise error(f"{path} is not a UTF-8 text file: {cause.reason} at byte {cause.start}") from cause
 
 
 def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX_TEXT) -> Any:
@@ -103,9 +103,9 @@ def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
     try:
         return json.loads(read_text_input(path, error, largest))
     except RecursionError as cause:
-        raise error(f"{path}: not JSON that can be read: its lists and tables are nested too deeply") from cause
+        raise error(f"{path}: invalid JSON: arrays and objects are nested too deeply") from cause
     except ValueError as cause:
-        raise error(f"{path}: not JSON: {cause}") from cause
+        raise error(f"{path}: invalid JSON: {cause}") from cause
 
 
 #: Error codes of write operations that are caused by the disk and not by the caller's code.
@@ -115,7 +115,7 @@ _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 def refuse_existing(path: str | Path, overwrite: bool) -> None:
     """Raises DvrkDrakeError if a file exists at `path` and `overwrite` is False."""
     if os.path.exists(path) and not overwrite:
-        raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with overwrite=True")
+        raise DvrkDrakeError(f"{path} already exists. Choose another file, or replace this one with overwrite=True.")
 
 
 @contextmanager
@@ -134,14 +134,16 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
     target = Path(os.path.realpath(path))
     exists = os.path.exists(target)
     if exists and not target.is_file():
-        raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
+        raise DvrkDrakeError(
+            f"{path} is not a regular file and cannot be replaced. Give the path of a regular or a new file."
+        )
     if exists and not os.access(target, os.W_OK):
-        raise DvrkDrakeError(f"{path}: cannot be written: it is read-only")
+        raise DvrkDrakeError(f"{path} cannot be written: the file is read-only")
     permissions = target.stat().st_mode & 0o777 if exists else 0o666 & ~_umask()
     try:
         handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:100]}.")
     except OSError as error:
-        raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
+        raise DvrkDrakeError(f"{path} cannot be written: {error.strerror}") from error
     text: dict[str, Any] = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
     try:
         with os.fdopen(handle, mode, **text) as stream:
@@ -150,12 +152,12 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
         try:
             os.replace(temporary, target)
         except OSError as error:
-            raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
+            raise DvrkDrakeError(f"{path} cannot be written: {error.strerror}") from error
     except BaseException as error:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
         if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
-            raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
+            raise DvrkDrakeError(f"{path} cannot be written: {error.strerror}") from error
         raise
 
 

@@ -1,7 +1,4 @@
-"""Channels, authentication and decoding of the LCM messages of an arm.
-
-Decoding tolerates messages of any content.
-"""
+"""Channels, authentication and decoding of the LCM messages of an arm."""
 
 from __future__ import annotations
 
@@ -23,12 +20,12 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
 #: Minimum and maximum length of a key, and length of a new key [bytes]. The maximum is that of BLAKE2b.
-_MIN_LENGTH, _MAX_LENGTH, _NEW = 16, 64, 32
+_MIN_LENGTH, _MAX_LENGTH, _NEW_LENGTH = 16, 64, 32
 #: Length of a message authentication code [bytes].
 MAC_SIZE = 16
-#: Last bytes of a message. An unsigned message ends with the size of the code, zero. A signed message ends with the
-#: size and the code.
-_EMPTY, _SIZE = b"\0", bytes([MAC_SIZE])
+#: Byte before the authentication code of a message: size of the code. In an unsigned message it is 0, and no code
+#: follows.
+_NO_MAC, _MAC_FOLLOWS = b"\0", bytes([MAC_SIZE])
 
 
 class MessageKey:
@@ -45,7 +42,7 @@ class MessageKey:
             KeyFileError: The key is too short or too long.
         """
         if not _MIN_LENGTH <= len(key) <= _MAX_LENGTH:
-            raise KeyFileError(f"a key has {_MIN_LENGTH} to {_MAX_LENGTH} bytes; this one has {len(key)}")
+            raise KeyFileError(f"the key has {len(key)} bytes; allowed: {_MIN_LENGTH} to {_MAX_LENGTH}")
         self._hash = hashlib.blake2b(key=key, digest_size=MAC_SIZE)
 
     @classmethod
@@ -58,26 +55,28 @@ class MessageKey:
         with open_input(path, KeyFileError) as file:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             if mode & (stat.S_IRWXG | stat.S_IRWXO):
-                raise KeyFileError(f"{path}: other users may access this key (mode {mode:04o}); run: chmod 600 {path}")
+                raise KeyFileError(
+                    f"{path}: other users have access to this key (mode {mode:04o}). Run: chmod 600 {path}"
+                )
             key = file.read(_MAX_LENGTH + 1) or b""
         try:
             return cls(key)
         except KeyFileError as error:
-            more = "more" if len(key) > _MAX_LENGTH else str(len(key))
+            size = f"more than {_MAX_LENGTH}" if len(key) > _MAX_LENGTH else str(len(key))
             raise KeyFileError(
-                f"{path}: not a key of {_MIN_LENGTH} to {_MAX_LENGTH} bytes, it has {more}; "
-                "make one: dvrk-drake key --output FILE"
+                f"{path}: the key has {size} bytes; allowed: {_MIN_LENGTH} to {_MAX_LENGTH}. "
+                "Create a key with: dvrk-drake key --output FILE"
             ) from error
 
     def sign(self, data: bytes) -> bytes:
         """Returns the unsigned encoded message `data` with its authentication code appended."""
-        content = data[: -len(_EMPTY)]
-        return content + _SIZE + self._mac(content)
+        content = data[: -len(_NO_MAC)]
+        return content + _MAC_FOLLOWS + self._mac(content)
 
     def verify(self, data: bytes) -> bool:
         """Returns whether `data` ends with the authentication code of the bytes before it."""
         content, size, mac = data[: -MAC_SIZE - 1], data[-MAC_SIZE - 1 : -MAC_SIZE], data[-MAC_SIZE:]
-        return size == _SIZE and secrets.compare_digest(self._mac(content), mac)
+        return size == _MAC_FOLLOWS and secrets.compare_digest(self._mac(content), mac)
 
     def _mac(self, content: bytes) -> bytes:
         state = self._hash.copy()
@@ -94,11 +93,11 @@ def create_key_file(path: str | Path) -> None:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError as error:
-        raise KeyFileError(f"{path}: exists already, and a key is not overwritten; name another file") from error
+        raise KeyFileError(f"{path} already exists, and a key is never overwritten. Choose another file.") from error
     except (OSError, ValueError) as error:
-        raise KeyFileError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+        raise KeyFileError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from error
     with open(descriptor, "wb") as file:
-        file.write(secrets.token_bytes(_NEW))
+        file.write(secrets.token_bytes(_NEW_LENGTH))
 
 
 Message = TypeVar("Message", lcmt_dvrk_command, lcmt_dvrk_status)
@@ -107,7 +106,7 @@ STATUS_PREFIX = "DVRK_STATUS_"
 
 #: Maximum rate of statuses [Hz], and maximum number of statuses that may arrive at once after a pause of the arm's
 #: process.
-_FASTEST, _AHEAD = 2000, 100
+_MAX_RATE, _MAX_AHEAD = 2000, 100
 
 _STATE_NAMES = {
     value: name.removeprefix("STATE_").lower()
@@ -117,27 +116,27 @@ _STATE_NAMES = {
 
 _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_NONE: "none",
-    lcmt_dvrk_status.REFUSAL_UNREADABLE: "unreadable",
-    lcmt_dvrk_status.REFUSAL_WRONG_ARM: "meant for another arm",
-    lcmt_dvrk_status.REFUSAL_WRONG_SIZE: "of another number of joints",
-    lcmt_dvrk_status.REFUSAL_NOT_FINITE: "not finite",
-    lcmt_dvrk_status.REFUSAL_BAD_MODE: "in a mode that is not accepted now",
-    lcmt_dvrk_status.REFUSAL_NO_SENDER: "without a sender_id",
-    lcmt_dvrk_status.REFUSAL_WRONG_SESSION: "meant for the arm before it was restarted",
-    lcmt_dvrk_status.REFUSAL_STALE: "too late: the measurement is too old",
-    lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER: "sent twice or out of order",
-    lcmt_dvrk_status.REFUSAL_CLOCK_JUMP: "after a jump of the sender's clock",
-    lcmt_dvrk_status.REFUSAL_FAULT: "in a fault",
-    lcmt_dvrk_status.REFUSAL_BAD_RESET: "a reset that is no hold",
-    lcmt_dvrk_status.REFUSAL_START_FAR: "starting too far from the present efforts or pose",
-    lcmt_dvrk_status.REFUSAL_START_OUTSIDE: "starting while the arm is beyond a position limit",
-    lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "from a second sender",
-    lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "off without a hold before",
-    lcmt_dvrk_status.REFUSAL_RESUME: "before an operator resumed",
-    lcmt_dvrk_status.REFUSAL_START_GRAVITY: "starting while the measured effort is not the gravity effort",
+    lcmt_dvrk_status.REFUSAL_UNREADABLE: "unreadable message",
+    lcmt_dvrk_status.REFUSAL_WRONG_ARM: "command for another arm",
+    lcmt_dvrk_status.REFUSAL_WRONG_SIZE: "wrong number of joints",
+    lcmt_dvrk_status.REFUSAL_NOT_FINITE: "numbers that are not finite",
+    lcmt_dvrk_status.REFUSAL_BAD_MODE: "mode not accepted in the present state",
+    lcmt_dvrk_status.REFUSAL_NO_SENDER: "no sender_id",
+    lcmt_dvrk_status.REFUSAL_WRONG_SESSION: "session from before a restart of the arm",
+    lcmt_dvrk_status.REFUSAL_STALE: "answer to a measurement that is too old",
+    lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER: "command sent twice or out of order",
+    lcmt_dvrk_status.REFUSAL_CLOCK_JUMP: "jump of the sender's clock",
+    lcmt_dvrk_status.REFUSAL_FAULT: "guard in a fault",
+    lcmt_dvrk_status.REFUSAL_BAD_RESET: "reset of a fault in a mode other than HOLD",
+    lcmt_dvrk_status.REFUSAL_START_FAR: "start too far from the present efforts or pose",
+    lcmt_dvrk_status.REFUSAL_START_OUTSIDE: "start while the arm is beyond a position limit",
+    lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "sent by a second sender",
+    lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "OFF without HOLD before",
+    lcmt_dvrk_status.REFUSAL_RESUME: "command before the operator has resumed",
+    lcmt_dvrk_status.REFUSAL_START_GRAVITY: "start while the measured effort differs from the gravity effort",
     lcmt_dvrk_status.REFUSAL_NOT_AUTHENTIC: "not signed with the arm's key (--key)",
-    lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP: "after a jump of the sequence",
-    lcmt_dvrk_status.REFUSAL_FLOOD: "too many at once",
+    lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP: "jump of the sequence number",
+    lcmt_dvrk_status.REFUSAL_FLOOD: "too many messages at once",
 }
 
 
@@ -177,13 +176,14 @@ class StatusFilter:
 
     The filter keeps the first session that it receives. It ignores a status, and counts the reason, if the status is
     not authentic, belongs to another session, or was sent before the last one. It also ignores a status whose sequence
-    or time is so far ahead that the arm cannot have sent it yet: more than 2 kHz since the last status, plus a tenth of
-    a second. A spoofed status with a large sequence number therefore does not make the authentic ones appear old.
+    number or time is too far ahead. The limit is an increase of 2000 statuses (of 1 ms each) per second since the last
+    status, plus 100. Without this limit, one spoofed status with a large sequence number would make all authentic
+    statuses appear old.
 
     Attributes:
-        last: Last accepted status, or None.
-        ignored: Number of ignored messages since then, for each reason: OTHER_SESSION, JUMP, OLD, NOT_AUTHENTIC,
-            UNREADABLE.
+        last: Last accepted status, None before the first one.
+        ignored: Mapping from a reason (OTHER_SESSION, JUMP, OLD, NOT_AUTHENTIC, UNREADABLE) to the number of messages
+            ignored since the last accepted status.
     """
 
     OTHER_SESSION = "of another session"
@@ -216,11 +216,11 @@ class StatusFilter:
         self._arm_name, self._num_joints, self._key, self._follow_after = arm_name, num_joints, key, follow_after
         self._session_id = session_id
         self._fingerprint = lcmt_dvrk_status()._get_packed_fingerprint()
-        self._heard = 0.0
+        self._last_arrival = 0.0
         self._reference = (0, 0, 0.0)
 
-    def take(self, data: bytes, now: float, *, settle: bool = True) -> lcmt_dvrk_status | None:
-        """Returns the status in a message, or None if it is ignored; arguments as for `examine`."""
+    def accept(self, data: bytes, now: float, *, settle: bool = True) -> lcmt_dvrk_status | None:
+        """Returns the status in a message, or None if the message is ignored; arguments as for `examine`."""
         return None if self.examine(data, now, settle=settle) else self.last
 
     def examine(self, data: bytes, now: float, *, settle: bool = True) -> str:
@@ -229,8 +229,8 @@ class StatusFilter:
         Args:
             data: Received message.
             now: Time of arrival on a monotonic clock [s].
-            settle: False if the caller calls `settle` after each batch of messages. Queued messages arrive all at once,
-                so they must be compared with the last status before the batch.
+            settle: False if the caller calls `settle` after each batch of messages. The messages of a batch arrive at
+                the same time, so they are compared with the last status before the batch.
 
         Returns:
             The reason why the message is ignored, or "".
@@ -242,7 +242,7 @@ class StatusFilter:
             self.ignored[reason] += 1
             return reason
         is_first = self.last is None
-        self.last, self._heard, self._session_id = status, now, status.session_id
+        self.last, self._last_arrival, self._session_id = status, now, status.session_id
         self.ignored.clear()
         if settle or is_first:
             self.settle(now)
@@ -254,7 +254,7 @@ class StatusFilter:
             self._reference = (self.last.sequence, self.last.utime, now)
 
     def _reason(self, data: bytes, now: float) -> str:
-        """Returns the reason to ignore a message, from its first bytes and its authentication code, or ""."""
+        """Returns the reason to ignore a message, or "". Only the header and the authentication code are examined."""
         if len(data) < 32 or data[:8] != self._fingerprint:
             return self.UNREADABLE
         utime, sequence, session_id = struct.unpack_from(">qqq", data, 8)
@@ -262,13 +262,13 @@ class StatusFilter:
         if last is None:
             if self._session_id not in (0, session_id):
                 return self.OTHER_SESSION
-        elif now - self._heard <= self._follow_after:
+        elif now - self._last_arrival <= self._follow_after:
             if session_id != last.session_id:
                 return self.OTHER_SESSION
             if sequence <= last.sequence:
                 return self.OLD
             from_sequence, from_utime, then = self._reference
-            most = _FASTEST * (now - then) + _AHEAD
+            most = _MAX_RATE * (now - then) + _MAX_AHEAD
             if sequence - from_sequence > most or not last.utime <= utime <= from_utime + 1e3 * most:
                 return self.JUMP
         if self._key is not None and not self._key.verify(data):

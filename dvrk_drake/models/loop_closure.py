@@ -1,4 +1,4 @@
-"""Closes the kinematic loops of an arm's plant: the parallelogram of an MTM, the remote centre linkage of a PSM."""
+"""Closes the kinematic loops of a plant: the parallelogram of an MTM, the remote centre linkage of a PSM."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import LoopClosure
 from dvrk_drake.models.sdf_model import DRAKE
 
-#: Methods of closing the loops of a linkage: "mimic" couples the joints of a tree, "ball" constrains the cut loops.
+#: Methods of closing the loops of a linkage: "mimic" couples joints of the tree, "ball" adds constraints at the cuts.
 Closure = Literal["mimic", "ball"]
 
 
@@ -33,14 +33,14 @@ def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClos
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
     hinge = next((joint for joint in joints if joint.child_body() is A.body()), None)
     if hinge is None:
-        raise ArmError(f"{A.body().name()}, which carries the frame {loop.frame_a} of a loop, hangs on no joint")
+        raise ArmError(f"{A.body().name()}, the link of frame {loop.frame_a} in loop_closures, has no parent joint")
     p_CH = hinge.frame_on_parent().GetFixedPoseInBodyFrame().translation()
     p_AH = hinge.frame_on_child().GetFixedPoseInBodyFrame().translation()
     plant.AddDistanceConstraint(hinge.parent_body(), p_CH, B.body(), p_BQ, float(np.linalg.norm(p_AP - p_AH)))
 
 
 def remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
-    """Removes the mimic tags of the joints in a loop, and no others.
+    """Removes the mimic tags of the joints in a loop.
 
     The mimic of a rotor or counterweight that follows another joint is kept, because it represents a cable and closes
     no loop.
@@ -60,7 +60,7 @@ def _loop_joints(root: ElementTree.Element, arm: Arm) -> set[str]:
     for loop in arm.loop_closures:
         for frame in (loop.frame_a, loop.frame_b):
             if frame not in frame_link:
-                raise ArmError(f"{', '.join(arm.sdf)}: has no <frame> {frame}, which loop_closures names")
+                raise ArmError(f"{', '.join(arm.sdf)}: <frame> {frame} of loop_closures is missing")
             link = frame_link[frame]
             while link in parent_joint:
                 names.add(parent_joint[link].get("name", ""))

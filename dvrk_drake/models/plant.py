@@ -47,10 +47,10 @@ def add_arm(
             graph needs less time per step.
 
     Raises:
-        ArmError: The closure is unknown, or Drake refuses the arm's SDF.
+        ArmError: The closure is unknown, or Drake cannot load the SDF.
     """
     if closure not in get_args(Closure):
-        raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
+        raise ArmError(f'unknown closure "{closure}"; allowed: {", ".join(get_args(Closure))}')
     # Compared by name, because newer versions of drake have no tamsi.
     if plant.time_step() > 0 and plant.get_discrete_contact_approximation().name == "kTamsi":
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
@@ -73,7 +73,7 @@ def add_arm(
         for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
             plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
     except RuntimeError as error:
-        raise ArmError(f"{', '.join(arm.sdf)}: Drake refuses this model: {error}") from error
+        raise ArmError(f"{', '.join(arm.sdf)}: Drake cannot load this model: {error}") from error
     return instance
 
 
@@ -81,8 +81,8 @@ def check_plant(arm: Arm) -> None:
     """Checks that a plant of the arm can be created with each method of loop closure.
 
     Raises:
-        ArmError: Drake refuses the SDF, no joint holds a link, or the SDF lacks a frame of a loop or one of the frames
-            dh_0, dh_1, ...
+        ArmError: Drake cannot load the SDF, a link has no joint, or a frame of a loop or one of the frames dh_0, dh_1,
+            ... is missing.
     """
     for closure in get_args(Closure):
         try:
@@ -90,18 +90,18 @@ def check_plant(arm: Arm) -> None:
             _check_links_and_frames(plant, arm)
             plant.CalcMassMatrix(plant.CreateDefaultContext())
         except RuntimeError as error:
-            raise ArmError(f"{', '.join(arm.sdf)}: Drake refuses this model: {error}") from error
+            raise ArmError(f"{', '.join(arm.sdf)}: Drake cannot load this model: {error}") from error
 
 
 def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
     where = ", ".join(arm.sdf)
     if floating := [plant.get_body(index).name() for index in plant.GetFloatingBaseBodies()]:
-        raise ArmError(f"{where}: no joint holds {', '.join(sorted(floating))}")
+        raise ArmError(f"{where}: no joint connects {', '.join(sorted(floating))} to the base")
     instance = plant.GetBodyByName("base_link").model_instance()
     names = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
     numbers = {int(match[1]) for name in names if (match := re.fullmatch(r"dh_(\d+)", name))}
     if missing := set(range(max(numbers, default=0))) - numbers:
-        raise ArmError(f"{where}: has a frame dh_{max(numbers)}, but no dh_{min(missing)}")
+        raise ArmError(f"{where}: frame dh_{min(missing)} is missing, but there is a frame dh_{max(numbers)}")
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:
@@ -114,7 +114,7 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
 
 @cache
 def shared_plant(arm: Arm) -> MultibodyPlant:
-    """Returns the finalized plant of an arm for read-only use; it is created once per Arm object."""
+    """Returns the finalized plant of an arm, which is created once per Arm object. Do not modify the plant."""
     return make_arm_plant(arm)
 
 
@@ -125,7 +125,7 @@ def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> No
 
 
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
-    """Returns the index of each of `arm.tree_joint_names` in the plant's q.
+    """Returns the index in the positions of the plant of each joint in `arm.tree_joint_names`.
 
     The indices are also valid for v, because all joints have one degree of freedom.
     """
@@ -134,7 +134,7 @@ def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex 
 
 
 def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: ArrayLike) -> None:
-    """Sets the whole tree, including the linkage, to the pose of the independent joints q (n,)."""
+    """Sets the positions of all joints, including those of the linkage, from the independent joint positions q (n,)."""
     q_plant = plant.GetPositions(context)
     q_plant[tree_selector(plant, arm)] = arm.linkage.position(q)
     plant.SetPositions(context, q_plant)
@@ -143,7 +143,7 @@ def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: Arra
 def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:
     """Returns the torque (n,) on the independent joints that compensates gravity at the context's pose.
 
-    Drake's gravity forces do not include constraints, so they are projected through the linkage: tau = -G' tau_g.
+    The gravity forces of Drake do not include constraints. They are projected through the linkage: tau = -G' tau_g.
     """
     tau_g = plant.CalcGravityGeneralizedForces(context)[tree_selector(plant, arm)]
     return -arm.linkage.pull_back_effort(tau_g)
@@ -152,7 +152,7 @@ def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray
 def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the torques (m, n) that compensate gravity at poses (m, n) of the independent joints [N m, N].
 
-    They are computed from the arm's SDF.
+    The inertial parameters are those of the SDF files.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()

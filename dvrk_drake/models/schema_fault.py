@@ -1,7 +1,7 @@
-"""Checks the content of files and settings made in Python; messages name the key, its value and the accepted values.
+"""Checks the content of files and of objects created in Python. Messages name the key, value and accepted values.
 
 The range of a number is metadata of its field: `field(default=0.05, metadata=within(0.002, 1.0, "s"))`. It applies to
-all numbers in the field, including those in lists and tables. `schema_fault` checks the content of a file,
+all numbers in the field, including those in lists and mappings. `schema_fault` checks the content of a file,
 `number_fault` an object.
 """
 
@@ -18,13 +18,13 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-_ONE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-_MANY = {bool: "true or false", int: "whole numbers", float: "numbers", str: "texts"}
+_ONE = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
+_MANY = {bool: "true or false", int: "integers", float: "numbers", str: "strings"}
 #: Metadata key of a field: the `Range` of all numbers in it.
 RANGE = "range"
 #: Metadata key of a field: its name in files of earlier versions.
 FORMERLY = "formerly"
-#: Mapping from a unit to a unit that may be used by mistake, and the size of that unit.
+#: Mapping from a unit to a unit that is used by mistake, and the size of the latter.
 _MISTAKEN = {
     "rad": ("degrees", math.pi / 180),
     "rad/s": ("degrees/s", math.pi / 180),
@@ -67,7 +67,7 @@ class Range:
         return "".join(f"{number:g} or " for number in self.also) + text
 
     def fault(self, key: str, value: float) -> str:
-        """Returns why the number is not accepted, including the unit that it probably has, or ""."""
+        """Returns a message if the number is not accepted, with the unit that it probably has; "" otherwise."""
         if value in self:
             return ""
         mistaken = [_MISTAKEN[unit] for unit in self.unit.split(" or ") if unit in _MISTAKEN]
@@ -84,7 +84,7 @@ def within(
 
 
 def formerly(name: str) -> dict[str, object]:
-    """Returns metadata of a field that files of earlier versions call `name`; `with_current_keys` renames it."""
+    """Returns metadata of a field whose key in files of earlier versions is `name`, see `with_current_keys`."""
     return {FORMERLY: name}
 
 
@@ -113,7 +113,7 @@ def with_current_keys(schema: Any, content: Any, where: str) -> Any:
     for key, value in content.items():
         name = names.get(key, key)
         if name != key and name not in content:
-            warnings.warn(f'{where}: key "{key}" is now "{name}"', FutureWarning, stacklevel=2)
+            warnings.warn(f'{where}: key "{key}" was renamed to "{name}"', FutureWarning, stacklevel=2)
         else:
             name = key
         current[name] = with_current_keys(hints[name], value, where) if name in hints else value
@@ -123,7 +123,7 @@ def with_current_keys(schema: Any, content: Any, where: str) -> Any:
 def number_fault(instance: object) -> str:
     """Returns a message on the first number in a dataclass that is not finite or out of range, or "".
 
-    The message contains the key of the number. Nested lists, tuples, tables, arrays and dataclasses are searched.
+    The message contains the key of the number. Nested lists, tuples, mappings, arrays and dataclasses are searched.
     Values that are not numbers are ignored.
     """
     return next(_number_faults(instance, "", None), "")
@@ -154,19 +154,19 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
     """Returns a message on the first part of `content` that does not match the schema, or "".
 
     Args:
-        schema: Dataclass of dataclasses, lists, tables with text keys, bool, int, float, str, and optional values of
-            these types. Numbers must be finite and within the range of their field, see `within`.
+        schema: Dataclass of dataclasses, lists, mappings with text keys, bool, int, float, str, and optional values
+            of these types. Numbers must be finite and within the range of their field, see `within`.
         content: Content as returned by yaml_load.
-        what: Kind of file that is expected, e.g. "a file of gains".
+        what: Kind of file that is expected, e.g. "a gains file".
     """
     if not isinstance(content, dict):
-        given = "is empty" if content is None else f"must be keys and values, not {_quoted(content)}"
+        given = "is empty" if content is None else f"must have keys and values, not {_quoted(content)}"
         return f"{given}; allowed in {what}: {_keys(schema)}"
     return next(_faults(schema, content, "", what, None), "")
 
 
 def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None) -> Iterator[str]:
-    """Yields messages on faults; `key` is the key of the value, `what` describes the keys of a table."""
+    """Yields messages on faults; `key` is the key of the value, `what` describes the keys of a mapping."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         if value is not None:
@@ -180,7 +180,7 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
         ranges = {entry.name: entry.metadata.get(RANGE) for entry in dataclasses.fields(schema)}
         for name, entry in value.items():
             if name not in hints:
-                yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {meant(name, hints)}" + (
+                yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {suggest_name(name, hints)}" + (
                     f"allowed in {what}: {_keys(schema)}"
                 )
             else:
@@ -266,9 +266,9 @@ def _described(schema: Any, number: dict[type, str]) -> str:
     if get_origin(schema) is list:
         return f"{'a list' if one else 'lists'} of {_described(arguments[0], _MANY)}"
     if get_origin(schema) is dict:
-        return f"{'a table' if one else 'tables'} of names with {_described(arguments[1], _MANY)}"
+        return f"{'a mapping' if one else 'mappings'} from names to {_described(arguments[1], _MANY)}"
     if dataclasses.is_dataclass(schema):
-        return f"{'a table' if one else 'tables'} with the keys {_keys(schema)}"
+        return f"{'a mapping' if one else 'mappings'} with the keys {_keys(schema)}"
     return number[schema]
 
 
@@ -276,13 +276,13 @@ def _keys(schema: Any) -> str:
     return ", ".join(get_type_hints(schema))
 
 
-def meant(name: object, known: Iterable[str]) -> str:
+def suggest_name(name: object, known: Iterable[str]) -> str:
     """Returns "did you mean ...? " with the known name closest to a wrong name, or "" if there is none or a tie."""
     of_lower_case = {key.lower(): key for key in known}
     given = str(name)[:_MAX_LENGTH].lower()
     near = difflib.get_close_matches(given, of_lower_case, 2)
-    likeness = [difflib.SequenceMatcher(None, other, given).ratio() for other in near]
-    unique = len(set(likeness)) == len(likeness) > 0
+    similarity = [difflib.SequenceMatcher(None, other, given).ratio() for other in near]
+    unique = len(set(similarity)) == len(similarity) > 0
     return f'did you mean "{of_lower_case[near[0]]}"? ' if unique else ""
 
 

@@ -1,4 +1,4 @@
-"""Combines an arm's SDF files into one model, and reads properties that Drake parses but does not expose."""
+"""Combines the SDF files of an arm into one model, and reads properties that Drake parses but does not expose."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKAGE_URL = "package://dvrk_drake/"
 DRAKE = "{http://drake.mit.edu}"
 #: Maximum nesting of elements; the SDF of an arm has 7 levels.
 _MAX_DEPTH = 50
-#: Numbers that SDF files contain for joints without a limit.
+#: Limits of joints without a limit in SDF files.
 _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
 _LENGTHS = Range(1e-6, 10.0, "m")
@@ -72,18 +72,17 @@ def local_path(url: str) -> Path:
 
 
 def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | None = None) -> ElementTree.Element:
-    """Returns the model of the first file, extended by the links, joints and frames of the others (an instrument).
+    """Returns the model of the first file, extended by the links, joints and frames of further files (an instrument).
 
     Relative paths of meshes become absolute. If a file repeats a link of an earlier file, only the shapes of that link
-    are added. In this way an instrument's housing is drawn on the arm's carriage without being a body of its own.
+    are added. This draws the housing of an instrument on the carriage of the arm without a body of its own.
 
     Args:
         urls: Package URLs or paths.
         mirrored: Mapping from a URL to the links of that file that are mirrored (`mirror_links`).
 
     Raises:
-        ArmError: A file is not an SDF with one model, gives an existing link more than shapes and a mass of 0, or lacks
-            a link that is to be mirrored.
+        ArmError: A file is not an SDF with one model, repeats a link with inertia, or lacks a link in `mirrored`.
     """
     root, *others = (_read(local_path(url)) for url in urls)
     for url, part in zip(urls, (root, *others), strict=True):
@@ -130,12 +129,14 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
             raise ArmError(f"joint {name} of the SDF has type {kind!r}; allowed: revolute, prismatic, fixed")
         if kind == "fixed":
             if mimic is not None:
-                raise ArmError(f"joint {name} of the SDF is fixed, so it cannot follow another joint")
+                raise ArmError(f"joint {name} of the SDF is fixed and cannot have <drake:mimic>")
             continue
         if joint.find(".//friction") is not None:
-            raise ArmError(f"joint {name} of the SDF has <friction>, which Drake drops silently; model it elsewhere")
+            raise ArmError(
+                f"joint {name} of the SDF has <friction>, which Drake ignores; use effects.friction of the YAML file"
+            )
         if name in names:
-            raise ArmError(f"the SDF has two joints called {name}")
+            raise ArmError(f"the SDF has two joints named {name}")
         names.append(name)
         if joint.get("type") == "prismatic":
             prismatic.add(name)
@@ -146,7 +147,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
                 float(mimic.get("offset", "0")),
             )
             if mimics[name][1] == 0:
-                raise ArmError(f"joint {name} of the SDF follows another with the multiplier 0; make it fixed instead")
+                raise ArmError(f"joint {name} of the SDF has a mimic multiplier of 0; make the joint fixed instead")
         effort = joint.findtext("axis/limit/effort")
         if effort is not None:
             efforts[name] = float(effort)
@@ -157,9 +158,9 @@ def _read(path: Path) -> ElementTree.Element:
     try:
         root = _parse(read_input(path, ArmError, MAX_TEXT))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ArmError(f"{path}: not a readable SDF: {error}") from error
+        raise ArmError(f"{path}: invalid SDF: {error}") from error
     if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
-        raise ArmError(f"{path}: must hold one <model> in <sdf>, with no <model> or <include> in it")
+        raise ArmError(f"{path}: <sdf> must contain exactly one <model>, without a nested <model> or <include>")
     for link in root.iterfind("model/link"):
         # Required by Drake's parser, which uses 1 kg for a link without <inertial>.
         for inertial in link.findall("inertial"):
@@ -185,7 +186,7 @@ def _parse(content: bytes) -> ElementTree.Element:
             raise ValueError(f"elements are nested deeper than {_MAX_DEPTH} levels")
     parser.close()
     if root is None:
-        raise ValueError("it has no element")
+        raise ValueError("the file has no element")
     return root
 
 
@@ -224,8 +225,8 @@ def _number(word: str) -> float:
         return math.nan
 
 
-def _add_shapes(link: ElementTree.Element, again: ElementTree.Element) -> None:
-    for shape in again:
+def _add_shapes(link: ElementTree.Element, repeated: ElementTree.Element) -> None:
+    for shape in repeated:
         if shape.tag not in ("visual", "collision"):
             raise ArmError(f"link {link.get('name')} has <{shape.tag}> in two files; allowed: <visual>, <collision>")
         link.append(shape)
@@ -247,7 +248,7 @@ def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -
     by_name = {link.get("name", ""): link for link in root.iterfind("model/link")}
     for name in links:
         if name not in by_name:
-            raise ArmError(f'{source}: has no link "{name}" to mirror; its links: {", ".join(by_name)}')
+            raise ArmError(f'{source} has no link "{name}" of mirrored_links; allowed: {", ".join(by_name)}')
         link = by_name[name]
         for pose in link.iterfind("*/pose"):
             _mirror_pose(f"{source}: link {name}", pose)
@@ -266,7 +267,7 @@ def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -
 def _mirror_pose(where: str, pose: ElementTree.Element) -> None:
     numbers = (pose.text or "").split()
     if len(numbers) != 6 or pose.get("relative_to") or pose.get("rotation_format", "euler_rpy") != "euler_rpy":
-        raise ArmError(f"{where}: to be mirrored, a <pose> must be x y z roll pitch yaw in the link's frame")
+        raise ArmError(f"{where}: <pose> of a mirrored link must be x y z roll pitch yaw in the link frame")
     x, y, z, roll, pitch, yaw = map(float, numbers)
     # R = Rz(yaw) Ry(pitch) Rx(roll), and M Rx M = Rx, M Ry M = Ry', M Rz M = Rz'.
     pose.text = " ".join(f"{value + 0.0:.10g}" for value in (-x, y, z, roll, -pitch, -yaw))

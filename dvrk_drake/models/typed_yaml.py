@@ -1,4 +1,4 @@
-"""Reads a YAML file into a schema; an error message names the key, its value and the accepted values."""
+"""Reads YAML files into dataclasses. Error messages name the key, its value and the accepted values."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ Schema = TypeVar("Schema")
 
 #: Maximum nesting and maximum number of values of a file, with expanded aliases. The files of a PSM have 6 and 6000.
 MAX_DEPTH, MAX_VALUES = 50, 1_000_000
-# libyaml's parser is ten times as fast as the Python parser, and its speed does not depend on the nesting.
+# The parser of libyaml is faster than the Python parser, and its speed does not depend on the nesting.
 _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_FastLoader):
-    """YAML loader that refuses duplicate keys in a table. By default YAML uses the last one."""
+    """YAML loader that refuses duplicate keys in a mapping. By default YAML uses the last one."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys: set[str] = set()
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if isinstance(key, yaml.ScalarNode) and key.value != "<<":
                 if key.value in keys:
-                    what = f'key "{key.value}" is there twice'
+                    what = f'duplicate key "{key.value}"'
                     raise yaml.constructor.ConstructorError(None, None, what, key.start_mark)
                 keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
 def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrakeError], what: str) -> Schema:
-    """Returns the content of the file at `path` as the type of the schema.
+    """Returns the content of the file at `path` as an object of the schema.
 
     Args:
         schema: Dataclass, see `schema_fault`.
         path: Path of the file.
         error: Type of error to raise.
-        what: Kind of file that is expected, for the message: "a file of gains".
+        what: Kind of file that is expected, for the message: "a gains file".
 
     Raises:
         DvrkDrakeError: Error of type `error`: the file cannot be read, is not YAML, or does not match the schema.
@@ -50,7 +50,7 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
 
 
 def typed_content(schema: type[Schema], content: Any, where: str, error: type[DvrkDrakeError], what: str) -> Schema:
-    """Converts content that was read already, see `load_typed_yaml`; `where` names its source."""
+    """Converts parsed content as `load_typed_yaml` does; `where` names the source of the content."""
     content = with_current_keys(schema, content, where)
     if fault := schema_fault(schema, content, what):
         raise error(f"{where}: {fault}")
@@ -70,7 +70,7 @@ def load_yaml(path: str | Path, error: type[DvrkDrakeError]) -> Any:
 
 
 def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
-    """Returns the content of a YAML text, None if it is empty; `where` names its source.
+    """Returns the content of a YAML text, None for an empty text; `where` names the source of the text.
 
     Keys that begin with "_" are omitted, because they may hold anchors.
 
@@ -79,16 +79,16 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
     """
     try:
         if excess := _excess(text):
-            raise error(f"{where}: not YAML that can be read: {excess}")
+            raise error(f"{where}: invalid YAML: {excess}")
         content = yaml.load(text, Loader=_Loader)
     except DvrkDrakeError:
         raise
     except Exception as cause:
-        # Errors of various types; only those of YAML contain the line.
+        # The parser raises errors of various types. Only YAML errors contain the line.
         mark, problem = getattr(cause, "problem_mark", None), getattr(cause, "problem", None)
         # At the end of a text libyaml reports one line too many.
         line = "" if mark is None else f"line {min(mark.line, len(text.splitlines()) - 1) + 1}: "
-        raise error(f"{where}: not YAML: {line}{problem or cause}") from cause
+        raise error(f"{where}: invalid YAML: {line}{problem or cause}") from cause
     if isinstance(content, dict):
         return {key: value for key, value in content.items() if not str(key).startswith("_")}
     return content
@@ -97,7 +97,7 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
 def _excess(text: str) -> str:
     """Returns a description of excessive nesting or excessive aliases in a text, or "".
 
-    The parser's events are examined one by one, so that the check stops as soon as a maximum is exceeded.
+    The check processes the events of the parser one by one, and stops as soon as a maximum is exceeded.
     """
     # Number of values so far and anchor of each open collection.
     open_values: list[int] = [0]
@@ -128,7 +128,7 @@ def _excess(text: str) -> str:
 
 
 def _converted(schema: Any, value: Any) -> Any:
-    """Converts a value in which `schema_fault` found no fault to the type of the schema."""
+    """Converts a value that `schema_fault` accepts to the type of the schema."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         (inner,) = (argument for argument in arguments if argument is not types.NoneType)

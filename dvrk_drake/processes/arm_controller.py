@@ -1,4 +1,4 @@
-"""Controller of one arm that computes one command for each status message and has no clock of its own."""
+"""Controller of one arm. It computes one command for each status message."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class ArmController:
     """Gravity compensation or pose hold of one arm, from status message to command message.
 
     The controller is a Diagram of DvrkStatusReceiver, GravityPidController, an optional FrictionCompensator, EffortRamp
-    and DvrkCommandSender. It is stepped by forced updates, so that each status produces one command without waiting for
-    a period. While its efforts are not applied, it commands the measured efforts. When they begin to be applied, it
-    latches the pose to hold and ramps to its own efforts.
+    and DvrkCommandSender. Forced updates step the Diagram, so each status produces one command immediately. While the
+    arm does not apply the commanded efforts, the controller commands the measured efforts. When the arm begins to apply
+    them, the controller latches the pose to hold and ramps to its own efforts.
 
     Attributes:
-        arm: Arm that is controlled.
+        arm: Controlled arm.
     """
 
     def __init__(
@@ -39,15 +39,15 @@ class ArmController:
         friction: FrictionCompensator | None = None,
         gains: Gains | None = None,
     ) -> None:
-        """Creates the controller of `arm`, whose gravity is computed by `model`.
+        """Creates the controller.
 
         Args:
-            arm: Arm whose name is in the messages.
-            model: Model of that arm in its actual mounting.
+            arm: Arm to control.
+            model: Model of the arm in its actual mounting.
             mode: Mode of the controller.
             period: Period of the status messages [s].
-            friction: Compensator of friction in mode "gravity". It becomes part of this controller.
-            gains: Gains for holding and braking. Defaults to the gains of the arm.
+            friction: Friction compensator for mode "gravity", which is added to the Diagram. None: no compensation.
+            gains: Gains for holding and braking. None: the gains of the arm.
         """
         builder = DiagramBuilder()
         self.arm, self._mode = arm, mode
@@ -57,25 +57,25 @@ class ArmController:
         self._sender = builder.AddSystem(DvrkCommandSender(arm))
         builder.Connect(receiver.GetOutputPort("state_estimated"), self._controller.GetInputPort("state_estimated"))
         builder.Connect(receiver.GetOutputPort("effort_measured"), self._ramp.GetInputPort("effort_measured"))
-        wanted = self._controller.GetOutputPort("effort")
+        desired_effort = self._controller.GetOutputPort("effort")
         if friction is not None:
             builder.AddSystem(friction)
             builder.Connect(receiver.GetOutputPort("state_estimated"), friction.GetInputPort("state_estimated"))
-            builder.Connect(wanted, friction.GetInputPort("effort_wanted"))
-            wanted = friction.GetOutputPort("effort")
-        builder.Connect(wanted, self._ramp.GetInputPort("effort_wanted"))
+            builder.Connect(desired_effort, friction.GetInputPort("effort_wanted"))
+            desired_effort = friction.GetOutputPort("effort")
+        builder.Connect(desired_effort, self._ramp.GetInputPort("effort_wanted"))
         builder.Connect(self._ramp.GetOutputPort("effort"), self._sender.GetInputPort("effort"))
         status = builder.ExportInput(receiver.GetInputPort("lcmt_dvrk_status"), "lcmt_dvrk_status")
         builder.ConnectInput(status, self._sender.GetInputPort("lcmt_dvrk_status"))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        # The ports are fixed once: FixValue would deep-copy each message, which takes longer than the rest of a step.
+        # The port is fixed only once. FixValue would deep-copy each message, which is slower than the rest of a step.
         port = self._diagram.GetInputPort("lcmt_dvrk_status")
         self._status = port.FixValue(self._context, AbstractValue.Make(lcmt_dvrk_status()))
         self._ramp_context = self._ramp.GetMyMutableContextFromRoot(self._context)
         self._sender_context = self._sender.GetMyContextFromRoot(self._context)
         self._new_state = self._diagram.AllocateDiscreteVariables()
-        self._act(False)
+        self._set_acting(False)
 
     @property
     def sender_id(self) -> int:
@@ -84,7 +84,7 @@ class ArmController:
 
     @property
     def acting(self) -> bool:
-        """True if the efforts of this controller were applied at the last status."""
+        """True if the arm applied the efforts of this controller at the last status."""
         return self._acting
 
     @property
@@ -95,17 +95,22 @@ class ArmController:
     def answer(
         self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None
     ) -> lcmt_dvrk_command:
-        """Computes the command for `status`, received at `time` [s] of the controller's clock.
+        """Computes the command that answers a status.
 
-        In mode "hold" the arm is regulated to `desired_state` (2n: q_d, then v_d), if given. Otherwise it is regulated
-        to the latched pose.
+        Args:
+            status: Received status.
+            time: Time of arrival on the controller's clock [s].
+            desired_state: Desired state (2n,) in mode "hold": q_d, then v_d. None: the latched pose is held.
+
+        Returns:
+            Command for the arm.
         """
         context = self._context
         context.SetTime(time)
         self._status.GetMutableData().set_value(status)
         acts = status.guard_state == lcmt_dvrk_status.STATE_EFFORT and status.command_sender_id == self.sender_id
         if acts != self._acting:
-            self._act(acts)
+            self._set_acting(acts)
         if desired_state is not None:
             controller_context = self._controller.GetMyMutableContextFromRoot(context)
             self._controller.GetInputPort("desired_state").FixValue(controller_context, desired_state)
@@ -113,8 +118,8 @@ class ArmController:
         context.SetDiscreteState(self._new_state)
         return self._sender.get_output_port().Eval(self._sender_context)
 
-    def _act(self, acting: bool) -> None:
-        """Sets whether efforts are applied from now on. If so, restarts the ramp and latches the pose to hold."""
+    def _set_acting(self, acting: bool) -> None:
+        """Sets whether the arm applies the efforts. If it does, restarts the ramp and latches the pose to hold."""
         self._acting = acting
         self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
         # The change to "hold" latches the pose again and resets the integrator.

@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
-from dvrk_drake.processes.teacher import Leg, RestDetector
+from dvrk_drake.processes.teacher import CubicTrajectory, RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
 
-#: Largest time step of the trajectory between two statuses [s], so that it does not jump after a pause of the computer.
+#: Largest time step of the trajectory between two statuses [s]. It prevents a jump after a pause of the computer.
 _MAX_STEP = 0.01
-#: Longest time until the arm applies efforts [s].
+#: Longest time until the arm applies the commanded efforts [s].
 _START = 10.0
-#: Tolerance of an arm at rest [rad], [m], to which 1.5 encoder counts are added. Time for which the arm must stay
-#: within the tolerance [s]. Time after which a pose is skipped because the arm did not come to rest [s].
+#: Position tolerance [rad], [m] of an arm at rest, to which 1.5 encoder counts are added. Time for which the arm must
+#: stay within the tolerance [s]. Time after which a pose is skipped if the arm has not come to rest [s].
 _REST, _REST_TIME, _SETTLE = (2e-3, 2e-4), 0.5, 10.0
 #: Time over which measurements are averaged [s].
 _MEASURE = 0.25
 #: Duration of braking after a stop during a motion [s].
 _BRAKE = 0.3
 #: Largest tracking error of a joint as a share of its range.
-_ASTRAY = 0.1
-#: Proportional effort of the controller at the start of an approach, as a share of the effort limit. Static friction of
-#: up to half of it is reversed during the approach.
+_MAX_TRACKING_ERROR = 0.1
+#: Proportional effort of the controller at the start of an approach, divided by the effort limit. It defines the
+#: distance of the approach. Static friction of up to half of this effort changes its sign during the approach.
 _APPROACH = 0.3
 
 Steps = Generator[None, None, None]
@@ -44,8 +44,8 @@ class CollectionSettings:
 
     Attributes:
         traverse_time: Time in which a joint may cross its range [s]. It determines the speed between poses.
-        both_sides: If true, each pose is approached from below and from above in all joints and the two measurements
-            are averaged, which cancels Coulomb friction. If false, each pose is measured once, as in the paper.
+        both_sides: If true, each pose is approached from below and from above in all joints. The average of the two
+            measurements cancels Coulomb friction. If false, each pose is measured once, as in the paper.
     """
 
     traverse_time: float = field(default=5.0, metadata=within(1.0, 60.0, "s"))
@@ -53,19 +53,19 @@ class CollectionSettings:
 
     def __post_init__(self) -> None:
         if fault := number_fault(self):
-            raise CollectionError(f"the time to cross a joint's range, {fault}")
+            raise CollectionError(f"collection settings: {fault}")
 
 
 class Collector:
     """Computes the desired state of a controller in "hold" mode, one per status, until all poses are measured.
 
-    The collection always ends with `finished`, and the caller then lets the arm hold itself. It ends after the last
-    pose, after a requested stop (with braking), and if the arm takes over, a joint does not follow or the disk is full.
+    The collection ends after the last pose or after a requested stop, for which the arm brakes. It also ends if the arm
+    takes over, a joint does not follow or the disk is full. `finished` is then true, and the caller commands HOLD.
 
     Attributes:
         finished: True after the end of the collection.
-        problem: Reason for an early end that was not requested.
-        unsettled: Numbers of the poses that were skipped because the arm did not come to rest, starting at 1.
+        problem: Error that ended the collection early, or None.
+        unsettled: Numbers of the skipped poses at which the arm did not come to rest, starting at 1.
         done: Boolean array (m,), true for poses that are in the file.
     """
 
@@ -83,13 +83,13 @@ class Collector:
         """Creates a collector for the arm of `controller`.
 
         Args:
-            poses: Poses (m, n) that were already checked. Poses that are already in `output` are skipped.
+            poses: Checked poses (m, n) [rad, m]. Poses that are already in `output` are skipped.
             controller: Controller that computes the commands.
             output: File for the measurements.
             settings: Settings of the collection.
             stopped: Function that returns whether to stop. It is called once per status.
             report: Function that is called with one line per completed pose.
-            writer: Executor that writes rows. Defaults to a separate thread.
+            writer: Executor that writes the rows of the file. None: a separate thread.
         """
         self.finished = False
         self.problem: DvrkDrakeError | None = None
@@ -99,33 +99,43 @@ class Collector:
         self._poses, self._controller, self._output = poses, controller, output
         self._settings, self._stopped, self._report = settings, stopped, report
         span = arm.position_upper - arm.position_lower
-        self._speed, self._astray = span / settings.traverse_time, _ASTRAY * span
+        self._speed, self._tracking_tolerance = span / settings.traverse_time, _MAX_TRACKING_ERROR * span
         self._approach = _APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
-        self._time, self._heard = 0.0, 0.0
-        self._answers, self._obeyed = AnswerTimes(), lcmt_dvrk_status()
+        self._time, self._status_time = 0.0, 0.0
+        self._answers, self._last_applied = AnswerTimes(), lcmt_dvrk_status()
         self._q = self._tau = np.zeros(arm.num_joints)
         self._desired = np.zeros(2 * arm.num_joints)
-        self._leg_end = 0.0
-        self._stopping = self._hand_guided = False
-        self._what = "waiting for the arm"
+        self._motion_end = 0.0
+        self._stopping = self._in_control = False
+        self._activity = "waiting for the arm"
         # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._steps = self._collect()
 
-    def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
-        """Returns the desired state (2n) after a status. Time is that of the arm, which may be slow."""
+    def update(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
+        """Processes a status and returns the desired state.
+
+        The trajectory advances with the arm's clock, which may be slow.
+
+        Args:
+            status: Received status.
+            time: Time of arrival on the controller's clock [s].
+
+        Returns:
+            Desired state (2n,): q, then v.
+        """
         measured = 1e-6 * status.utime
-        self._time += min(max(measured - self._heard, 0.0), _MAX_STEP)
-        self._heard = measured
+        self._time += min(max(measured - self._status_time, 0.0), _MAX_STEP)
+        self._status_time = measured
         self._answers.add(time)
         # controller.acting refers to the previous status. This status may already report the problem.
         if (status.guard_state, status.command_sender_id) == (status.STATE_EFFORT, self._controller.sender_id):
-            self._obeyed = status
+            self._last_applied = status
         self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
         if self.finished:
             return self._desired
         try:
-            if self._hand_guided:
+            if self._in_control:
                 self._check(status)
             if not self._stopping and self._stopped():
                 self._stopping = True
@@ -138,98 +148,99 @@ class Collector:
         return self._desired
 
     def close(self) -> None:
-        """Closes the file after a pending row is written."""
+        """Waits until a pending row is written, then closes the file."""
         self._writer.shutdown()
         self._output.close()
 
     def describe(self) -> str:
         """Returns a short description of the progress."""
-        return f"{np.count_nonzero(self.done)} of {len(self.done)} poses, {self._what}"
+        return f"{np.count_nonzero(self.done)} of {len(self.done)} poses, {self._activity}"
 
     def _check(self, status: lcmt_dvrk_status) -> None:
         if not self._controller.acting:
-            why = takeover_reason(status, self._obeyed, self._answers)
-            raise CollectionError(f"{self._arm.name} took over and holds: {why}")
+            reason = takeover_reason(status, self._last_applied, self._answers)
+            raise CollectionError(f"{self._arm.name} took over and holds: {reason}")
         n = self._arm.num_joints
-        away = np.abs(self._q - self._desired[:n]) / self._astray
+        away = np.abs(self._q - self._desired[:n]) / self._tracking_tolerance
         if away.max() > 1:
             j = int(np.argmax(away))
+            unit = "m" if self._arm.prismatic[j] else "rad"
             raise CollectionError(
-                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g}, wanted at "
-                f"{self._desired[j]:.3g}. Is something in its way, or the model wrong?"
+                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g} {unit}, its "
+                f"target is {self._desired[j]:.3g} {unit}. Check for an obstacle, then validate the model."
             )
 
     def _collect(self) -> Steps:
         yield from self._begin()
         began, before = self._time, np.count_nonzero(self.done)
         for k in np.flatnonzero(~self.done):
-            yield from self._visit(int(k))
+            yield from self._measure_pose(int(k))
             if self.done[k]:
                 count = np.count_nonzero(self.done)
                 left = (self._time - began) / (count - before) * np.count_nonzero(~self.done[k:])
                 self._report(f"pose {k + 1} measured, {count} of {len(self.done)}; about {left / 60:.1f} min left")
 
     def _begin(self) -> Steps:
-        """Waits until the efforts are fully applied. The desired pose is the one at which they began to be applied."""
+        """Waits until the arm applies the efforts and their ramp is complete. Holds the pose at which this began."""
         began = self._time
         while not self._controller.acting:
             if self._time - began > _START:
                 late = self._answers.lateness()
                 raise CollectionError(
-                    f"{self._arm.name} did not let efforts act within {_START:.0f} s" + (late and f": {late}")
+                    f"{self._arm.name} did not apply efforts within {_START:.0f} s" + (late and f": {late}")
                 )
             self._desired = np.concatenate([self._q, np.zeros_like(self._q)])
             yield
-        self._hand_guided = True
-        self._what = "taking over"
+        self._in_control = True
+        self._activity = "taking over"
         while not self._controller.ramped:
             yield
 
-    def _visit(self, k: int) -> Steps:
-        """Measures pose `k` from one or both sides."""
+    def _measure_pose(self, k: int) -> Steps:
+        """Moves the arm to pose `k` from one or both sides and writes the measurement."""
         pose = self._poses[k]
         measured: list[NDArray[np.float64]] = []
         for side in (-1, 1) if self._settings.both_sides else (0,):
-            self._what = f"going to pose {k + 1}"
+            self._activity = f"going to pose {k + 1}"
             if side:
-                yield from self._go(beside(self._arm, pose, side * self._approach))
-            yield from self._go(pose)
-            self._what = f"settling at pose {k + 1}"
+                yield from self._move_to(offset_pose(self._arm, pose, side * self._approach))
+            yield from self._move_to(pose)
+            self._activity = f"settling at pose {k + 1}"
             if not (yield from self._settle()):
                 self.unsettled.append(k + 1)
-                self._report(f"pose {k + 1} left out: not at rest within {_SETTLE:.0f} s")
+                self._report(f"pose {k + 1} skipped: the arm did not come to rest within {_SETTLE:.0f} s")
                 return
-            self._what = f"measuring pose {k + 1}"
+            self._activity = f"measuring pose {k + 1}"
             measured.append((yield from self._measure()))
         row = np.split(np.mean(measured, axis=0), 2)
         if self._settings.both_sides:
             row.append((measured[0] - measured[1])[self._arm.num_joints :] / 2)
         yield from self._write(k, *row)
 
-    def _go(self, q_end: NDArray[np.float64]) -> Steps:
-        leg = Leg.between(self._desired[: self._arm.num_joints], q_end, self._speed)
-        yield from self._follow(leg)
+    def _move_to(self, q_end: NDArray[np.float64]) -> Steps:
+        trajectory = CubicTrajectory.rest_to_rest(self._desired[: self._arm.num_joints], q_end, self._speed)
+        yield from self._follow(trajectory)
 
-    def _follow(self, leg: Leg) -> Steps:
-        began, self._leg_end = self._time, self._time + leg.duration
-        while self._time < self._leg_end:
-            self._desired = leg.state(self._time - began)
+    def _follow(self, trajectory: CubicTrajectory) -> Steps:
+        began, self._motion_end = self._time, self._time + trajectory.duration
+        while self._time < self._motion_end:
+            self._desired = trajectory.state(self._time - began)
             yield
-        self._desired = leg.state(leg.duration)
+        self._desired = trajectory.state(trajectory.duration)
 
     def _settle(self) -> Generator[None, None, bool]:
-        """Waits for the arm to come to rest and returns whether it did in time."""
+        """Waits until the arm is at rest. Returns False if it does not come to rest in time."""
         tolerance = self._arm.per_joint(*_REST) + 1.5 * self._arm.encoder_counts()
         detector = RestDetector(tolerance, _REST_TIME)
         end = self._time + _SETTLE
-        while not detector.rests(self._time, self._q):
+        while not detector.is_at_rest(self._time, self._q):
             if self._time > end:
                 return False
             yield
         return True
 
     def _measure(self) -> Generator[None, None, NDArray[np.float64]]:
-        """Returns the means of q, then tau (2n,)."""
+        """Returns the means of q (n,) and tau (n,) over `_MEASURE`, concatenated."""
         end = self._time + _MEASURE
         samples = []
         while self._time < end:
@@ -238,7 +249,7 @@ class Collector:
         return np.mean(samples, axis=0)
 
     def _write(self, k: int, *row: NDArray[np.float64]) -> Steps:
-        self._what = f"writing pose {k + 1}"
+        self._activity = f"writing pose {k + 1}"
         writing = self._writer.submit(self._store, k, *row)
         while not writing.done():
             yield
@@ -249,8 +260,8 @@ class Collector:
         self.done[k] = True
 
     def _brake(self) -> Steps:
-        """Brakes to rest, at the end of the leg if that is close. A shorter stop on the leg stays inside the limits."""
-        self._what = "stopping"
-        if self._hand_guided:
-            duration = min(_BRAKE, max(self._leg_end - self._time, 1e-3))
-            yield from self._follow(Leg.braking(self._desired, duration))
+        """Brakes to rest, at the latest at the end of the trajectory, so the arm stays inside the limits."""
+        self._activity = "stopping"
+        if self._in_control:
+            duration = min(_BRAKE, max(self._motion_end - self._time, 1e-3))
+            yield from self._follow(CubicTrajectory.braking(self._desired, duration))

@@ -29,30 +29,31 @@ from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 #: Time without a status after which an arm is considered absent, and the longer time for its first status [s].
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
-#: Longest period of the measurements [us]. With its own gains a PSM oscillates at 7 ms and an MTM at 10 ms.
+#: Longest period of the measurements [us]. With the gains of the arm files, a PSM oscillates at a period of 7 ms and an
+#: MTM at 10 ms.
 _MAX_PERIOD = 5000
 
-#: Length of the queue of statuses, beyond which new ones are dropped. Number of statuses that are processed at once, so
-#: that a flood of messages cannot keep a controller from responding.
+#: Length of the queue of statuses; further statuses are dropped. Number of statuses that are processed at once, which
+#: limits the delay that a flood of messages can cause.
 _QUEUE, _MESSAGES_AT_ONCE = 100, 200
 
 #: Number of statuses that are inspected before an arm is controlled.
 _FIRST_STATUSES = 60
 
-#: Longest time until the arm confirms that it holds itself [s].
+#: Longest time until the arm confirms HOLD [s].
 _RELEASE = 1.0
 
-#: Longest time for which a guard reserves its place for a silent sender, plus a margin [s].
-_FORGOTTEN = 1.1
+#: Longest time for which a guard ignores new senders after the last command of a sender, plus a margin [s].
+_SENDER_RESERVED = 1.1
 
-#: Longest time in which commands may be refused or monitored without being applied [s]. The start guard takes 0.25 s.
+#: Longest time without applied commands [s]. The start check of the guard takes 0.25 s.
 _TIMEOUT = 10.0
 
 #: Advice for an arm that has a fault or waits for an operator.
 _RESET = "Look at the arm, then start again with --reset"
 
-#: Period in which `tell` is called with the live status [s].
-_TELL = 0.2
+#: Period in which `report` is called with the live status [s].
+_REPORT_PERIOD = 0.2
 
 
 class ArmLink:
@@ -72,10 +73,10 @@ class ArmLink:
         Args:
             arm: Arm whose statuses are received.
             url: URL of the LCM network.
-            key: Key that statuses must be signed with and that signs commands. None: messages are not signed.
-            before: Status of the session to be controlled. None: the first session that is received.
-            replays: Also accepts statuses of any session and time, for example from a replayed log. It must not be used
-                for a controller because old statuses would determine the commands.
+            key: Key that must have signed the statuses, and that signs the commands. None: messages are not signed.
+            before: Status of the session to use. None: the first received session.
+            replays: True to accept statuses of any session and time, for example from a replayed log. Must be False for
+                a controller, because old statuses would determine the commands.
         """
         self.arm, self.lost, self._replays, self._key = arm, 0, replays, key
         self._session = 0 if before is None else before.session_id
@@ -83,13 +84,13 @@ class ArmLink:
         self._lcm = lcm.LCM(url)
         self._last: lcmt_dvrk_status | None = None
         self._is_new = False
-        self._subscription = self._lcm.subscribe(status_channel(arm), self._hear)
+        self._subscription = self._lcm.subscribe(status_channel(arm), self._receive)
         self._subscription.set_queue_capacity(_QUEUE)
 
     def close(self) -> None:
         """Stops receiving and ends LCM's receive thread, which otherwise wakes up for every message."""
         self._lcm.unsubscribe(self._subscription)
-        # The subscription references this link and LCM, which the garbage collector cannot detect.
+        # The garbage collector does not detect the references of the subscription to this link and to LCM.
         del self._subscription, self._lcm
 
     def now(self) -> float:
@@ -100,7 +101,7 @@ class ArmLink:
         """Returns the newest status of the session that arrives within `seconds`.
 
         Raises:
-            ControllerError: No status arrived. The message lists the statuses that were received and ignored.
+            ControllerError: No status arrived. The message lists ignored statuses.
         """
         end = time.monotonic() + seconds
         self._is_new = False
@@ -112,7 +113,7 @@ class ArmLink:
         self._filter.settle(self.now())
         if not self._is_new or self._last is None:
             raise ControllerError(
-                f"no status of {self.arm.name} for {seconds:g} s on {status_channel(self.arm)}{self._instead()}"
+                f"no status of {self.arm.name} for {seconds:g} s on {status_channel(self.arm)}{self._ignored_text()}"
             )
         return self._last
 
@@ -121,19 +122,19 @@ class ArmLink:
         data = command.encode()
         self._lcm.publish(command_channel(self.arm), data if self._key is None else self._key.sign(data))
 
-    def _hear(self, channel: str, data: bytes) -> None:
+    def _receive(self, channel: str, data: bytes) -> None:
         if self._replays:
             status = decode(lcmt_dvrk_status, data)
             if status is None or (status.arm_name, status.num_joints) != (self.arm.name, self.arm.num_joints):
                 return
-        elif (status := self._filter.take(data, self.now(), settle=False)) is None:
+        elif (status := self._filter.accept(data, self.now(), settle=False)) is None:
             return
         elif self._last is not None:
             self.lost += status.sequence - self._last.sequence - 1
         self._last, self._is_new = status, True
 
-    def _instead(self) -> str:
-        """Describes the statuses that were ignored since the last accepted one, or returns ""."""
+    def _ignored_text(self) -> str:
+        """Describes the statuses that were ignored since the last accepted status, or returns ""."""
         ignored = self._filter.ignored.most_common()
         if not ignored:
             return ""
@@ -145,18 +146,21 @@ class ArmLink:
 
 
 def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
-    """Returns the first status of an arm that may be controlled, and the period of its statuses [s].
+    """Waits for the first status and checks that the arm may be controlled.
+
+    Returns:
+        First status, and the period of the statuses [s].
 
     Raises:
-        ControllerError: There is no arm, it has a fault, it waits for an operator, its state is unknown, its pose is
-            outside the limits, it does not accept efforts, or its measurements are too infrequent.
+        ControllerError: No status arrives, or the arm has a fault, waits for an operator, measures values that are not
+            finite, is outside its limits, does not accept efforts, or measures too infrequently.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     _check(status, name)
     if not np.all(np.isfinite([*status.position, *status.velocity, *status.effort_measured])):
-        raise ControllerError(f"{name} does not know its state: a position, velocity or effort is not finite")
+        raise ControllerError(f"{name}: a measured position, velocity or effort is not finite. Check its sensors first")
     if violations := link.arm.limit_violations(status.position):
-        raise ControllerError(f"{name} stands outside its limits: {'; '.join(violations)}. Move it inside first")
+        raise ControllerError(f"{name} is outside its limits: {'; '.join(violations)}. Move it inside first")
     if not status.accepted_modes >> lcmt_dvrk_command.EFFORT & 1:
         raise ControllerError(f"{name} does not accept efforts now; its state is {describe_state(status.guard_state)}")
     utimes = [status.utime]
@@ -165,118 +169,127 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         _check(later, name)
         utimes.append(later.utime)
     if not (later.sequence > status.sequence and later.utime > status.utime):
-        raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
-    # The smallest period is used because a busy computer misses some. Statuses of one measurement have the same utime.
+        raise ControllerError(
+            f"{name}: utime or sequence of its status does not increase. Restart its driver or bridge"
+        )
+    # The smallest interval is the period, because a busy computer may miss statuses. Statuses of one measurement have
+    # the same utime.
     gaps = np.diff(np.unique(utimes))
     if min(gaps) > _MAX_PERIOD:
         raise ControllerError(
-            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs {1e6 / _MAX_PERIOD:.0f} Hz, better 1 kHz"
+            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs at least {1e6 / _MAX_PERIOD:.0f} Hz "
+            "(1 kHz is recommended)"
         )
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
 
 
-def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
-    """Clears the latched fault of the arm, or resumes after its watchdog took over. The arm then holds itself.
+def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
+    """Clears the latched fault of the arm, or resumes after the watchdog took over. The arm is then in HOLD.
 
     Args:
         link: Channels of the arm.
-        tell: Function that is called with the fault, or the reason of the watchdog, before it is cleared.
+        report: Function that is called with a description of the fault, or of the reason why the watchdog took over.
 
     Raises:
-        ControllerError: There is no arm, or its fault or hold remains because the cause persists.
+        ControllerError: No status arrives, or the fault remains because its cause persists.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     if status.fault_code == lcmt_dvrk_status.FAULT_NONE and not status.fault_text:
         return
     fault = status.fault_text
     if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
-        tell(f"{name} took over and waits for an operator, who resumes now: {fault}")
+        report(f"{name} took over and waits for an operator, who resumes now: {fault}")
     else:
-        tell(f"{name} has a fault, which is reset now: {fault}")
+        report(f"{name} has a fault, which is reset now: {fault}")
     sender = DvrkCommandSender(link.arm)
     context = sender.CreateDefaultContext()
     start = link.now()
-    # The guard detects a change of the flag from false to true.
+    # The guard requires a change of the flag from false to true.
     for reset in [0.0, 0.0, *[1.0] * 20]:
         context.SetTime(link.now() - start)
         sender.GetInputPort("reset_fault").FixValue(context, np.array([reset]))
         sender.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
         link.send(sender.get_output_port().Eval(context))
         status = link.next_status(_SILENCE)
-    # The guard reserves its place for this sender for up to a second and would ignore a new one in that time.
-    end = link.now() + _FORGOTTEN
+    # For up to a second, the guard would ignore a new sender.
+    end = link.now() + _SENDER_RESERVED
     while link.now() < end:
         status = link.next_status(_SILENCE)
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
-        raise ControllerError(f"{name} has a fault that stays: {status.fault_text or fault}")
+        raise ControllerError(f"{name} still has a fault after the reset: {status.fault_text or fault}")
     if status.fault_text:
         raise ControllerError(f"{name} does not resume: {status.fault_text}")
 
 
 def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda: "") -> None:
-    """Raises an error for an arm that has a fault, waits for an operator, or adds its own gravity compensation.
+    """Raises a ControllerError if the arm has a fault, waits for an operator, or adds its own gravity compensation.
 
-    `late` describes late answers, which may be the reason why the arm took over. It returns "" if there are none.
+    Args:
+        status: Status of the arm.
+        name: Name of the arm.
+        late: Function that describes late answers, which may be the reason why the arm took over. It returns "" if
+            there are none.
     """
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
         raise ControllerError(f"{name} has a fault: {status.fault_text}. {_RESET}")
     if status.fault_text:
-        why = "; ".join(filter(None, [status.fault_text, late()]))
-        raise ControllerError(f"{name} took over and holds: {why}. {_RESET}")
+        reason = "; ".join(filter(None, [status.fault_text, late()]))
+        raise ControllerError(f"{name} took over and holds: {reason}. {_RESET}")
     if status.gravity_compensation:
         raise ControllerError(
-            f"{name} adds gravity compensation of its own, and two of them throw the arm upward: switch it off there "
-            "(gravity_compensation in its status)"
+            f"{name} adds its own gravity compensation. Together with this controller, it would throw the arm upward. "
+            "Switch it off in the arm's driver (gravity_compensation in its status)"
         )
 
 
-#: Function of a status and the time [s] that returns the desired state (2n), or None for the latched pose.
-Lead = Callable[[lcmt_dvrk_status, float], NDArray[np.float64] | None]
+#: Function that is called with a status and its time of arrival [s]. It returns the desired state (2n,), or None to
+#: hold the latched pose.
+StatusHandler = Callable[[lcmt_dvrk_status, float], NDArray[np.float64] | None]
 
 
 def control(
     link: ArmLink,
     controller: ArmController,
     stopped: Callable[[], bool],
-    tell: Callable[[LiveStatus], None],
-    lead: Lead = lambda status, time: None,
+    report: Callable[[LiveStatus], None],
+    on_status: StatusHandler = lambda status, time: None,
 ) -> None:
-    """Answers every status until `stopped`, then lets the arm hold itself.
+    """Answers every status until `stopped` returns true, then commands HOLD.
 
     Args:
         link: Channels of the arm.
         controller: Controller that computes the commands.
         stopped: Function that returns whether to stop. It is called once per status.
-        tell: Function that is called with the live status a few times per second.
-        lead: Function that returns the desired state. It is called once per status.
+        report: Function that is called with the live status a few times per second.
+        on_status: Function that returns the desired state; see `StatusHandler`. It is called once per status.
 
     Raises:
-        ControllerError: The arm stopped sending, restarted, had a fault, took over, or applies no commands.
+        ControllerError: The arm stopped sending, restarted, had a fault, took over, or applied no commands.
     """
     start = link.now()
     first = link.next_status(_SILENCE)
-    live, tell_at, acted, before = LiveStatusMaker(controller.sender_id, first), _TELL, 0.0, first
+    live, next_report, acted, before = LiveStatusMaker(controller.sender_id, first), _REPORT_PERIOD, 0.0, first
     answers = AnswerTimes()
     while not stopped():
         status = link.next_status(_SILENCE)
         now = link.now() - start
         answers.add(now)
         _check(status, link.arm.name, answers.lateness)
-        link.send(controller.answer(status, now, lead(status, now)))
+        link.send(controller.answer(status, now, on_status(status, now)))
         live.answer(status, now)
         if controller.acting:
             acted, before = now, status
         elif now > acted + _TIMEOUT:
-            why = takeover_reason(status, before, answers)
-            raise ControllerError(f"{link.arm.name} lets no command act for {_TIMEOUT:g} s; {why}")
-        if now >= tell_at:
-            tell(live.make(status, now, link.lost))
-            tell_at = now + _TELL
+            reason = takeover_reason(status, before, answers)
+            raise ControllerError(f"{link.arm.name} applied no command for {_TIMEOUT:g} s: {reason}")
+        if now >= next_report:
+            report(live.make(status, now, link.lost))
+            next_report = now + _REPORT_PERIOD
     _release(link, controller, start)
 
 
 def _release(link: ArmLink, controller: ArmController, start: float) -> None:
-    """Requests that the arm hold itself until its status confirms it."""
+    """Commands HOLD until the status confirms it."""
     end = link.now() + _RELEASE
     while link.now() < end:
         status = link.next_status(_SILENCE)
@@ -286,4 +299,4 @@ def _release(link: ArmLink, controller: ArmController, start: float) -> None:
         command = controller.answer(status, link.now() - start)
         command.control_mode = lcmt_dvrk_command.HOLD
         link.send(command)
-    raise ControllerError(f"{link.arm.name} did not confirm that it holds; without commands it does after its expiry")
+    raise ControllerError(f"{link.arm.name} did not confirm HOLD. It holds when the last command expires")

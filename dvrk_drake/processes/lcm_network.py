@@ -1,4 +1,4 @@
-"""Opens an LCM network and raises an error if it is not usable. LCM itself only writes to stderr and continues."""
+"""Opens an LCM network and raises an error if it is not usable. LCM only writes an error to stderr and continues."""
 
 from __future__ import annotations
 
@@ -11,13 +11,19 @@ from pydrake.lcm import DrakeLcm, DrakeLcmParams
 
 from dvrk_drake.errors import DvrkDrakeError
 
-#: Longest time for a message to this process on a busy computer, and time between attempts, because UDP may lose
-#: messages [s].
+#: Longest time for a message to this process on a busy computer [s]. Time between two attempts [s], which are needed
+#: because UDP may lose messages.
 _OWN_MESSAGES, _NEXT_MESSAGE = 5.0, 0.2
 
 
 def open_lcm(url: str = "") -> DrakeLcm:
-    """Opens the network at `url`. An empty URL selects the environment's LCM_DEFAULT_URL or LCM's default.
+    """Opens an LCM network.
+
+    Args:
+        url: URL of the network. Empty: LCM_DEFAULT_URL of the environment, or LCM's default.
+
+    Returns:
+        LCM interface of the network.
 
     Raises:
         DvrkDrakeError: LCM does not support the URL, or this process does not receive its own messages.
@@ -34,17 +40,19 @@ def open_lcm(url: str = "") -> DrakeLcm:
             own.publish(channel, b"")
             handle_message(own, _NEXT_MESSAGE)
     except (RuntimeError, OSError) as error:
-        raise DvrkDrakeError(f'LCM network "{name}" cannot be used: {error}; e.g. udpm://239.255.76.67:7667') from error
+        raise DvrkDrakeError(
+            f'LCM network "{name}" cannot be used: {error}. Use a URL such as udpm://239.255.76.67:7667'
+        ) from error
     if not received:
         raise DvrkDrakeError(
-            f'LCM network "{name}" carries no message: is there a route for its multicast address? On one machine: '
+            f'LCM network "{name}" does not deliver messages. Add a route for its multicast address. On one machine: '
             "ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo"
         )
     return network
 
 
 def handle_message(network: lcm.LCM, seconds: float) -> bool:
-    """Handles one message if it arrives within `seconds`. Unlike lcm's handle_timeout, it does not fail on a signal."""
+    """Handles one message if it arrives within `seconds`, and returns whether it did. A signal causes no error."""
     ready, _, _ = select.select([network.fileno()], [], [], seconds)
     if ready:
         network.handle()
@@ -52,7 +60,7 @@ def handle_message(network: lcm.LCM, seconds: float) -> bool:
 
 
 def listen(network: lcm.LCM, seconds: float) -> None:
-    """Handles the messages that arrive within `seconds`, so that few messages are pending when a tick begins."""
+    """Handles the messages that arrive within `seconds`."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         handle_message(network, left)

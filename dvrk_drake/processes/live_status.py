@@ -19,12 +19,18 @@ class LiveLine:
     """Status line in a terminal that is updated at most four times per second."""
 
     def __init__(self, stream: TextIO, period: float = 0.25, clock: Callable[[], float] = time.monotonic) -> None:
-        """Creates a line on `stream` if it is a terminal. `period` [s] and `clock` are for tests."""
+        """Creates a status line.
+
+        Args:
+            stream: Stream to write to. If it is not a terminal, nothing is written.
+            period: Least time between two updates [s].
+            clock: Function that returns a monotonic time [s].
+        """
         self._stream, self._period, self._clock = stream, period, clock
         self._next = clock()
 
     def show(self, text: Callable[[], str]) -> None:
-        """Updates the line if the period has elapsed. Only then is `text` called."""
+        """Updates the line with the result of `text` if the period has elapsed."""
         now = self._clock()
         if not self._stream.isatty() or now < self._next:
             return
@@ -43,16 +49,16 @@ class LiveLine:
         self._stream.flush()
 
 
-#: Time window in which answers are counted [s]. Interval between answers that may be too long for the arm's guard [s].
+#: Time window in which answers are counted [s]. Interval between answers above which the controller is too slow [s].
 _WINDOW, _LATE = 1.0, 0.02
-#: Reasons for refused commands if the sender or the arm is slow.
+#: Reasons of the guard for refusing commands if the sender or the arm is slow.
 _REFUSED_IF_LATE = (
     lcmt_dvrk_status.REFUSAL_STALE,
     lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER,
     lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP,
     lcmt_dvrk_status.REFUSAL_CLOCK_JUMP,
 )
-#: Reasons for refused commands until the last accepted command expires.
+#: Reasons of the guard for refusing all commands until the last accepted command expires.
 _EXPIRED_IF_REFUSED = (lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP, lcmt_dvrk_status.REFUSAL_CLOCK_JUMP)
 
 
@@ -63,7 +69,7 @@ class LiveStatus:
     Attributes:
         state: State of the guard.
         pace: Rate, round-trip time and lost messages.
-        problem: Reason for commands that were refused or expired since the last status, or "".
+        problem: Reasons why commands were refused, ignored or expired since the previous live status, or "".
     """
 
     state: str
@@ -75,11 +81,11 @@ class LiveStatus:
 
 
 class LiveStatusMaker:
-    """Counts the answers between two live statuses."""
+    """Computes live statuses from the answers of a controller."""
 
     def __init__(self, sender_id: int, first: lcmt_dvrk_status) -> None:
-        """Starts the counts for a sender at the arm's `first` status. A restarted arm requires a new object."""
-        self._sender_id, self._before, self._told_at = sender_id, first, 0.0
+        """Starts the counts for a sender at the `first` status of the arm. A restarted arm requires a new object."""
+        self._sender_id, self._before, self._last_time = sender_id, first, 0.0
         self._answered = 0
         self._trips: deque[float] = deque(maxlen=1000)
 
@@ -90,23 +96,29 @@ class LiveStatusMaker:
             self._trips.append(time - 1e-6 * status.command_utime)
 
     def make(self, status: lcmt_dvrk_status, time: float, lost: int) -> LiveStatus:
-        """Returns the live status since the previous one. `lost` is the number of statuses that were not received."""
-        rate = self._answered / (time - self._told_at)
+        """Returns the live status for the time since the previous one.
+
+        Args:
+            status: Last status of the arm.
+            time: Time of the sender's clock [s].
+            lost: Number of statuses that were not received.
+        """
+        rate = self._answered / (time - self._last_time)
         trip = f"round trip {1e3 * float(np.median(self._trips)):.2f} ms" if self._trips else "no command accepted yet"
         problem = []
         if status.num_refused > self._before.num_refused:
             problem.append(f"refused: {describe_refusal(status.refusal_code)}")
         if status.num_ignored > self._before.num_ignored:
-            problem.append(f"messages that the arm ignores: {describe_refusal(status.ignored_code)}")
+            problem.append(f"the arm ignores messages: {describe_refusal(status.ignored_code)}")
         if status.num_expired > self._before.num_expired:
-            problem.append("no command for so long that the arm took over")
-        self._before, self._told_at, self._answered = status, time, 0
+            problem.append("the last command expired and the arm took over")
+        self._before, self._last_time, self._answered = status, time, 0
         pace = f"{rate:.0f} Hz, {trip}, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))
 
 
 class AnswerTimes:
-    """Times of a controller's answers in the last second, for their rate and longest interval."""
+    """Times of a controller's answers in the last second, from which it computes their rate and longest interval."""
 
     def __init__(self) -> None:
         self._times: deque[float] = deque()
@@ -118,13 +130,13 @@ class AnswerTimes:
             self._times.popleft()
 
     def lateness(self) -> str:
-        """Describes the rate and longest interval if answers were too infrequent. Otherwise returns ""."""
+        """Describes the rate and longest interval of the answers if they were too infrequent, otherwise returns ""."""
         intervals = np.diff(np.array(self._times))
         if not len(intervals) or intervals.max() <= _LATE:
             return ""
         return (
-            f"this computer, or that of the arm, is too slow: {1 / intervals.mean():.0f} answers per second, and "
-            f"{1e3 * intervals.max():.0f} ms between two of them. End other programs, or use --realtime"
+            f"this computer, or that of the arm, is too slow: {1 / intervals.mean():.0f} answers per second, longest "
+            f"interval {1e3 * intervals.max():.0f} ms. End other programs, or use --realtime"
         )
 
 
@@ -133,17 +145,17 @@ def takeover_reason(status: lcmt_dvrk_status, before: lcmt_dvrk_status, answers:
 
     Args:
         status: Status in which the arm does not accept commands.
-        before: Last status in which it did. Earlier refusal codes are ignored.
-        answers: Times of the answers to its statuses.
+        before: Last status in which the arm accepted commands. Earlier refusals are not considered.
+        answers: Times of the answers to the statuses.
     """
     expired, refused = status.num_expired > before.num_expired, status.num_refused > before.num_refused
     late = answers.lateness()
     if late and (expired or not refused or status.refusal_code in _REFUSED_IF_LATE):
         return late
     if expired and not (refused and status.refusal_code in _EXPIRED_IF_REFUSED):
-        return "commands came too late for it (use --realtime)"
+        return "commands arrived too late (use --realtime)"
     if refused:
-        return f"the last refusal is: {describe_refusal(status.refusal_code)}"
+        return f"last refused command: {describe_refusal(status.refusal_code)}"
     if status.num_ignored > before.num_ignored:
-        return f"messages that it ignores: {describe_refusal(status.ignored_code)}"
+        return f"the arm ignores messages: {describe_refusal(status.ignored_code)}"
     return f"its state is {describe_state(status.guard_state)}"

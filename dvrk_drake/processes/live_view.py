@@ -15,12 +15,12 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.processes.control import ArmLink
 from dvrk_drake.systems.arm_view import ArmView
 
-#: Time to wait for a status before the last pose is kept [s]. It is short so that a page closes immediately.
+#: Longest time to wait for a status [s]. It is short, so that the view can be closed at any time.
 _TIMEOUT = 0.2
 
 
 def show_status(view: ArmView, link: ArmLink) -> None:
-    """Displays the pose of the newest status. Without a status, or if it is not finite, the last pose is kept."""
+    """Displays the pose of the newest status. Keeps the last pose without a status, or if the pose is not finite."""
     try:
         q = link.next_status(_TIMEOUT).position
     except ControllerError:
@@ -29,7 +29,7 @@ def show_status(view: ArmView, link: ArmLink) -> None:
         view.show(q)
 
 
-# Looked up before a fork, because few operations are safe after it.
+# This symbol is looked up before the fork, because few operations are safe after a fork.
 _prctl = getattr(ctypes.CDLL(None), "prctl", None)
 _PR_SET_PDEATHSIG = 1
 
@@ -43,8 +43,8 @@ def _end_with_parent() -> None:
 def live_view(arm: str, url: str) -> Iterator[subprocess.Popen]:
     """Runs `dvrk-drake view --live` for an arm (name or path) in a process that ends with the context.
 
-    A separate process is required because drawing would delay a loop at 1 kHz. On Linux it also ends if the parent
-    process is killed.
+    A separate process is required because drawing would delay a loop at 1 kHz. On Linux, the process also ends if the
+    parent process is killed.
     """
     command = [sys.executable, "-m", "dvrk_drake.cli", "view", "--arm", arm, "--live", "--lcm-url", url]
     viewer = subprocess.Popen(command, preexec_fn=_end_with_parent)  # noqa: PLW1509

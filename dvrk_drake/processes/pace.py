@@ -1,4 +1,4 @@
-"""Periodic execution by the wall clock, and real-time scheduling where the system permits it."""
+"""Periodic execution by the wall clock, and real-time scheduling if the system permits it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from collections.abc import Callable
 #: Priority of SCHED_FIFO. It is above all processes that are not real-time and below the kernel's own threads at 99.
 _PRIORITY = 50
 
-#: Delay beyond which a loop does not catch up but continues from the current time [s].
+#: Longest delay [s] that a loop makes up for. After a longer delay, the loop continues from the current time.
 _MAX_DELAY = 0.1
 
 
 class Pace:
     """Periodic ticks of the monotonic clock, which is not affected by changes of the system time.
 
-    After a late tick the next ones follow immediately until the loop has caught up. If it is more than 0.1 s late, it
+    After a late tick, the next ticks follow immediately until the loop is on time. A loop that is more than 0.1 s late
     continues from the current time.
 
     Attributes:
@@ -31,7 +31,13 @@ class Pace:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Starts ticks every `period` [s] with the first one now. `clock` and `sleep` are for tests."""
+        """Starts the ticks. The first tick is at the current time.
+
+        Args:
+            period: Period of the ticks [s].
+            clock: Function that returns a monotonic time [s].
+            sleep: Function that waits for a time [s].
+        """
         self._period, self._clock, self._sleep = period, clock, sleep
         self._next = clock()
         self.late = 0
@@ -60,9 +66,9 @@ def make_realtime() -> list[str]:
     """
     warnings = []
     for step, what in (
-        (_schedule, f"no real-time scheduling: give the user an rtprio limit of {_PRIORITY}, or CAP_SYS_NICE"),
-        (_lock_memory, "memory may be paged out: give the user an unlimited memlock limit, or CAP_IPC_LOCK"),
-        (_keep_cores_awake, "cores may sleep between messages: let the user write /dev/cpu_dma_latency"),
+        (_schedule, f"no real-time scheduling. Give the user an rtprio limit of {_PRIORITY}, or CAP_SYS_NICE"),
+        (_lock_memory, "memory may be paged out. Give the user an unlimited memlock limit, or CAP_IPC_LOCK"),
+        (_keep_cores_awake, "cores may sleep between messages. Allow the user to write /dev/cpu_dma_latency"),
     ):
         try:
             step()
@@ -87,6 +93,6 @@ def _keep_cores_awake() -> None:
 
 
 def settle_memory() -> None:
-    """Excludes existing objects from garbage collection, so that collections are short."""
+    """Excludes existing objects from garbage collection, which makes collections short."""
     gc.collect()
     gc.freeze()

@@ -16,11 +16,11 @@ from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
 from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
 
-#: Longest time until the first status, and time without a status after which the live line reports it [s].
+#: Longest time until the first status [s]. Time without a status after which the live line reports it [s].
 FIRST_STATUS, SILENCE = 10.0, 0.5
-#: Time without a status of its session after which an arm is considered restarted and is recorded again [s].
+#: Time without a status of the session after which the statuses of a new session are recorded [s].
 _RESTART = 1.0
-#: Length of the message queue while the computer is busy. Further messages are lost.
+#: Length of the queue of messages. If it is full, further messages are lost.
 _QUEUE = 20_000
 #: Reasons why messages do not belong to the arm's session.
 _FOREIGN = (StatusFilter.OTHER_SESSION, StatusFilter.JUMP, StatusFilter.NOT_AUTHENTIC)
@@ -38,9 +38,13 @@ class Recorder:
     """
 
     def __init__(self, arm: Arm, path: str | Path, url: str, key: MessageKey | None = None) -> None:
-        """Creates a recorder for `arm` on the LCM network `url`. The file is created at the first status.
+        """Creates a recorder. The file is created at the first status.
 
-        With `key`, only statuses that are signed with it are recorded.
+        Args:
+            arm: Arm whose statuses are recorded.
+            path: Path of the new file.
+            url: URL of the LCM network.
+            key: Key that must have signed the statuses. None: signatures are not verified.
 
         Raises:
             RecordingError: A new file cannot be created at `path`.
@@ -53,18 +57,18 @@ class Recorder:
         self._arm, self._path, self._url = arm, path, url
         self._channel = status_channel(arm)
         self._file: RecordingFile | None = None
-        self._heard: Counter[str] = Counter()
+        self._other_channels: Counter[str] = Counter()
         self._arrivals: deque[float] = deque()
         self._lcm = lcm.LCM(url)
-        # Statuses of all arms, to list the available ones if there are none of this arm.
+        # The subscription includes all arms, so that an error message can list the channels with messages.
         self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._receive)
         self._subscription.set_queue_capacity(_QUEUE)
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
-        """Records until `stopped`, or for `duration` [s] from the first message.
+        """Records until `stopped` returns true, or for `duration` from the first message.
 
         Args:
-            duration: Duration of the recording [s], may be infinite.
+            duration: Duration of the recording [s], which may be infinite.
             stopped: Function that returns whether to stop. It is called at least every 0.1 s.
             show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
                 function that returns the live line.
@@ -77,10 +81,12 @@ class Recorder:
             end = time.monotonic() + FIRST_STATUS
             while not stopped() and self.stream.last is None:
                 if time.monotonic() > end:
-                    raise RecordingError(self._why_silent())
+                    raise RecordingError(self._no_status_reason())
                 handle_message(self._lcm, _POLL)
             if self._file is None:
-                raise RecordingError(f"{self._path}: not made: ended before the first status of {self._arm.name}")
+                raise RecordingError(
+                    f"{self._path} was not written: the recording ended before the first status of {self._arm.name}"
+                )
             end = time.monotonic() + duration
             while not stopped() and time.monotonic() < end:
                 handle_message(self._lcm, _POLL)
@@ -90,7 +96,7 @@ class Recorder:
                 self._file.close()
 
     def describe(self) -> str:
-        """Returns the live line with the rate, lost messages and the state of the arm."""
+        """Returns the live line with the number of rows, the rate, lost messages and the state of the arm."""
         now = time.monotonic()
         while self._arrivals and self._arrivals[0] < now - 1:
             self._arrivals.popleft()
@@ -98,9 +104,9 @@ class Recorder:
         if status is None:
             return f"waiting for {self._channel}"
         if not self._arrivals or self._arrivals[-1] < now - SILENCE:
-            return f"{self._arm.name}: no status any more; {self.stream.num_taken} rows"
+            return f"{self._arm.name}: no more statuses; {self.stream.num_used} rows"
         parts = [
-            f"{self._arm.name}: {self.stream.num_taken} rows",
+            f"{self._arm.name}: {self.stream.num_used} rows",
             f"{len(self._arrivals)} Hz",
             f"{self.stream.num_lost} lost",
             describe_state(status.guard_state, status.fault_text),
@@ -108,13 +114,13 @@ class Recorder:
         return ", ".join(parts)
 
     def notes(self) -> list[str]:
-        """Returns one line for each kind of message that was not recorded or was lost."""
+        """Returns one line per kind of messages that were not recorded or were lost."""
         left_out = [f"messages not recorded, {reason}: {count}" for reason, count in self.foreign.items()]
         return [*left_out, *self.stream.notes()]
 
     def _receive(self, channel: str, data: bytes) -> None:
         if channel != self._channel:
-            self._heard[channel] += 1
+            self._other_channels[channel] += 1
             return
         self.num_received += 1
         now = time.monotonic()
@@ -123,21 +129,22 @@ class Recorder:
             self.foreign[reason] += 1
             return
         self._arrivals.append(now)
-        status = self.stream.take(data)
+        status = self.stream.accept(data)
         if self._file is None:
             if self.stream.last is None:
                 return
             self._file = open_recording_file(self._path, self._arm, self.stream)
         self._file.write(data, time.time_ns() // 1000, status)
 
-    def _why_silent(self) -> str:
+    def _no_status_reason(self) -> str:
         where = f"on channel {self._channel} of {self._url}"
         if self.num_received:
             reasons = "; ".join(self.notes())
             return f"no status of {self._arm.name} within {FIRST_STATUS:.0f} s {where}: {reasons}"
-        if others := ", ".join(sorted(self._heard)):
-            return f"no message within {FIRST_STATUS:.0f} s {where}; there is {others}"
+        if others := ", ".join(sorted(self._other_channels)):
+            return f"no message within {FIRST_STATUS:.0f} s {where}. Channels with messages: {others}"
         return (
-            f"no message within {FIRST_STATUS:.0f} s {where}: does the arm's process or bridge run, on this network? "
-            "Between machines the URL needs ?ttl=1, and each a multicast route (ip route add 239.255.0.0/16 dev DEVICE)"
+            f"no message within {FIRST_STATUS:.0f} s {where}. Check that the arm's process or bridge runs on this "
+            "network. Between machines, the URL needs ?ttl=1 and each machine needs a multicast route "
+            "(ip route add 239.255.0.0/16 dev DEVICE)"
         )

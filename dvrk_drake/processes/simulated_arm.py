@@ -25,9 +25,9 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
-#: Length of the queue of commands, beyond which new ones are dropped, and number of commands handled at the start of a
-#: tick. Most commands are handled while the arm waits for its tick, so this limits the delay that a flood can cause.
-_QUEUE, _MESSAGES_A_STEP = 200, 10
+#: Length of the queue of commands; further commands are dropped. Number of commands that are handled at the start of a
+#: tick, which limits the delay that a flood can cause. Most commands are handled while the arm waits for its tick.
+_QUEUE, _MESSAGES_PER_STEP = 200, 10
 
 
 def monotonic_utime() -> int:
@@ -36,7 +36,7 @@ def monotonic_utime() -> int:
 
 
 def load_driver(path: str | Path) -> DvrkDriver:
-    """Reads the configuration of a driver from its YAML file. Missing entries have their defaults.
+    """Reads the configuration of a driver from a YAML file. Missing entries have their default values.
 
     Raises:
         StationError: The file cannot be read or has an invalid entry.
@@ -51,9 +51,11 @@ def load_driver(path: str | Path) -> DvrkDriver:
 
 
 def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.float64]:
-    """Returns the initial pose (n,) of a simulated arm: `pose`, or the pose nearest to zero that is inside the limits.
+    """Returns the initial pose (n,) of a simulated arm.
 
-    The pose nearest to zero has a margin to the limits.
+    Args:
+        arm: Simulated arm.
+        pose: Pose (n,) [rad, m]. None: the pose nearest to zero with a margin to the limits.
 
     Raises:
         StationError: `pose` does not have n entries inside the arm's limits.
@@ -65,7 +67,7 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
     if q.shape != (arm.num_joints,) or not np.all(np.isfinite(q)):
         raise StationError(f"a pose of {arm.name} is {arm.num_joints} finite numbers [rad, m]; got {q.tolist()}")
     if violations := arm.limit_violations(q):
-        raise StationError(f"{arm.name} cannot start there: {'; '.join(violations)}")
+        raise StationError(f"{arm.name} cannot start outside its limits: {'; '.join(violations)}")
     return q
 
 
@@ -80,9 +82,15 @@ class SimulatedArm:
         q: ArrayLike,
         wall_clock: Callable[[], int] = monotonic_utime,
     ) -> None:
-        """Connects the arm to the LCM network `url`. It starts at rest at the pose q (n,), at the current time of day.
+        """Creates the arm at rest. The arm's clock starts at the current time of day.
 
-        The guard uses `wall_clock` [us], so that commands also expire if this process is late or was suspended.
+        Args:
+            arm: Simulated arm.
+            driver: Configuration of the driver.
+            url: URL of the LCM network.
+            q: Initial pose (n,) [rad, m].
+            wall_clock: Function that returns a monotonic time [us]. The guard uses it, so that commands also expire
+                while this process is late or suspended.
         """
         self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0
@@ -110,7 +118,7 @@ class SimulatedArm:
         """Current guard, read-only."""
         return self._driver.GetGuard(self._driver.GetMyContextFromRoot(self._simulator.get_context()))
 
-    def hear(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """Stores a message of the command channel for the next step."""
         self._driver.Receive(data)
 
@@ -121,9 +129,9 @@ class SimulatedArm:
         self._memory.HandleSubscriptions(0)
 
     def stall(self, seconds: float) -> None:
-        """Simulates a bridge process that is suspended for `seconds` of the arm's clock, without guard and statuses.
+        """Simulates a bridge process that is suspended for `seconds` of the arm's clock.
 
-        The motors meanwhile apply the last commanded efforts, as those of a dVRK do.
+        The guard is not stepped and no status is sent. The motors apply the last commanded efforts, as on a dVRK.
         """
         self._driver.SetStalled(True)
         for _ in range(round(seconds / self.driver.status_period)):
@@ -134,34 +142,38 @@ class SimulatedArm:
         """Publishes the current state."""
         network.publish(status_channel(self.arm), self._status)
 
-    def run(self, stopped: Callable[[], bool], tell: Callable[[str], None] = lambda line: None) -> Pace:
-        """Steps by the wall clock until `stopped` and reports every change of the guard's state to `tell`.
+    def run(self, stopped: Callable[[], bool], report: Callable[[str], None] = lambda line: None) -> Pace:
+        """Steps the simulation by the wall clock until `stopped` returns true.
 
-        A status is published when its tick begins. The simulation computes the next state while the controller computes
-        its answer, which is applied from the next tick on. The motors of a real arm do not wait for the answer either.
+        A status is published when a tick begins. The simulation then computes the next state while the controller
+        computes the answer. The answer is applied from the next tick on, as on a real arm.
+
+        Args:
+            stopped: Function that returns whether to stop. It is called once per tick.
+            report: Function that is called with a line of text at every change of the guard's state.
 
         Returns:
-            The pace, with the number of late ticks.
+            Pace with the number of late ticks.
         """
-        # LCM is opened here because its receive thread inherits the scheduling of the thread that opens it. Drake's own
-        # subscription would keep only one message between two steps and hide a second sender.
+        # LCM is opened here because its receive thread inherits the scheduling of the thread that opens it. Drake's
+        # subscription would keep only one message between two steps, so a second sender would not be noticed.
         network = lcm.LCM(self._url)
-        network.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_QUEUE)
+        network.subscribe(command_channel(self.arm), self.receive).set_queue_capacity(_QUEUE)
         # The first period of the guard is too long because it includes the time since the simulation was created. The
-        # status of that step is not published because a controller would reject the arm for it.
+        # status of that step is not published, because a controller would reject the arm.
         self.step()
         self.step()
         pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))
         described = ""
         while not stopped():
             pace.wait()
-            for _ in range(_MESSAGES_A_STEP):
+            for _ in range(_MESSAGES_PER_STEP):
                 if not handle_message(network, 0.0):
                     break
             self.send(network)
             self.step()
             if (state := self._describe()) != described:
-                tell(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
+                report(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
                 described = state
         return pace
 
@@ -175,8 +187,8 @@ class SimulatedArm:
 
 
 def stop_on_signals() -> Callable[[], bool]:
-    """Returns a function that returns whether SIGINT or SIGTERM was received, for loops with an orderly end."""
-    came: list[int] = []
+    """Handles SIGINT and SIGTERM. Returns a function that returns whether one of them was received."""
+    received: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: came.append(number))
-    return lambda: bool(came)
+        signal.signal(number, lambda number, frame: received.append(number))
+    return lambda: bool(received)

@@ -1,4 +1,4 @@
-"""Poses taught by hand, steps 1 to 3 of section III.G of the paper, and trajectories between poses."""
+"""Poses taught by hand (steps 1 to 3 of section III.G of the paper), and trajectories between poses."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.recordings.pose_file import load_poses_if_any, same_pose, save_poses
 
-#: Shortest duration of a leg [s]. Shorter legs would begin and end with a jerk.
+#: Shortest duration of a trajectory [s]. Shorter trajectories would begin and end with a jerk.
 MIN_DURATION = 0.3
 
 
-class Leg:
+class CubicTrajectory:
     """Cubic trajectory from a joint state to rest.
 
     Attributes:
@@ -32,30 +32,39 @@ class Leg:
     def __init__(
         self, q_start: NDArray[np.float64], v_start: NDArray[np.float64], q_end: NDArray[np.float64], duration: float
     ) -> None:
-        """Creates a leg from q_start, v_start (n,) to rest at q_end (n,) [rad, m, rad/s, m/s] in `duration` [s]."""
+        """Creates a trajectory.
+
+        Args:
+            q_start: Initial positions (n,) [rad, m].
+            v_start: Initial velocities (n,) [rad/s, m/s].
+            q_end: Final positions (n,) [rad, m], at rest.
+            duration: Duration of the trajectory [s].
+        """
         self.duration = duration
         velocities = np.column_stack([v_start, np.zeros_like(v_start)])
         self._q = PiecewisePolynomial.CubicHermite([0.0, duration], np.column_stack([q_start, q_end]), velocities)
         self._v = self._q.derivative()
 
     @classmethod
-    def between(cls, q_start: NDArray[np.float64], q_end: NDArray[np.float64], speed: NDArray[np.float64]) -> Leg:
-        """Returns a trajectory from rest to rest in which no joint exceeds `speed` (n,) [rad/s, m/s].
+    def rest_to_rest(
+        cls, q_start: NDArray[np.float64], q_end: NDArray[np.float64], speed: NDArray[np.float64]
+    ) -> CubicTrajectory:
+        """Returns a trajectory from rest to rest on which no joint exceeds `speed` (n,) [rad/s, m/s].
 
-        The path is straight, so it stays inside linear limits if both poses do.
+        The path is a straight line in joint space. It is inside all limits if both poses are.
         """
         # The peak speed of a cubic from rest to rest is 1.5 times its mean.
         duration = max(MIN_DURATION, 1.5 * float(np.max(np.abs(q_end - q_start) / speed)))
         return cls(q_start, np.zeros_like(q_start), q_end, duration)
 
     @classmethod
-    def braking(cls, state: NDArray[np.float64], duration: float) -> Leg:
-        """Returns a trajectory from a state (2n: q, then v) to rest at constant deceleration."""
+    def braking(cls, state: NDArray[np.float64], duration: float) -> CubicTrajectory:
+        """Returns a trajectory from `state` (2n,), q, then v, to rest at constant deceleration."""
         q, v = np.split(state, 2)
         return cls(q, v, q + 0.5 * duration * v, duration)
 
     def state(self, time: float) -> NDArray[np.float64]:
-        """Returns q, then v (2n,) at `time` [s], which is clamped to 0 and the duration."""
+        """Returns the state (2n,), q, then v, at `time` [s], which is limited to 0..`duration`."""
         time = min(max(time, 0.0), self.duration)
         return np.concatenate([self._q.value(time).ravel(), self._v.value(time).ravel()])
 
@@ -64,19 +73,24 @@ class RestDetector:
     """Detects that all joints of an arm have stayed near one pose for some time."""
 
     def __init__(self, tolerance: NDArray[np.float64], duration: float) -> None:
-        """Creates a detector for poses within `tolerance` (n,) [rad, m] for `duration` [s]."""
+        """Creates a detector.
+
+        Args:
+            tolerance: Largest deviation (n,) [rad, m] from one pose.
+            duration: Time for which the joints must stay within the tolerance [s].
+        """
         self._tolerance, self._duration = tolerance, duration
         self._since = 0.0
         self._q: NDArray[np.float64] | None = None
 
-    def rests(self, time: float, q: NDArray[np.float64]) -> bool:
+    def is_at_rest(self, time: float, q: NDArray[np.float64]) -> bool:
         """Returns whether the arm is at rest at `time` [s] with measured q (n,). Call it at every measurement."""
         if self._q is None or not np.all(np.abs(q - self._q) <= self._tolerance):  # also true of NaN
             self._q, self._since = q, time
         return time - self._since >= self._duration
 
 
-#: Tolerance [rad], [m] and duration [s] in which a hand-guided arm is at rest, for --at-rest.
+#: Tolerance [rad], [m] and duration [s] for detecting that a hand-guided arm is at rest, for --at-rest.
 _REST, _REST_TIME = (0.01, 0.001), 1.0
 
 
@@ -84,7 +98,7 @@ class Teacher:
     """Records poses of an arm in "gravity" mode to a file of poses, on request or whenever the arm is at rest.
 
     Attributes:
-        poses: Poses (m, n) in the file, including those that are being written.
+        poses: Poses (m, n) [rad, m] in the file, including a pose that is being written.
     """
 
     def __init__(
@@ -102,10 +116,10 @@ class Teacher:
         Args:
             controller: Controller in "gravity" mode.
             path: Path of the file, which is created or extended. It is complete at any time.
-            at_rest: Records each pose at which the arm rests for a second.
+            at_rest: True to record each pose at which the arm is at rest for a second.
             requested: Function that returns whether to record the present pose. It is called once per status.
             report: Function that is called with one line per pose.
-            writer: Executor that writes the file. Defaults to a separate thread.
+            writer: Executor that writes the file. None: a separate thread.
 
         Raises:
             CollectionError: The file exists and does not contain poses of this arm.
@@ -118,30 +132,30 @@ class Teacher:
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._writing: Future[None] | None = None
 
-    def lead(self, status: lcmt_dvrk_status, time: float) -> None:
-        """Processes a status that arrived at `time` [s]. Returns no desired state because the operator moves the arm.
+    def update(self, status: lcmt_dvrk_status, time: float) -> None:
+        """Processes a status that arrived at `time` [s]. Returns None, because the operator moves the arm.
 
         Raises:
             DvrkDrakeError: The file cannot be written.
         """
         q = np.array(status.position)
-        rests = self._detector.rests(time, q)
+        at_rest = self._detector.is_at_rest(time, q)
         requested = self._requested()
         if self._writing is not None:
             if not self._writing.done():
                 return
             self._writing.result()
             self._writing = None
-            self._report(f"pose {len(self.poses)} taken")
+            self._report(f"pose {len(self.poses)} recorded")
         if not self._controller.ramped:
             return
         arm = self._controller.arm
         known = same_pose(self.poses, q, arm)
         if requested:
             if reason := self._refusal(arm, q, known):
-                self._report(f"not taken: {reason}")
+                self._report(f"not recorded: {reason}")
                 return
-        elif not (self._at_rest and rests and known is None and not arm.limit_violations(q)):
+        elif not (self._at_rest and at_rest and known is None and not arm.limit_violations(q)):
             return
         self.poses = np.vstack([self.poses, q])
         self._writing = self._writer.submit(save_poses, self.poses, arm, self._path)
@@ -154,7 +168,7 @@ class Teacher:
     def _refusal(arm: Arm, q: np.ndarray, known: int | None) -> str:
         if violations := arm.limit_violations(q):
             return "; ".join(violations)
-        return "" if known is None else f"it is pose {known + 1} again"
+        return "" if known is None else f"same as pose {known + 1}"
 
 
 class EnterKey:

@@ -1,4 +1,4 @@
-"""Converts recordings to this project's CSV: CSV files with a header, LCM logs, and public recordings of real arms.
+"""Converts CSV files with a header, LCM logs and public recordings of real arms to the CSV format of this project.
 
 The public recordings are from the WPI AIM lab and have two layouts; `docs/public_recordings.md` explains how to obtain
 them.
@@ -22,8 +22,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.csv_rows import read_bytes
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log
 from dvrk_drake.recordings.public_formats import (
+    generated_times,
     looks_like_matlab,
-    made_times,
     read_team_mat,
     read_wpi_csv,
     refuse_rate,
@@ -34,7 +34,7 @@ from dvrk_drake.recordings.recording import Coordinates, Recording, column_names
 
 Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log"]
 
-#: Coordinates of the formats that define them. A CSV with a header does not.
+#: Mapping from a format to its coordinates. A CSV with a header has no defined coordinates.
 DEFINED_COORDINATES: dict[str, Coordinates] = {"team-mat": "joint", "wpi-csv": "actuator", "lcm-log": "joint"}
 
 
@@ -49,7 +49,7 @@ def convert(
     arm: Arm | None = None,
     skip_invalid: bool = False,
 ) -> Recording:
-    """Reads a recording and writes it atomically as a CSV that `read_recording` reads.
+    """Converts a recording to a CSV for `read_recording`. The CSV is written atomically.
 
     Time stamps of the recording are kept unchanged.
 
@@ -57,15 +57,15 @@ def convert(
         path: Path of the recording.
         output: Path of the CSV to write; an existing file is replaced.
         format: Format of the recording; None to detect it.
-        coordinates: Coordinates of q, qd and tau, for "csv", which does not define them. Other formats do.
+        coordinates: Coordinates of q, qd and tau, required for "csv". Other formats define their coordinates.
         variable: Name of the variable, for "team-mat"; required if several variables match.
-        rate: Sampling rate [Hz] of a CSV without time stamps. Default: 200 for "wpi-csv", no times for "csv".
+        rate: Sampling rate [Hz] of a CSV without time stamps. None: 200 Hz for "wpi-csv", no times for "csv".
         arm: For "csv" and "wpi-csv": arm whose joint coordinates are written; None for the coordinates of the file. For
             "lcm-log": arm whose statuses are read; required if there are several.
         skip_invalid: Whether to omit and count invalid rows (or poses) instead of refusing the file.
 
     Returns:
-        The recording as written; `source`, `lines` and `notes` refer to the original.
+        Written recording. Its `source`, `lines` and `notes` refer to the original file.
 
     Raises:
         RecordingError: The file does not have the layout of the format, its coordinates are unknown, or an option does
@@ -77,24 +77,24 @@ def convert(
     if coordinates is not None and coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
-        raise RecordingError(f"{output}: is the recording itself; name another output")
+        raise RecordingError(f"{output} is the input recording. Choose another output.")
     chosen = format or detect_format(path)
     defined = DEFINED_COORDINATES.get(chosen)
     if defined is not None and coordinates not in (None, defined):
-        raise RecordingError(f"{path}: {chosen} is in {defined} coordinates, not {coordinates}")
+        raise RecordingError(f"{path}: a {chosen} file is in {defined} coordinates, not in {coordinates} coordinates")
     if variable is not None and chosen in ("csv", "wpi-csv"):
-        raise RecordingError(f"{path}: --variable does not apply to {chosen}, which has no variables")
+        raise RecordingError(f"{path}: --variable does not apply to {chosen} files")
     if chosen == "lcm-log":
         if rate is not None or variable is not None or skip_invalid:
             raise RecordingError(f"{path}: --rate, --variable and --skip-invalid do not apply to an LCM log")
         if not is_lcm_log(Path(path)):
-            raise RecordingError(f"{path}: is not an LCM log")
+            raise RecordingError(f"{path} is not an LCM log")
         recording = read_recording(path, arm)
     elif chosen == "team-mat":
         if rate is not None:
-            raise RecordingError(f"{path}: --rate does not apply to team-mat, whose poses have no time")
+            raise RecordingError(f"{path}: --rate does not apply to team-mat files, which have no times")
         if arm is not None:
-            raise RecordingError(f"{path}: --arm does not apply to team-mat, which is in joint coordinates")
+            raise RecordingError(f"{path}: --arm does not apply to team-mat files, which are in joint coordinates")
         recording = read_team_mat(path, variable=variable, skip_invalid=skip_invalid)
     elif chosen == "wpi-csv":
         recording = read_wpi_csv(path, rate, skip_invalid=skip_invalid)
@@ -102,19 +102,19 @@ def convert(
             recording = wpi_in_joint_coordinates(recording, arm)
     elif coordinates is None:
         raise RecordingError(
-            f"{path}: its header does not say whether the numbers are of the joints or of the actuators; pass "
-            "--coordinates joint or --coordinates actuator (coordinates= in Python)"
+            f"{path}: a CSV file does not define its coordinates. Pass --coordinates joint or --coordinates actuator "
+            "(coordinates= in Python)."
         )
     else:
         recording = _read_csv(Path(path), coordinates, rate, arm, skip_invalid)
     if recording.coordinates == "actuator":
         first, *others = recording.notes
         note = (
-            "in actuator coordinates, which a CSV cannot say: pass --coordinates actuator to every command that reads "
-            "it, or convert with --arm"
+            "in actuator coordinates, which the CSV does not state: pass --coordinates actuator to every command that "
+            "reads the CSV, or convert with --arm"
         )
         if chosen == "wpi-csv":
-            note += " (of a PSM always: its roll is not the dVRK's actuator)"
+            note += " (required for a PSM, whose roll is recorded at the joint)"
         recording = dataclasses.replace(recording, notes=(first, note, *others))
     write_recording(recording, output)
     return recording
@@ -123,7 +123,7 @@ def convert(
 def _read_csv(
     path: Path, coordinates: Coordinates, rate: float | None, arm: Arm | None, skip_invalid: bool
 ) -> Recording:
-    """Reads a CSV with a header that contains q1, and adds notes on its times and its omitted columns."""
+    """Reads a CSV with a header, and adds notes on times and ignored columns."""
     recording = read_recording(path, arm, coordinates, skip_invalid=skip_invalid)
     if recording.t is not None:
         refuse_rate(path, rate)
@@ -131,13 +131,15 @@ def _read_csv(
         notes = time_notes(recording.t, recording.lines)
     elif rate is not None:
         assert recording.lines is not None
-        t, note = made_times(np.arange(len(recording)), rate)
+        t, note = generated_times(np.arange(len(recording)), rate)
         recording, notes = dataclasses.replace(recording, t=t), [note]
     else:
-        notes = [f"{len(recording)} rows without time stamps (no column t), as poses have; --rate HZ makes them"]
+        notes = [
+            f"{len(recording)} rows without time stamps (no column t), read as static poses; --rate HZ adds time stamps"
+        ]
     kept = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, recording.q.shape[1])]
     if other := [name for name in _header(read_bytes(path)) if name and name not in kept]:
-        notes.append(f"columns left out, which are not q, qd, tau or t: {', '.join(other)}")
+        notes.append(f"ignored columns: {', '.join(other)}")
     if arm is not None:
         recording = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
@@ -157,11 +159,11 @@ def detect_format(path: str | Path) -> Format:
         return "lcm-log"
     content = read_bytes(path)
     if not content.strip():
-        raise RecordingError(f"{path}: is empty")
+        raise RecordingError(f"{path} is empty")
     if looks_like_matlab(path, content):
         return "team-mat"
     if b"\0" in content[:_HEAD]:
-        raise RecordingError(f"{path}: neither an LCM log, a MATLAB file (team-mat) nor a text file in UTF-8 (CSV)")
+        raise RecordingError(f"{path}: unknown format; allowed: LCM log, MATLAB file (team-mat), UTF-8 text file (CSV)")
     return "csv" if "q1" in _header(content) else "wpi-csv"
 
 

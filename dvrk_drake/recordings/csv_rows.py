@@ -35,11 +35,11 @@ def read_bytes(path: Path) -> bytes:
 class CsvReader:
     """Reads the rows of a CSV file in blocks, so that a large file needs little memory.
 
-    The file is UTF-8 with or without a byte-order mark. Lines end in LF, CRLF or CR. Each iteration continues where the
-    previous one stopped. It yields (line number, unmodified cells) of the rows that are not blank.
+    The file is UTF-8 with or without a byte-order mark. Lines end in LF, CRLF or CR. Iteration yields (line number,
+    unmodified cells) of the rows that are not blank. A new iteration continues after the last row that was read.
 
     Attributes:
-        has_underscore: Whether an underscore was read so far; Python accepts underscores in numbers.
+        has_underscore: Whether the text read so far contains an underscore, which Python accepts in numbers.
     """
 
     def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:
@@ -62,7 +62,7 @@ class CsvReader:
         self._file.close()
 
     def __iter__(self) -> Iterator[tuple[int, list[str]]]:
-        """Raises RecordingError if the file is not text, or its cells are not separated by commas."""
+        """Iterates over rows. Raises RecordingError if the file is not text or cells are not separated by commas."""
         reader = self._reader
         try:
             for cells in reader:
@@ -72,7 +72,7 @@ class CsvReader:
                     self._check_commas(cells)
                 yield reader.line_num, cells
         except csv.Error as error:
-            raise RecordingError(f"{self._path}:{reader.line_num}: not CSV: {error}") from error
+            raise RecordingError(f"{self._path}, line {reader.line_num}: invalid CSV: {error}") from error
 
     def sha256(self) -> str:
         """Returns the SHA-256 of the file; valid after all rows have been read."""
@@ -82,8 +82,8 @@ class CsvReader:
         self._is_first = False
         if len(cells) == 1 and re.search(r"[;\s]", cells[0].strip()):
             raise RecordingError(
-                f"{self._path}:{self._reader.line_num}: no comma in the first row; cells must be separated by commas, "
-                "with a point as the decimal sign"
+                f"{self._path}, line {self._reader.line_num}: the first row has no comma. Separate cells by commas "
+                "and use a point as the decimal sign."
             )
 
     def _lines(self) -> Iterator[str]:
@@ -94,16 +94,14 @@ class CsvReader:
             try:
                 block = self._file.read(_BLOCK)
             except OSError as error:
-                raise RecordingError(f"{self._path}: cannot be read: {error.strerror}") from error
+                raise RecordingError(f"{self._path} cannot be read: {error.strerror}") from error
             self._digest.update(block)
             undecoded = len(decoder.getstate()[0])
             try:
                 text = decoder.decode(block, final=not block)
             except UnicodeDecodeError as error:
                 at = num_read - undecoded + error.start
-                raise RecordingError(
-                    f"{self._path}: not a CSV text file in UTF-8: {error.reason} at byte {at}"
-                ) from error
+                raise RecordingError(f"{self._path} is not a UTF-8 text file: {error.reason} at byte {at}") from error
             if is_start and text:
                 text, is_start = text.removeprefix("\ufeff"), False
             text = rest + text
@@ -112,7 +110,7 @@ class CsvReader:
             end = max(text.rfind("\n"), text.rfind("\r", 0, -1)) + 1 if block else len(text)
             whole, rest = text[:end], text[end:]
             if len(rest) > _MAX_LINE:
-                raise RecordingError(f"{self._path}: not CSV: has a line of more than {_MAX_LINE} characters")
+                raise RecordingError(f"{self._path}: invalid CSV: a line has more than {_MAX_LINE} characters")
             self.has_underscore = self.has_underscore or "_" in whole
             yield from io.StringIO(whole, newline="")
             self._progress(min(1.0, num_read / size))
@@ -162,7 +160,7 @@ def parse_number(cell: str, where: str) -> float:
 
     Args:
         cell: Text of the cell.
-        where: Beginning of the error message, `file:line: column`.
+        where: Beginning of the error message, "file, line 2: column".
 
     Raises:
         RecordingError: The cell is not a number.
@@ -209,7 +207,7 @@ class GrowingFile:
                 self._file.truncate(self._file.read().rfind(b"\n") + 1)
                 self._file.seek(0, os.SEEK_END)
         except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+            raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
 
     def append(self, row: bytes) -> None:
         """Writes one row.
@@ -223,10 +221,14 @@ class GrowingFile:
             if self._sync:
                 os.fsync(self._file.fileno())
         except OSError as error:
-            raise RecordingError(f"{self._path}: cannot be written any more: {error.strerror}; ends here") from error
+            raise RecordingError(
+                f"{self._path} cannot be written: {error.strerror}. The file ends with its last complete row."
+            ) from error
         if written != len(row):
             self._file.truncate(end)
-            raise RecordingError(f"{self._path}: cannot be written any more: no space left; ends here")
+            raise RecordingError(
+                f"{self._path} cannot be written: no space left. The file ends with its last complete row."
+            )
 
     def close(self) -> None:
         """Closes the file."""

@@ -1,7 +1,7 @@
 """Reads LCM logs, including damaged ones, and the measurements of one arm in them.
 
 The format is described at https://lcm-proj.github.io/lcm/content/log-file-format.html. A log is a sequence of events.
-Each event is big-endian and consists of a magic number, its number, a time, two lengths, the channel and the data.
+Each event is big-endian and consists of a magic number, the event number, a time, two lengths, channel and data.
 `EventLog` of the `lcm` package is not used. It crashes on a damaged length (segmentation fault in lcm 1.5.3), and does
 not write the last events before the log is closed.
 """
@@ -42,7 +42,7 @@ class LcmEvent(NamedTuple):
 
 
 class LcmLogReader:
-    """Iterates over the events of a log in their order, and skips damaged ones.
+    """Iterates over the events of a log in order, and skips damaged ones.
 
     Attributes:
         path: Path of the log.
@@ -56,7 +56,7 @@ class LcmLogReader:
             RecordingError: The file cannot be read, or does not begin like an LCM log.
         """
         if not is_lcm_log(path):
-            raise RecordingError(f"{path}: is not an LCM log")
+            raise RecordingError(f"{path} is not an LCM log")
         self.path = path
         self.notes: list[str] = []
 
@@ -85,11 +85,9 @@ class LcmLogReader:
         position = damaged
         while (position := content.find(_MAGIC, position + 1)) >= 0:
             if _end_of_event(content, position):
-                self.notes.append(f"{position - damaged} bytes from byte {damaged} on are damaged and are left out")
+                self.notes.append(f"{position - damaged} damaged bytes skipped, from byte {damaged}")
                 return position
-        self.notes.append(
-            f"the last {len(content) - damaged} bytes are no whole message, as after a kill: read up to there"
-        )
+        self.notes.append(f"incomplete message skipped at the end of the log ({len(content) - damaged} bytes)")
         return len(content)
 
 
@@ -109,9 +107,9 @@ def event_bytes(event: LcmEvent) -> bytes:
 
 
 def _end_of_event(content: mmap.mmap, start: int) -> int:
-    """Returns the end of the event that begins at `start`, or 0.
+    """Returns the end of the event that begins at `start`.
 
-    The result is 0 if there is no event at `start`, or if it is not followed by another event.
+    The result is 0 if there is no event at `start`, or if neither an event nor the end of the file follows.
     """
     if start + _HEADER.size > len(content):
         return 0
@@ -127,16 +125,16 @@ def _event(content: mmap.mmap, start: int) -> LcmEvent:
     _, number, utime, channel_length, data_length = _HEADER.unpack_from(content, start)
     channel = start + _HEADER.size
     data = channel + channel_length
-    # A channel that is not UTF-8 is not used here, and must not prevent reading others.
+    # Channels that are not UTF-8 are not used, but must not raise an error.
     name = content[channel:data].decode("utf-8", "replace")
     return LcmEvent(number, utime, name, content[data : data + data_length])
 
 
-_UNREADABLE = "no lcmt_dvrk_status, or one of another version"
+_UNREADABLE = "not an lcmt_dvrk_status of this version"
 _FOREIGN = "of another arm or number of joints"
-_LATE = "not later than the one before"
+_LATE = "not later than the previous one"
 _NOT_FINITE = "with a measurement that is not finite"
-_OFF = "with the motors off, whose efforts hold nothing"
+_OFF = "with the motors off"
 
 
 class StatusStream:
@@ -147,19 +145,19 @@ class StatusStream:
         num_joints: Number of joints that the statuses must have.
         last: Last status of the arm, usable or not, or None.
         num_lost: Number of statuses missing in the sequence.
-        num_taken: Number of used statuses.
-        first_utime: Time of the first used status [us], which is the zero of a recording's t.
+        num_used: Number of used statuses.
+        first_utime: Time of the first used status [us], at which t of the recording is 0.
     """
 
     def __init__(self, arm_name: str, num_joints: int) -> None:
         """Creates a stream for the named arm."""
         self.arm_name, self.num_joints = arm_name, num_joints
         self.last: lcmt_dvrk_status | None = None
-        self.num_lost, self.num_taken, self.first_utime = 0, 0, 0
+        self.num_lost, self.num_used, self.first_utime = 0, 0, 0
         self._sessions: list[int] = []
-        self._left_out: Counter[str] = Counter()
+        self._omitted: Counter[str] = Counter()
 
-    def take(self, data: bytes) -> lcmt_dvrk_status | None:
+    def accept(self, data: bytes) -> lcmt_dvrk_status | None:
         """Returns the status in a message, or None if it cannot be used as a measurement.
 
         Raises:
@@ -168,11 +166,11 @@ class StatusStream:
         status = decode(lcmt_dvrk_status, data)
         reason = _UNREADABLE if status is None else self._examine(status)
         if status is None or reason:
-            self._left_out[reason] += 1
+            self._omitted[reason] += 1
             return None
-        if not self.num_taken:
+        if not self.num_used:
             self.first_utime = status.utime
-        self.num_taken += 1
+        self.num_used += 1
         return status
 
     def time(self, status: lcmt_dvrk_status) -> float:
@@ -181,15 +179,15 @@ class StatusStream:
 
     def notes(self) -> list[str]:
         """Returns descriptions of omitted and lost statuses, one per line."""
-        notes = [f"messages left out, {reason}: {count}" for reason, count in self._left_out.items()]
+        notes = [f"messages omitted, {reason}: {count}" for reason, count in self._omitted.items()]
         if self.num_lost:
-            notes.append(f"messages lost on the way, missing in the sequence: {self.num_lost}")
+            notes.append(f"messages lost (gaps in the sequence numbers): {self.num_lost}")
         if len(self._sessions) > 1:
-            notes.append(f"restarts of {self.arm_name} in between: {len(self._sessions) - 1}")
+            notes.append(f"restarts of {self.arm_name} during the recording: {len(self._sessions) - 1}")
         return notes
 
     def _examine(self, status: lcmt_dvrk_status) -> str:
-        """Returns the reason why a status cannot be used, or "". Unusable statuses also advance the sequence."""
+        """Returns the reason why a status is not usable, or "". Unusable statuses also advance the sequence number."""
         if status.arm_name != self.arm_name or status.num_joints != self.num_joints:
             return _FOREIGN
         continues = self._follow_session(status.session_id)
@@ -203,13 +201,13 @@ class StatusStream:
         return _OFF if status.guard_state == lcmt_dvrk_status.STATE_OFF else ""
 
     def _follow_session(self, session_id: int) -> bool:
-        """Returns whether the session is that of the previous message. A session that reappears had not ended."""
+        """Returns whether the session is that of the previous message. Raises an error if an earlier one reappears."""
         if self._sessions and self._sessions[-1] == session_id:
             return True
         if session_id in self._sessions:
             raise RecordingError(
-                f"two arms called {self.arm_name} send at the same time (sessions "
-                f"{' and '.join(map(str, self._sessions))}): end one, or give them networks of their own"
+                f"two processes send statuses of {self.arm_name} at the same time (sessions "
+                f"{' and '.join(map(str, self._sessions))}). Stop one of them, or use a separate network for each."
             )
         self._sessions.append(session_id)
         return False
@@ -270,7 +268,7 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
         if stream is None and (first := decode(lcmt_dvrk_status, event.data)):
             stream = StatusStream(first.arm_name, first.num_joints)
         try:
-            status = stream.take(event.data) if stream else None
+            status = stream.accept(event.data) if stream else None
         except RecordingError as error:
             raise RecordingError(f"{path}: event {event.number}: {error}") from error
         if status is not None and stream is not None:
@@ -279,7 +277,7 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
             events.append(event.number)
     notes = [*log.notes, *(stream.notes() if stream else [])]
     if not events:
-        raise RecordingError(f"{path}: {_why_nothing(channel, arm, channels, notes)}")
+        raise RecordingError(f"{path}: {_no_usable_status(channel, arm, channels, notes)}")
     q, qd, tau = np.array(rows).reshape(len(events), 3, -1).transpose(1, 0, 2)
     return StatusLog(np.array(times), q, qd, tau, np.array(events), tuple(notes), log.sha256())
 
@@ -287,15 +285,17 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
 def _only_status_channel(log: LcmLogReader) -> str:
     channels = sorted({event.channel for event in log if event.channel.startswith(STATUS_PREFIX)})
     if len(channels) > 1:
-        raise RecordingError(f"{log.path}: has statuses of several arms, {', '.join(channels)}: name one")
+        raise RecordingError(
+            f"{log.path} has statuses of several arms ({', '.join(channels)}). Select one with --arm (arm= in Python)."
+        )
     return channels[0] if channels else STATUS_PREFIX
 
 
-def _why_nothing(channel: str, arm: Arm | None, channels: Counter[str], notes: list[str]) -> str:
+def _no_usable_status(channel: str, arm: Arm | None, channels: Counter[str], notes: list[str]) -> str:
     if count := channels[channel]:
-        reasons = "; ".join(notes) or "no lcmt_dvrk_status, or one of another version"
-        return f"none of its {count} messages on channel {channel} can be used: {reasons}"
+        reasons = "; ".join(notes) or _UNREADABLE
+        return f"none of the {count} messages on channel {channel} is usable: {reasons}"
     listed = [f"{name} ({number})" for name, number in channels.most_common(_LISTED)]
     more = [f"{len(channels) - _LISTED} more"] if len(channels) > _LISTED else []
-    has = ", ".join([*listed, *more]) or "nothing that can be read"
-    return f"has no status of {arm.name if arm else 'any arm'} (channel {channel}); it has {has}"
+    has = ", ".join([*listed, *more]) or "none"
+    return f"no status of {arm.name if arm else 'any arm'} (channel {channel}). Channels in the log: {has}."

@@ -25,7 +25,7 @@ _ROUNDING = 1e-9
 
 @dataclass
 class PoseFile:
-    """Schema of a file of poses: the name of the arm, and one list of n joint positions [rad, m] per pose."""
+    """Schema of a pose file: the name of the arm, and one list of n joint positions [rad, m] per pose."""
 
     format: str = "dvrk_drake poses 1"
     arm: str = ""
@@ -34,25 +34,27 @@ class PoseFile:
 
 
 def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
-    """Returns the poses (m, n) in a file after checking them.
+    """Reads and checks the poses (m, n) in a file.
 
     Raises:
-        CollectionError: The file does not exist, is not a file of poses, is of another arm, or has a pose that
+        CollectionError: The file does not exist, is not a pose file, is of another arm, or has a pose that
             `check_poses` refuses.
     """
     if not os.path.lexists(path):
-        raise CollectionError(f"{path}: no such file of poses; --teach or --random makes one")
-    content = load_typed_yaml(PoseFile, path, CollectionError, "a file of poses")
+        raise CollectionError(
+            f"{path}: the pose file does not exist. Create it with collect --teach or collect --random."
+        )
+    content = load_typed_yaml(PoseFile, path, CollectionError, "a pose file")
     if content.format != PoseFile.format:
-        raise CollectionError(f'{path}: format is "{content.format}", this version reads "{PoseFile.format}"')
+        raise CollectionError(f'{path}: format is "{content.format}"; allowed: "{PoseFile.format}"')
     if content.arm.lower() != arm.name.lower():
-        raise CollectionError(f'{path}: arm is "{content.arm}", not {arm.name}')
+        raise CollectionError(f'{path}: arm is "{content.arm}", but the selected arm is {arm.name}')
     if not content.poses:
-        raise CollectionError(f"{path}: has no poses")
+        raise CollectionError(f"{path} has no poses")
     for k, pose in enumerate(content.poses):
         if len(pose) != arm.num_joints:
             raise CollectionError(
-                f"{path}: pose {k + 1} has {len(pose)} numbers; {arm.name} has {arm.num_joints} joints: "
+                f"{path}, pose {k + 1}: {len(pose)} numbers, but {arm.name} has {arm.num_joints} joints: "
                 f"{', '.join(arm.joint_names)}"
             )
     poses = np.array(content.poses, float)
@@ -69,16 +71,19 @@ def check_poses(poses: NDArray[np.float64], arm: Arm, source: str) -> None:
     """
     for k, pose in enumerate(poses):
         if not np.all(np.isfinite(pose)):
-            raise CollectionError(f"{source}: pose {k + 1} must be finite numbers; got {pose.tolist()}")
+            raise CollectionError(f"{source}, pose {k + 1}: {pose.tolist()} has a number that is not finite")
     try:
         Recording(q=poses, source=source).check_fits(arm)  # detects degrees and millimetres
     except RecordingError as error:
-        raise CollectionError(str(error).replace(": row ", ": pose ")) from error
+        raise CollectionError(str(error).replace(", row ", ", pose ")) from error
     for k, pose in enumerate(poses):
         if violations := arm.limit_violations(pose, _ROUNDING):
-            raise CollectionError(f"{source}: pose {k + 1}: {'; '.join(violations)} [rad, m] of {arm.name}")
+            raise CollectionError(f"{source}, pose {k + 1}: {'; '.join(violations)} [rad, m] of {arm.name}")
         if (same := same_pose(poses[:k], pose, arm)) is not None:
-            raise CollectionError(f"{source}: pose {k + 1} is pose {same + 1} again, within {SAME_POSE[0]} rad")
+            raise CollectionError(
+                f"{source}, pose {k + 1}: equal to pose {same + 1}; all joints differ by less than "
+                f"{SAME_POSE[0]:g} rad or {SAME_POSE[1]:g} m"
+            )
 
 
 def same_pose(poses: NDArray[np.float64], pose: NDArray[np.float64], arm: Arm) -> int | None:
@@ -109,17 +114,21 @@ def load_poses_if_any(path: str | Path, arm: Arm) -> NDArray[np.float64]:
 class CollectionFile:
     """CSV file with one row per finished pose. A row is on the disk when `append` returns.
 
-    The columns are q1..qn and tau1..taun, as measured and as in every Recording; friction1..n, half of the difference
-    between the efforts of the two approach directions, if both are used; pose1..n, the requested pose; arm; utime, when
-    the row was written [us since 1970]. Joints are in the arm's order [rad, N m; m, N for a prismatic joint].
+    Units are rad and N m, or m and N for a prismatic joint. The columns are:
+
+    - q1..qn and tau1..taun: measured positions and efforts, as in every Recording.
+    - pose1..posen: requested pose.
+    - arm: name of the arm.
+    - utime: time when the row was written [us since 1970].
+    - friction1..frictionn: half of the difference between the efforts of the two approach directions, if both are used.
     """
 
     def __init__(self, path: str | Path, arm: Arm, both_sides: bool) -> None:
-        """Opens the file at `path`. If it exists, it must have rows of this kind.
+        """Opens the file at `path`, or prepares a new one.
 
         Args:
             path: Path of a CSV that is created or continued.
-            arm: Arm of the poses.
+            arm: Measured arm.
             both_sides: Whether each pose is measured from both approach directions.
 
         Raises:
@@ -131,11 +140,11 @@ class CollectionFile:
         if both_sides:
             self._header += self._names("friction")
         self._file: GrowingFile | None = None
-        self._is_there, self._has_header = os.path.lexists(path), False
-        self._rows = self._read() if self._is_there else []
+        self._exists, self._has_header = os.path.lexists(path), False
+        self._rows = self._read() if self._exists else []
 
     def finished(self, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Returns an array (m,) of bool that marks which of `poses` (m, n) are already in the file.
+        """Returns a mask (m,) of the `poses` (m, n) that are already in the file.
 
         Raises:
             CollectionError: The file contains a pose that is not in `poses`.
@@ -145,8 +154,8 @@ class CollectionFile:
             which = np.all(poses == pose, axis=1)
             if not which.any():
                 raise CollectionError(
-                    f"{self._path}:{line}: was collected for a pose that is none of these; name another output, or "
-                    "the poses that it was begun with (more may be added to them)"
+                    f"{self._path}, line {line}: the requested pose of this row is not in the pose file. Choose "
+                    "another output, or the pose file of this collection (poses may be added to it)."
                 )
             done |= which
         return done
@@ -164,7 +173,7 @@ class CollectionFile:
             RecordingError: The row cannot be written; the previous rows are complete.
         """
         if self._file is None:
-            self._file = GrowingFile(self._path, resume=self._is_there, sync=True)
+            self._file = GrowingFile(self._path, resume=self._exists, sync=True)
             if not self._has_header:
                 self._file.append((",".join(self._header) + "\n").encode())
         numbers = [*map(repr, [*q.tolist(), *tau.tolist(), *pose.tolist()])]
@@ -194,11 +203,11 @@ class CollectionFile:
         columns = [header.index(name) for name in self._names("pose")]
         found = []
         for line, cells in rows:
-            where = f"{self._path}:{line}"
+            where = f"{self._path}, line {line}"
             if len(cells) != len(header):
-                raise RecordingError(f"{where}: has {len(cells)} cells, the header names {len(header)} columns")
+                raise RecordingError(f"{where}: the row has {len(cells)} cells, the header has {len(header)}")
             if (name := cells[header.index("arm")]) != self._arm.name:
-                raise CollectionError(f"{where}: is of {name}, not of {self._arm.name}; name another output")
+                raise CollectionError(f"{where}: the row is of {name}, not of {self._arm.name}. Choose another output.")
             found.append((line, np.array([parse_finite(cells[j], f"{where}: {header[j]}") for j in columns])))
         return found
 
@@ -207,7 +216,7 @@ class CollectionFile:
             return
         if "pose1" in header and ("friction1" in header) != self._both_sides:
             sides = "one side (--no-both-sides)" if self._both_sides else "both sides (--both-sides)"
-            raise CollectionError(f"{self._path}: was collected from {sides}; go on in the same way")
+            raise CollectionError(f"{self._path} was collected from {sides}. Continue with the same option.")
         raise CollectionError(
-            f"{self._path}: is there and was not collected from {self._arm.name}; name another output"
+            f"{self._path} already exists and is not a collection of {self._arm.name}. Choose another output."
         )

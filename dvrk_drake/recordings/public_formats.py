@@ -35,12 +35,12 @@ from dvrk_drake.recordings.recording import Recording
 #: Nominal sampling rate of the recordings [Hz].
 WPI_RATE = 200.0
 
-#: Joints whose recorded coordinates are those of the joint itself, although a disc drives them.
+#: Joints that are recorded in joint coordinates, although a disc drives them.
 WPI_DIRECT_JOINTS = ("roll",)
 
 _NUM_JOINTS = 7
 _WPI_COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(_NUM_JOINTS)]
-_WPI_LAYOUT = "21 numbers a row: q1..q7, qd1..qd7, tau1..tau7"
+_WPI_LAYOUT = "21 numbers per row: q1..q7, qd1..qd7, tau1..tau7"
 
 
 def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: bool = False) -> Recording:
@@ -66,7 +66,7 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
     path = Path(path)
     rows, sha256 = read_rows(path)
     if not rows:
-        raise RecordingError(f"{path}: is empty; needs {_WPI_LAYOUT}")
+        raise RecordingError(f"{path} is empty; needs {_WPI_LAYOUT}")
     first_line, first = rows[0]
     timed = first == ["t", *_WPI_COLUMNS]
     names = ["t", *_WPI_COLUMNS] if timed else _WPI_COLUMNS
@@ -75,33 +75,35 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
         rows = rows[1:]
     elif not any(is_number(cell) for cell in first):
         raise RecordingError(
-            f"{path}:{first_line}: has a header, which wpi-csv has not ({_WPI_LAYOUT}); "
-            "a CSV whose header names q1..q7 needs no conversion"
+            f"{path}, line {first_line}: unexpected header; wpi-csv files have no header and {_WPI_LAYOUT}. "
+            "A CSV with columns q1..q7 in its header needs no conversion."
         )
     values = np.empty((len(rows), len(names)))
     parse = parse_or_nan if skip_invalid else parse_finite
     for row, (line, cells) in enumerate(rows):
         if len(cells) != len(names):
-            layout = f"its header names {len(names)} columns" if timed else f"wpi-csv has {_WPI_LAYOUT}"
-            raise RecordingError(f"{path}:{line}: has {len(cells)} cells; {layout}")
+            layout = f"the header has {len(names)}" if timed else f"wpi-csv files have {_WPI_LAYOUT}"
+            raise RecordingError(f"{path}, line {line}: the row has {len(cells)} cells, {layout}")
         for column, cell in enumerate(cells):
-            values[row, column] = parse(cell, f"{path}:{line}: {names[column]} (column {column + 1})")
+            values[row, column] = parse(cell, f"{path}, line {line}: {names[column]} (column {column + 1})")
     valid = np.all(np.isfinite(values), axis=1)
     lines = np.array([line for line, _ in rows])
     kept = values[valid]
     if len(kept) < 2:
-        raise RecordingError(f"{path}: has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2")
+        raise RecordingError(f"{path} has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2")
     if timed:
         t, kept = kept[:, 0], kept[:, 1:]
         notes = time_notes(t, lines[valid])
     else:
-        t, note = made_times(np.flatnonzero(valid), WPI_RATE if rate is None else rate)
+        t, note = generated_times(np.flatnonzero(valid), WPI_RATE if rate is None else rate)
         notes = [note]
     if len(kept) < len(values):
         notes.append(skipped_note(lines[~valid], len(values)))
     repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
     if repeats:
-        notes.append(f"{repeats} of {len(kept)} rows repeat the row before them (polled too fast); they are kept")
+        notes.append(
+            f"{repeats} of {len(kept)} rows repeat the previous row (polled faster than updated); they are kept"
+        )
     q, qd, tau = np.split(kept, 3, axis=1)
     return Recording(
         q=q,
@@ -122,14 +124,14 @@ def refuse_rate(path: Path, rate: float | None) -> None:
         raise RecordingError(f"{path}: --rate does not apply: the file has time stamps (column t), which are kept")
 
 
-def made_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
+def generated_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
     """Returns times [s] for the row numbers of a file without time stamps, and a note on them.
 
     Raises:
         RecordingError: The rate is not a positive number.
     """
     if not (np.isfinite(rate) and rate > 0):
-        raise RecordingError(f"rate must be a positive number of Hz, not {rate}")
+        raise RecordingError(f"rate is {rate:g} Hz; allowed: a positive number")
     return rows / rate, f"{len(rows)} samples; the file has no time stamps, so t = row / {rate:g} Hz"
 
 
@@ -141,9 +143,8 @@ def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
     if np.any(steps <= 0):
         repeated, back = int(np.sum(steps == 0)), int(np.sum(steps < 0))
         notes.append(
-            f"t does not always increase: {repeated} row{'s repeat' if repeated != 1 else ' repeats'} the t before "
-            f"{'them' if repeated != 1 else 'it'}, {back} go{'es' * (back == 1)} back, first at line "
-            f"{lines[1:][steps <= 0][0]}; kept, but a motion with such times is refused by identify"
+            f"t does not increase in all rows ({repeated} equal, {back} smaller than the previous t; first at line "
+            f"{lines[1:][steps <= 0][0]}). The rows are kept, but identify refuses a motion with such times."
         )
     return notes
 
@@ -151,8 +152,8 @@ def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
 def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
     """Converts a "wpi-csv" recording of `arm` from actuator to joint coordinates.
 
-    Its actuators are those of the dVRK, except for the roll of a PSM, which is recorded at the joint (Wang et al. 2019,
-    table of the PSM).
+    The recorded coordinates are those of the actuators of the dVRK. The roll of a PSM is recorded at the joint instead
+    (Wang et al. 2019, table of the PSM).
 
     Raises:
         RecordingError: The number of joints is wrong, or the arm cannot reach the poses.
@@ -175,7 +176,7 @@ _T = TypeVar("_T")
 
 
 def looks_like_matlab(path: Path, content: bytes) -> bool:
-    """Returns whether a file with this content is a MATLAB file, from its first bytes or its name."""
+    """Returns whether a file is a MATLAB file, according to its first bytes or its name."""
     return content[126:128] in (b"IM", b"MI") or content[:8] == _HDF5_MAGIC or path.suffix.lower() == ".mat"
 
 
@@ -208,7 +209,7 @@ def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid
     if np.any(invalid) and not skip_invalid:
         raise RecordingError(_first_invalid_pose(path, joints, invalid))
     if np.all(invalid):
-        raise RecordingError(f"{path}: variable {name} has no valid pose among its {count}")
+        raise RecordingError(f"{path}: variable {name} has {count} poses, but none is valid")
     kept = joints[:, :, ~invalid]
     notes = [
         f"{kept.shape[2]} static poses from variable {name}, in joint coordinates",
@@ -222,16 +223,17 @@ def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid
         tau=kept[:, 1].T.copy(),
         source=str(path),
         lines=np.flatnonzero(~invalid) + 1,
+        line_label="pose",
         notes=tuple(notes),
         sha256=hashlib.sha256(content).hexdigest(),
     )
 
 
 def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, NDArray[np.float64]]:
-    """Returns the selected variable as (8, 2, N), and its name."""
+    """Returns the name and the array (8, 2, N) of the selected variable."""
     if content[:8] == _HDF5_MAGIC or content[124:128] in _MATLAB_73:
         raise RecordingError(
-            f"{path}: is a MATLAB v7.3 (HDF5) file, which is not supported; load it in MATLAB and save it with '-v7'"
+            f"{path} is a MATLAB v7.3 (HDF5) file, which is not supported. Load it in MATLAB and save it with '-v7'."
         )
     listed = _matlab(path, lambda: scipy.io.whosmat(io.BytesIO(content)))
     found = ", ".join(f"{n} ({' x '.join(map(str, s))} {kind})" for n, s, kind in listed) or "no variables"
@@ -239,15 +241,15 @@ def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, 
     layout = "8 x 2 x N real numbers (joint; position or effort; pose)"
     if variable is not None:
         if variable not in (n for n, _, _ in listed):
-            raise RecordingError(f"{path}: has no variable {variable}; it has: {found}")
+            raise RecordingError(f"{path} has no variable {variable}. Variables in the file: {found}.")
         if variable not in fitting:
-            raise RecordingError(f"{path}: variable {variable} must be {layout}; the file has: {found}")
+            raise RecordingError(f"{path}: variable {variable} must be {layout}. Variables in the file: {found}.")
     elif not fitting:
-        raise RecordingError(f"{path}: no variable is {layout}; it has: {found}")
+        raise RecordingError(f"{path}: no variable has the layout {layout}. Variables in the file: {found}.")
     elif len(fitting) > 1:
         raise RecordingError(
-            f"{path}: several variables fit: {', '.join(fitting)}; "
-            "choose one with --variable NAME (variable= in Python)"
+            f"{path}: several variables have the layout {layout}: {', '.join(fitting)}. "
+            "Choose one with --variable NAME (variable= in Python)."
         )
     name = variable or fitting[0]
     array = _matlab(path, lambda: scipy.io.loadmat(io.BytesIO(content), variable_names=[name])[name])
@@ -267,16 +269,16 @@ def _matlab(path: Path, read: Callable[[], _T]) -> _T:
     except Exception as error:
         # For a damaged file scipy may raise any error: ValueError, OSError, MatReadError, zlib.error, ...
         text = " ".join(str(error).split())
-        raise RecordingError(f"{path}: not a MATLAB file that can be read: {text}") from error
+        raise RecordingError(f"{path}: invalid MATLAB file: {text}") from error
 
 
 def _first_invalid_pose(path: Path, joints: NDArray[np.float64], invalid: NDArray[np.bool_]) -> str:
     pose = int(np.flatnonzero(invalid)[0])
     bad = np.argwhere(~np.isfinite(joints[:, :, pose]))
-    problem = "pose has only zeros, so it was never recorded"
+    problem = "all numbers are zero, so the pose was not recorded"
     if len(bad):
         joint, which = bad[0]
         name, value = f"{('q', 'tau')[which]}{joint + 1}", joints[joint, which, pose]
         problem = f"{name} is {value}; only finite numbers are allowed"
     count = f"{np.sum(invalid)} of {len(invalid)} poses"
-    return f"{path}:{pose + 1}: {problem}; {count} are invalid (--skip-invalid leaves them out)"
+    return f"{path}, pose {pose + 1}: {problem}. Use --skip-invalid to omit invalid poses ({count})."

@@ -52,9 +52,11 @@ class Recording:
         t: Times (m,), or None for poses.
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
-        lines: Line (m,) of each row in the source, for messages; the event number for an LCM log.
+        lines: Line number (m,) of each row in the source, or None. For an LCM log it is the number of the event, for a
+            MATLAB array the number of the pose.
         sha256: SHA-256 of the source, or "".
-        notes: Notes for the user on how the source was read, one per line: damage, omitted messages.
+        notes: Notes for the user on damaged and omitted parts of the source, one per line.
+        line_label: Name of the numbers in `lines`, for messages: "line", "event" or "pose".
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -73,6 +75,7 @@ class Recording:
     lines: NDArray[np.int_] | None = None
     sha256: str = ""
     notes: tuple[str, ...] = ()
+    line_label: str = "line"
     # Cache of this recording in the other coordinates, by transmission.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
@@ -98,9 +101,9 @@ class Recording:
         return len(self.q)
 
     def where(self, row: int) -> str:
-        """Returns `file:line` of a row, or the number of the row if there is no file."""
+        """Returns the source and the line of a row, "poses.csv, line 2", or its row number if there are no lines."""
         source = self.source or "recording"
-        return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
+        return f"{source}, row {row + 1}" if self.lines is None else f"{source}, {self.line_label} {self.lines[row]}"
 
     @property
     def is_motion(self) -> bool:
@@ -117,7 +120,7 @@ class Recording:
         return self.t is not None and bool(np.all(np.diff(self.t) > 0))
 
     def motion(self, arm: Arm) -> str:
-        """Returns the joint that moves most and its speed, e.g. "joint 1 at 0.2 rad/s RMS".
+        """Returns a text with the fastest joint and its speed, e.g. "joint 1 at 0.2 rad/s RMS".
 
         The text is empty if all joints are at rest, or if the speed is unknown. The speed is computed from qd, or from
         q and t if samples are less than 0.1 s apart. At longer intervals the speed between poses is unknown.
@@ -142,7 +145,7 @@ class Recording:
         """
         if self.tau is None:
             raise RecordingError(
-                f"{self.source or 'recording'}: has no efforts; needs columns tau1..tau{self.q.shape[1]}"
+                f"{self.source or 'recording'} has no efforts; needs columns tau1..tau{self.q.shape[1]}"
             )
         return self.tau
 
@@ -195,21 +198,21 @@ class Recording:
         lower, upper = arm.position_lower[joint], arm.position_upper[joint]
         message = (
             f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} "
-            f"is outside {lower:.4g}..{upper:.4g}{' m' if arm.prismatic[joint] else ''} of {arm.name}"
+            f"is outside {lower:.4g}..{upper:.4g} {'m' if arm.prismatic[joint] else 'rad'} of {arm.name}."
         )
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
-        turning = np.max(shares[~arm.prismatic])
+        revolute = np.max(shares[~arm.prismatic])
         # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3; in degrees by up to
         # 57.
-        if outside > 0.3 and turning > 4 and np.radians(turning) <= 1.2:
-            message += "; are these degrees, or is it another arm? Positions must be in rad (m on a prismatic joint)"
+        if outside > 0.3 and revolute > 4 and np.radians(revolute) <= 1.2:
+            message += " Are the positions in degrees instead of rad, or of another arm?"
         elif arm.prismatic[joint] and shares[joint] > 4:
-            message += "; are these millimetres or centimetres? A prismatic joint must be in m, its effort in N"
+            message += " Are the positions in millimetres or centimetres instead of m?"
         else:
-            message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
+            message += " Is the arm or the choice of coordinates (joint or actuator) wrong?"
         if pairs := self._exchanges_within_limits(arm):
-            message += f" Or are columns exchanged? Within the limits with {', '.join(pairs)} exchanged"
+            message += f" All poses are within the limits if columns are exchanged: {', '.join(pairs)}."
         raise RecordingError(message)
 
     def _exchanges_within_limits(self, arm: Arm) -> list[str]:
@@ -229,15 +232,16 @@ class Recording:
                 continue
             row, joint = np.argwhere(~plausible)[0]
             raise RecordingError(
-                f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
-                f"at most {IMPLAUSIBLE:g}"
+                f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is not plausible; "
+                f"allowed: absolute values up to {IMPLAUSIBLE:g}"
             )
 
     def _check_joint_count(self, arm: Arm) -> None:
         if self.q.shape[1] != arm.num_joints:
             source = self.source or "recording"
             raise RecordingError(
-                f"{source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}: {', '.join(arm.joint_names)}"
+                f"{source} has {self.q.shape[1]} joints, but {arm.name} has {arm.num_joints}: "
+                f"{', '.join(arm.joint_names)}"
             )
 
 
@@ -252,19 +256,19 @@ def read_recording(
     """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file content selects the format.
 
     A CSV has a header with q1..qn and optionally t, qd1..qdn and tau1..taun, in any order. Other columns are ignored.
-    `read_status_log` describes what is read from a log.
+    For the content of a log, see `read_status_log`.
 
     Args:
         path: Path of the CSV or log.
         arm: Arm that defines the number and the names of the joints, and whose statuses are read from a log. Without
-            it, a CSV must have 7 joints, and a log must have statuses of only one arm.
+            an arm, a CSV must have 7 joints, and a log must have statuses of only one arm.
         coordinates: Coordinates of q, qd and tau in a CSV. A log contains joint coordinates.
         skip_invalid: Whether to omit and note rows of a CSV with an empty cell, a NaN or an infinity, instead of
             refusing the file.
         progress: Callback that receives the step, "reading", and the completed share 0..1 of a CSV.
 
     Returns:
-        The recording, with its SHA-256 and with line numbers for messages; `notes` list what was omitted.
+        Recording with SHA-256 and line numbers. Its `notes` list omitted rows and messages.
 
     Raises:
         RecordingError: The file cannot be read as a recording. The message names the file, line and column.
@@ -275,16 +279,16 @@ def read_recording(
         >>> dvrk.write_recording(dvrk.Recording(q=np.zeros((8, 7)), tau=np.ones((8, 7))), "poses.csv")
         >>> recording = dvrk.read_recording("poses.csv", arm)
         >>> len(recording), recording.coordinates, recording.where(0)
-        (8, 'joint', 'poses.csv:2')
+        (8, 'joint', 'poses.csv, line 2')
     """
     if coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     path = Path(path)
     if is_lcm_log(path):
         if coordinates != "joint":
-            raise RecordingError(f"{path}: an LCM log is in joint coordinates, not {coordinates}")
+            raise RecordingError(f"{path}: an LCM log is in joint coordinates, not in {coordinates} coordinates")
         log = read_status_log(path, arm)
-        return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes)
+        return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes, "event")
     return _read_csv(path, arm, coordinates, step_progress(progress, "reading"), skip_invalid)
 
 
@@ -299,14 +303,14 @@ def _read_csv(
     with CsvReader(path, progress) as reader:
         header_line, cells = next(iter(reader), (0, []))
         if not cells:
-            raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
+            raise RecordingError(f"{path} is empty; needs a header with {_expected_columns(num_joints)}")
         header = [cell.strip() for cell in cells]
-        blocks = _columns_of_blocks(f"{path}:{header_line}", header, arm, num_joints)
+        blocks = _columns_of_blocks(f"{path}, line {header_line}", header, arm, num_joints)
         values, lines, skipped = _read_numbers(path, reader, header, blocks, skip_invalid)
         sha256 = reader.sha256()
     if not lines:
         rows = "no row of finite numbers" if skipped else "a header but no rows"
-        raise RecordingError(f"{path}: has {rows}")
+        raise RecordingError(f"{path} has {rows}")
     q, qd, tau, t = (
         np.frombuffer(values[prefix]).reshape(len(lines), -1) if prefix in values else None
         for prefix in ("q", "qd", "tau", "t")
@@ -321,11 +325,11 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
     """Returns a mapping from a prefix (q, qd, tau, t) to its columns in the header."""
     if all(is_number(cell) for cell in header):
         raise RecordingError(
-            f"{where}: has no header; the first line must name the columns, "
-            f"{_wanted(num_joints)} (dvrk-drake convert reads headerless public formats)"
+            f"{where}: the header is missing. The first line must contain the column names "
+            f"{_expected_columns(num_joints)}. dvrk-drake convert reads public recordings without a header."
         )
-    if twice := next((name for name, count in Counter(header).items() if name and count > 1), ""):
-        raise RecordingError(f"{where}: column {twice[:30]} is named twice")
+    if duplicate := next((name for name, count in Counter(header).items() if name and count > 1), ""):
+        raise RecordingError(f"{where}: column {duplicate[:30]} occurs twice")
     blocks = {}
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
         names = column_names(prefix, num_joints)
@@ -335,11 +339,12 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
         if missing:
             raise RecordingError(
                 f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
-                f"needs {_wanted(num_joints)}{_joint_list(arm)}"
+                f"needs {_expected_columns(num_joints)}{_joint_list(arm)}"
             )
         if f"{prefix}{num_joints + 1}" in header:
             raise RecordingError(
-                f"{where}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints{_joint_list(arm)}"
+                f"{where}: unexpected column {prefix}{num_joints + 1}; "
+                f"the arm has {num_joints} joints{_joint_list(arm)}"
             )
         blocks[prefix] = [header.index(name) for name in names]
     if "t" in header:
@@ -357,11 +362,11 @@ def _read_numbers(
     width = len(header)
     for line, cells in reader:
         if len(cells) != width:
-            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {width} columns")
+            raise RecordingError(f"{path}, line {line}: the row has {len(cells)} cells, the header has {width}")
         if len(lines) == MAX_COUNT:
-            raise RecordingError(f"{path}:{line}: has more than {MAX_COUNT} rows; cut the recording into parts")
+            raise RecordingError(f"{path}, line {line}: the file has more than {MAX_COUNT} rows. Split the recording.")
         if skip_invalid and not all(
-            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}:{line}: {header[column]}"))
+            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}, line {line}: {header[column]}"))
             for _, columns in parts
             for column in columns
         ):
@@ -371,12 +376,12 @@ def _read_numbers(
         for part, columns in parts:
             try:
                 numbers = [float(cells[column]) for column in columns]
-                is_good = math.isfinite(sum(numbers)) and not reader.has_underscore
+                valid = math.isfinite(sum(numbers)) and not reader.has_underscore
             except ValueError:
-                is_good = False
-            if not is_good:
+                valid = False
+            if not valid:
                 numbers = [
-                    parse_finite(cells[column].strip(), f"{path}:{line}: {header[column]}") for column in columns
+                    parse_finite(cells[column].strip(), f"{path}, line {line}: {header[column]}") for column in columns
                 ]
             part.extend(numbers)
     return values, lines, skipped
@@ -391,7 +396,7 @@ def write_recording(recording: Recording, path: str | Path) -> None:
     """Writes the CSV that `read_recording` reads, atomically and with full precision.
 
     Args:
-        recording: Recording in the coordinates to write; a CSV does not state them.
+        recording: Recording in the coordinates to write. A CSV does not state the coordinates.
         path: Path of the file; an existing one is replaced.
 
     Raises:
@@ -429,8 +434,8 @@ def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) 
 
 
 def _joint_list(arm: Arm | None) -> str:
-    return f"; of {arm.name} these are {', '.join(arm.joint_names)}" if arm else ""
+    return f"; joints of {arm.name}: {', '.join(arm.joint_names)}" if arm else ""
 
 
-def _wanted(num_joints: int) -> str:
+def _expected_columns(num_joints: int) -> str:
     return f"q1..q{num_joints} and tau1..tau{num_joints} (t and qd1..qd{num_joints} optional)"

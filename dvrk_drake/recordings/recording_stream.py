@@ -1,4 +1,4 @@
-"""Writes recordings while they are received. If the process ends, the file is complete up to its last row.
+"""Writes recordings while statuses are received. If the process ends, the file ends with a complete row.
 
 Written rows survive the termination of the process. The last rows before a power failure may be lost.
 """
@@ -18,7 +18,7 @@ from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.recording import column_names
 
-#: Additional columns of a CSV after those of a Recording, which identify the status of each row.
+#: Columns of a CSV after the columns of a Recording. They identify the status of each row.
 _ORIGIN = ("utime", "sequence", "guard_state")
 
 
@@ -50,16 +50,16 @@ def check_stream_output(path: str | Path) -> None:
     """
     path = Path(path)
     if path.suffix not in (".csv", ".log"):
-        raise RecordingError(f"{path}: must end in .csv or .log (LCM log)")
+        raise RecordingError(f"{path}: the file name must end in .csv or .log (LCM log)")
     if os.path.lexists(path):
-        raise RecordingError(f"{path}: exists already, and a recording is not overwritten; name another file")
+        raise RecordingError(f"{path} already exists, and a recording is never overwritten. Choose another file.")
     if not path.parent.is_dir():
-        raise RecordingError(f"{path}: cannot be written: its folder does not exist")
+        raise RecordingError(f"{path} cannot be written: its folder does not exist")
     try:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+        raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:

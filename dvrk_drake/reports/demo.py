@@ -1,4 +1,4 @@
-"""The demo and the teleoperation as text in a terminal."""
+"""Prints the results of the demo and of the teleoperation to a terminal."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 
 WITH_A_REAL_ARM = """
 With a real arm:
-1. Record 40 or more varied poses at rest (dvrk-drake collect, or
-   docs/public_recordings.md for other programs).
+1. Record at least 40 different static poses with dvrk-drake collect, or
+   convert a recording of another program (docs/public_recordings.md).
 2. dvrk-drake identify POSES.csv --arm {arm} --output model.yaml
 3. On another day: dvrk-drake validate OTHER.csv --model model.yaml --save
-4. Only when no joint's verdict is "do not use":
-   dvrk-drake run --arm {arm} --model model.yaml --mode gravity
-   Keep a hand on the stop button. Switch the controller's own gravity
-   compensation off first, or gravity is compensated twice."""
+4. Disable the gravity compensation of the dVRK controller. Otherwise gravity is
+   compensated twice. Keep a hand on the emergency stop.
+5. Only if no verdict is "do not use":
+   dvrk-drake run --arm {arm} --model model.yaml --mode gravity"""
 
 
 def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: bool = False) -> None:
-    """Prints how far the arm drifts when it is released, and the errors of the models on fresh poses.
+    """Prints the drift of the released arm, and the errors of the models at new poses.
 
     Args:
-        console: to print to.
-        result: to print.
-        folder: which the demo wrote.
-        verbose: also print the identified parameters and the steps with a real arm.
+        console: Console to print to.
+        result: Result of the demo.
+        folder: Folder that the demo wrote.
+        verbose: Whether to print the identified parameters and the steps for a real arm.
     """
     arm = result.arm
     drifts = list(result.drift.values())
     angles = [np.where(arm.prismatic, 0.0, drift) for drift in drifts[:2]]
-    identified, drawn = (f"{angle.max():.4f} rad ({arm.joint_names[int(np.argmax(angle))]})" for angle in angles)
+    identified, nominal = (f"{angle.max():.4f} rad ({arm.joint_names[int(np.argmax(angle))]})" for angle in angles)
     print_answer(
         console,
         f"Released without dry friction, {arm.name} turns by at most {identified} with the identified model, and by "
-        f"{drawn} with that of the SDF.",
+        f"{nominal} with the nominal model.",
         f"open {folder}/arm.html in a browser",
     )
     table = make_table(
-        f"RMS torque error at {result.fresh.poses} fresh poses [N m; N], drift and step error [rad; m]",
-        *("", "no model", "identified model", "paper's method", *(f"drift, {k}" for k in result.drift), "step error"),
+        f"RMS torque error at {result.fresh.poses} new poses [N m; N], drift and step error [rad; m]",
+        *("", "no model", "identified", "paper's method", "drift, identified", "drift, nominal", "step error"),
     )
     for i, (ours, paper) in enumerate(zip(result.fresh.joints, result.fresh_paper.joints, strict=True)):
         errors = (ours.rms_torque, ours.rms_error, paper.rms_error, *(drift[i] for drift in drifts))
@@ -62,19 +62,19 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     if arm.coupled_limits:
         print_note(
             console,
-            "The simulated arm has no stops in q2 + q3: the step, and the release with the SDF's model, pass where a "
-            "real arm would hit them.",
+            "The simulated arm has no joint stops in q2 + q3. A real arm would hit them in the step and in the release "
+            "with the nominal model.",
         )
 
 
 def print_teleoperation(console: Console, result: TeleoperationResult, file: str, *, verbose: bool = False) -> None:
-    """Prints how well the tip followed the handle.
+    """Prints the tracking error of the instrument tip.
 
     Args:
-        console: to print to.
-        result: to print.
-        file: page with the recorded motion.
-        verbose: also print how the errors are computed.
+        console: Console to print to.
+        result: Result of the teleoperation.
+        file: Path of the page with the recorded motion.
+        verbose: Whether to print the definition of the errors.
     """
     print_answer(
         console,
@@ -82,19 +82,19 @@ def print_teleoperation(console: Console, result: TeleoperationResult, file: str
         f"(RMS {1e3 * result.rms_position_error:.3f} mm).",
         f"open {file} in a browser",
     )
-    table = make_table("Error of the tip", "", "RMS", "largest")
+    table = make_table("Tracking error of the instrument tip", "", "RMS", "largest")
     table.add_row(
         escape("position [mm]"), f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}"
     )
     table.add_row(
         escape("rotation [mrad]"), f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}"
     )
-    table.add_row(escape("motion with an open clutch [mm]"), "", f"{1e3 * result.max_motion_held:.1g}")
+    table.add_row(escape("motion while the clutch is open [mm]"), "", f"{1e3 * result.max_motion_held:.1g}")
     console.print(table)
     if verbose:
         console.print()
         print_note(
             console,
-            "Error: motion of the tip less the scaled motion of the handle since the clutch closed, over "
-            f"{result.handle_path:.2f} m of the handle's path.",
+            "Error: motion of the tip minus the scaled motion of the handle, since the clutch was closed. Path of the "
+            f"handle: {result.handle_path:.2f} m.",
         )

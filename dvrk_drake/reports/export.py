@@ -1,4 +1,4 @@
-"""Exported files, and the dVRK's installed gravity compensation beside a model's, as text in a terminal."""
+"""Prints exported models, and comparisons of gravity-compensation files of the dVRK with models, to a terminal."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 
 
 def print_export(console: Console, path: str, export: ModelExport, *, verbose: bool = False) -> None:
-    """Prints what a written file has of a model, and what it cannot state.
+    """Prints the content of an exported file, and effects of the model that the file cannot represent.
 
     Args:
-        console: to print to.
-        path: of the file.
-        export: what was written.
-        verbose: also print all numbers of the file.
+        console: Console to print to.
+        path: Path of the file.
+        export: Exported model.
+        verbose: Whether to print all numbers of the file.
     """
     arm = export.model.arm
     if export.bodies is not None:
@@ -41,39 +41,39 @@ def print_export(console: Console, path: str, export: ModelExport, *, verbose: b
 
 
 def _source(model: IdentifiedModel, origin: str) -> str:
-    """Returns the option that names a model: --arm if it is what the arm's SDF states."""
+    """Returns the option that selects the model: --arm for the nominal model, otherwise --model."""
     return f"--{'arm' if origin == model.arm.source else 'model'} {origin}"
 
 
 def _next_step(model: IdentifiedModel, origin: str) -> str:
-    if origin == model.arm.source:  # whose masses are estimates
+    if origin == model.arm.source:  # the masses of a nominal model are estimates
         return f"dvrk-drake identify RECORDING.csv --arm {origin} --output MODEL.yaml"
     return f"dvrk-drake export --model {origin} --dvrk-gc NEW.json"
 
 
 def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: ModelBodies, verbose: bool) -> None:
     changes = changed_links(arm, bodies.links)
-    answer = f"The {export.format.upper()} states the inertias of the arm's own SDF."
+    answer = f"The {export.format.upper()} has the same inertias as the SDF of the arm."
     if changes:
         before, after = (sum(getattr(c, which).parameters[0] for c in changes) for which in ("before", "after"))
-        answer = f"{len(changes)} links differ from the arm's own SDF, their total mass by {after - before:+.4f} kg."
+        answer = f"{len(changes)} links differ from the SDF of the arm, total mass by {after - before:+.4f} kg."
     print_answer(console, answer, f"dvrk-drake export {_source(export.model, export.origin)} --diff")
     if changes:
         console.print(_mass_table(changes))
     if changes and verbose:
         console.print(_inertia_table(changes))
-        print_note(console, "Principal moments about the centre of mass.")
+        console.print()
     if bodies.rotors:
         rotors = ", ".join(f"{name} {inertia:.3g}" for name, inertia in bodies.rotors.items())
-        console.print(f"Inertia that motors add to joints [kg m^2; kg if prismatic]: {rotors}", markup=False)
+        console.print(f"Reflected rotor inertias [kg m^2; kg if prismatic]: {rotors}", markup=False)
     for remark in bodies.left_out:
-        console.print(f"Left out: {remark}", markup=False)
+        console.print(f"Not exported: {remark}", markup=False)
 
 
 def _mass_table(changes: Sequence[LinkChange]) -> Table:
-    """Mass and centre of mass of every changed link; the latter in the link's frame."""
+    """Returns a table with the mass and the centre of mass of each changed link."""
     columns = ("mass, SDF [kg]", "mass [kg]", "centre of mass, SDF [mm]", "centre of mass [mm]")
-    table = make_table("Links in the arm's SDF and as exported", "", *columns)
+    table = make_table("Links in the SDF of the arm and as exported, in link frames", "", *columns)
     for change in changes:
         bodies = [inertia.to_spatial_inertia() for inertia in (change.before, change.after)]
         masses = [f"{body.get_mass():.4f}" for body in bodies]
@@ -82,8 +82,8 @@ def _mass_table(changes: Sequence[LinkChange]) -> Table:
 
 
 def _inertia_table(changes: Sequence[LinkChange]) -> Table:
-    title = "Principal moments of inertia [kg cm^2]"
-    table = make_table(title, "", "arm's SDF", "exported")
+    title = "Principal moments of inertia about the centre of mass [kg cm^2]"
+    table = make_table(title, "", "SDF of the arm", "exported")
     for change in changes:
         cells = []
         for inertia in (change.before, change.after):
@@ -102,7 +102,7 @@ def _place(place: NDArray[np.float64]) -> str:
 def _print_compensation(
     console: Console, path: str, export: ModelExport, file: GravityCompensationFile, verbose: bool
 ) -> None:
-    """Prints how far a written file differs from its model, and at which torques it clips."""
+    """Prints the largest difference between a written file and its model, and the torque limits of the file."""
     arm, off = export.model.arm, largest_differences(file, export.model)
     j = int(np.argmax(off))
     print_answer(
@@ -110,13 +110,13 @@ def _print_compensation(
         f"The file differs from the model by at most {off[j]:.1e} N m ({MTM_JOINTS[j]}), at rest.",
         f"dvrk-drake compare-gc {path} {_source(export.model, export.origin)}",
     )
-    table = make_table("Torques [N m]", "", "largest difference*", "clip", "dry friction")
+    table = make_table("Torques at rest [N m]", "", "largest difference*", "torque limits", "dry friction")
     friction = np.append((file.positive - file.negative)[10::5] / 2, 0.0)
     for j, name in enumerate(MTM_JOINTS):
         clip = f"{file.torque_lower[j]:+.4f}..{file.torque_upper[j]:+.4f}"
         table.add_row(name, f"{off[j]:.1e}", clip, f"{friction[j]:.4f}")
     console.print(table)
-    print_note(console, "* at 4000 random poses of the joint box")
+    print_note(console, "* between file and model at 4000 random poses over the joint range")
     if verbose:
         table = make_table("Friction compensation", "", "ratio", "dead band [rad/s]", "saturation [rad/s]")
         for j, name in enumerate(MTM_JOINTS):
@@ -125,22 +125,24 @@ def _print_compensation(
         console.print()
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
-        console.print(f"Clipped at the motor's limit somewhere in the joint box: {', '.join(short)}")
+        console.print(f"Torque limited by the motor at some poses: {', '.join(short)}.")
     console.print('Name the file as "gravity_compensation" in the JSON file of the arm.')
 
 
 def _print_kinematic_compensation(
     console: Console, export: ModelExport, file: KinematicCompensation, verbose: bool
 ) -> None:
-    """Largest differences from the model; the chain's links."""
+    """Prints the largest differences from the model, and the links of the kinematic chain in the file."""
     j = int(np.argmax(file.error / export.model.arm.effort_limits[: len(ARM_JOINTS)]))
     units = ("N m", "N m", "N")
     print_answer(
         console,
         f"The file differs from the model by at most {file.error[j]:.1e} {units[j]} ({ARM_JOINTS[j]}), at rest.",
-        "name the file in the JSON file of the arm",
+        "reference the file in the JSON file of the arm",
     )
-    table = make_table("Largest difference from the model", "", "instrument straight", "more with the wrist bent", "")
+    table = make_table(
+        "Largest difference from the model at rest", "", "straight instrument", "added by a bent wrist", ""
+    )
     for name, error, wrist, unit in zip(ARM_JOINTS, file.error, file.wrist, units, strict=True):
         table.add_row(name, f"{error:.1e}", f"{wrist:.1e}", unit)
     console.print(table)
@@ -155,13 +157,14 @@ def _print_kinematic_compensation(
 def print_comparison(
     console: Console, file_name: str, model_name: str, comparison: CompensationComparison, *, verbose: bool = False
 ) -> None:
-    """Prints the largest difference between a file and a model, then how they differ at each joint.
+    """Prints the differences between a gravity-compensation file and a model.
 
     Args:
-        console: to print to.
-        file_name, model_name: what was compared.
-        comparison: to print.
-        verbose: also print the ranges of the torques.
+        console: Console to print to.
+        file_name: Path of the file.
+        model_name: Path of the model, or name of the arm of a nominal model.
+        comparison: Comparison to print.
+        verbose: Whether to print the definitions of the columns and the ranges of the torques.
     """
     joints = comparison.joints
     difference = np.abs(comparison.clipped_torque - comparison.model_torque).max(axis=0)
@@ -171,13 +174,13 @@ def print_comparison(
     print_answer(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). At {wrong:.0f} % of "
-        f"the poses a joint is at its clip, runs away or opposes the model.",
+        f"the poses, a joint is at its torque limit, runs away or opposes the model.",
         _next_step(comparison.model, model_name),
         "yellow" if wrong else "green",
     )
     table = make_table(
-        f"File less model [N m] at {len(comparison.q)} poses of the joint box, at rest",
-        *("", "largest", "RMS, in sweep", "RMS, outside", "at its clip", "runaway", "opposed"),
+        f"Torque of the file minus model [N m], {len(comparison.q)} random static poses",
+        *("", "largest", "RMS, in sweep", "RMS, outside", "at limit", "runaway", "opposed"),
     )
     for joint, largest in zip(joints, difference, strict=True):
         shares = (f"{100 * x:.0f} %" if x else "" for x in (joint.clipped, joint.runaway, joint.opposed))
@@ -188,12 +191,12 @@ def print_comparison(
         return
     print_note(
         console,
-        f"Sweep: from which the file says that its data are ({_sweep(comparison)}). At its clip: share of the poses at "
-        "which the file's torque is its limit. Runaway: the file's torque before the clip is outside the model's range "
-        "by more than half of it. Opposed: file and model have opposite signs, both above a tenth of the model's "
-        "largest torque.",
+        f"Sweep: range of the data from which the file was identified ({_sweep(comparison)}). At limit: share of the "
+        "poses at which the torque of the file is limited. Runaway: the torque of the file before the limit is outside "
+        "the range of the model by more than half of it. Opposed: the torques of file and model have opposite signs, "
+        "and both exceed a tenth of the largest torque of the model.",
     )
-    table = make_table(f"Ranges [N m] of {file_name}, {model_name}", "", "model", "file before its clip", "clip")
+    table = make_table(f"Torque ranges [N m] of {file_name}, {model_name}", "", "model", "file before limits", "limits")
     for joint in joints:
         table.add_row(
             joint.name,
@@ -206,8 +209,8 @@ def print_comparison(
 
 def _sweep(comparison: CompensationComparison) -> str:
     if comparison.file.sweep is None:
-        return "it states none"
-    return f"{100 * comparison.in_sweep.mean():.0f} % of the joint box"
+        return "not stated in the file"
+    return f"{100 * comparison.in_sweep.mean():.0f} % of the poses"
 
 
 def _range(lower: float, upper: float) -> str:

@@ -1,4 +1,4 @@
-"""Identified models, recalibrations and their errors on recordings as text in a terminal."""
+"""Prints identification, validation and recalibration results to a terminal."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-#: Colours of rows by verdict.
+#: Colours of table rows by verdict.
 _STYLES: dict[Verdict, str] = {"do not use": "red", "not judged": "yellow"}
 _EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit (revolute)")
 _NAME_WIDTH = 64
@@ -37,13 +37,13 @@ _NAME_WIDTH = 64
 def print_identification(
     console: Console, result: Identification, *, model_path: str = "MODEL.yaml", verbose: bool = False
 ) -> None:
-    """Prints the verdict by cross-validation and the error of each joint.
+    """Prints the verdict and the cross-validated error of each joint.
 
     Args:
-        console: to print to.
-        result: from poses or from a motion.
-        model_path: file that the model is written to, for the next command.
-        verbose: also print every parameter with its standard error, and the excluded measurements.
+        console: Console to print to.
+        result: Result for static poses or for a motion.
+        model_path: Path of the written model, for the suggested next command.
+        verbose: Whether to print each parameter with its standard error, and the excluded measurements.
     """
     verdicts = cross_validated_verdicts(result.model)
     next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
@@ -55,7 +55,7 @@ def print_identification(
             np.mean([getattr(a, which) / a.rms_effort for a in actuators if a.rms_effort > 0])
             for which in ("rms_fit", "rms_cross_validation")
         )
-        error = f"Mean effort error {_percent(fit)} in the fit, {_percent(held_out)} cross-validated."
+        error = f"Mean relative effort error: {_percent(held_out)} in cross-validation, {_percent(fit)} in the fit."
         _print_verdict(console, verdicts, error, next_command)
         _print_motion_errors(console, result, verdicts)
         if verbose:
@@ -64,15 +64,15 @@ def print_identification(
         joints = result.model.joints
         errors = np.array([j.rms_cross_validation_included for j in joints])
         torques = np.array([j.rms_zero_torque_included for j in joints])
-        error = _largest_error(result.model.arm, errors, torques, "cross-validated ")
+        error = _largest_error(result.model.arm, errors, torques, "cross-validation ")
         _print_verdict(console, verdicts, error, next_command)
-        _print_pose_errors(console, result, verdicts)
+        _print_pose_errors(console, result, verdicts, verbose)
         if verbose:
             _print_pose_details(console, result)
 
 
 def _source(recording: Recording) -> str:
-    """Arguments that name a recording and its coordinates."""
+    """Returns the path of a recording and the option for its coordinates, as arguments of a command."""
     coordinates = "" if recording.coordinates == "joint" else f" --coordinates {recording.coordinates}"
     return f"{recording.source or 'RECORDING.csv'}{coordinates}"
 
@@ -83,10 +83,10 @@ def print_validation(
     """Prints the verdict on a recording and the error of each joint.
 
     Args:
-        console: to print to.
-        validation: on poses or on a motion.
-        model_path: file of the model, for the next command.
-        verbose: also print the rule behind the verdicts, the kinds of errors, and the excluded measurements.
+        console: Console to print to.
+        validation: Result for static poses or for a motion.
+        model_path: Path of the model, for the suggested next command.
+        verbose: Whether to print the rule of the verdicts, the kinds of errors, and the excluded measurements.
     """
     verdicts, model = validation.verdicts, validation.model
     source = _source(validation.recording)
@@ -98,7 +98,7 @@ def print_validation(
         if isinstance(validation, DynamicValidation):
             next_command = f"dvrk-drake recalibrate {source} --model {model_path} --output NEW.yaml"
     if isinstance(validation, DynamicValidation):
-        error = f"Mean effort error {_percent(validation.mean_relative_error)}."
+        error = f"Mean relative effort error: {_percent(validation.mean_relative_error)}."
         _print_verdict(console, verdicts, error, next_command)
         _print_motion_validation(console, validation, verbose)
     elif isinstance(validation, StaticValidation):
@@ -112,13 +112,13 @@ def print_validation(
 def print_recalibration(
     console: Console, result: Recalibration, *, model_path: str = "MODEL.yaml", verbose: bool = False
 ) -> None:
-    """Prints errors before and after, and the new friction and offsets.
+    """Prints the errors before and after the refit, and the change of friction and offsets.
 
     Args:
-        console: to print to.
-        result: to print.
-        model_path: file that the new model is written to, for the next command.
-        verbose: also print how errors are computed, and friction that actuators share.
+        console: Console to print to.
+        result: Result of the recalibration.
+        model_path: Path of the new model, for the suggested next command.
+        verbose: Whether to print the definition of the errors, and friction that several actuators share.
     """
     before, after = (float(np.mean([getattr(a, which) for a in result.actuators])) for which in ("before", "after"))
     kept = sum(a.kept for a in result.actuators)
@@ -129,7 +129,7 @@ def print_recalibration(
         f"dvrk-drake validate OTHER.csv --model {model_path} --save",
     )
     table = make_table(
-        f"{result.model.arm.name}, {result.seconds:.1f} s of motion: effort error, and change of friction and offset",
+        f"{result.model.arm.name}, {result.seconds:.1f} s of motion: effort error, change of friction and offset",
         *(
             "",
             "error before",
@@ -148,23 +148,23 @@ def print_recalibration(
     console.print(table)
     print_note(
         console,
-        "The gain is for motions like the recalibration recording. At other positions and speeds it can be much "
-        "smaller: validate the new model on the motion that you need.",
+        "The improvement is valid for similar motions. At other positions and speeds it can be much smaller. Validate "
+        "the new model on the motion that you need.",
     )
     if not verbose:
         return
     print_note(
         console,
-        f"Error: |measured - predicted| / |measured effort| of the actuators, after the model's low-pass filter. "
-        f"After: {FOLDS}-fold cross-validation over the motion. Factors and offsets: fitted to the whole motion.",
+        f"Error: RMS of measured - predicted effort / RMS of measured effort, after the low-pass filter of the model. "
+        f"Error after: {FOLDS}-fold cross-validation over the motion. Factors and offsets: fit to the whole motion.",
     )
     if result.shared:
         shared = ", ".join(f"{name} x {scale:.2f}" for name, scale in result.shared.items())
-        console.print(f"Friction that several actuators share: {shared}", markup=False)
+        console.print(f"Factors of friction that several actuators share: {shared}", markup=False)
 
 
 def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str, next_command: str) -> None:
-    """The least favourable verdict and the joints that have it, the error, and the joints without torque."""
+    """Prints the least favourable verdict with its joints, the error, and the joints without feedforward."""
     verdict, names = worst(verdicts)
     which = "" if verdict == "good" or len(names) == len(verdicts) else f" ({', '.join(names)})"
     off = [name for name, v in verdicts.items() if v == "off"]
@@ -174,7 +174,7 @@ def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str
 
 
 def _largest_error(arm: Arm, errors: np.ndarray, torques: np.ndarray, kind: str = "") -> str:
-    """Names the joint with the largest error as a share of its effort limit."""
+    """Returns a sentence about the joint whose error is the largest share of its effort limit."""
     j = int(np.nanargmax(np.where(torques > 0, errors / arm.effort_limits, -1.0)))
     unit, share = "N" if arm.prismatic[j] else "N m", _percent(errors[j] / arm.effort_limits[j])
     return f"Largest {kind}error: {share} of the effort limit ({arm.joint_names[j]}, {errors[j]:.3g} {unit})."
@@ -182,8 +182,8 @@ def _largest_error(arm: Arm, errors: np.ndarray, torques: np.ndarray, kind: str 
 
 def _print_motion_errors(console: Console, result: DynamicIdentification, verdicts: Mapping[str, Verdict]) -> None:
     section = result.model.dynamic_model.section
-    title = f"{result.model.arm.name}, {len(result.recording)} rows of motion: RMS effort error of the actuators"
-    columns = ("", "effort [N m; N]", "error in fit", "cross-validated", "repeatability", "verdict")
+    title = f"{result.model.arm.name}, {len(result.recording)} rows of motion: effort and relative error (RMS)"
+    columns = ("", "effort [N m; N]", "fit error", "cross-validation error", "repeatability", "verdict")
     table = make_table(title, *columns)
     table.columns[-1].justify = "left"
     errors = ("rms_fit", "rms_cross_validation", "rms_repeatability")
@@ -203,21 +203,20 @@ def _print_motion_errors(console: Console, result: DynamicIdentification, verdic
     if tilt > 0.1:
         gravity = ", ".join(f"{x:.3f}" for x in section.gravity)
         console.print(
-            f"The base is tilted by {tilt:.1f} deg: gravity in the base frame is {gravity} m/s^2.", markup=False
+            f"The base is tilted by {tilt:.1f} deg. Gravity in the base frame: {gravity} m/s^2.", markup=False
         )
     console.print()
 
 
 def _print_motion_details(console: Console, result: DynamicIdentification) -> None:
-    """Every parameter with its standard error."""
+    """Prints each parameter with its standard error."""
     section = result.model.dynamic_model.section
     print_note(
         console,
-        f"Efforts are compared after a low-pass filter at {section.signals.effort_cut_off:g} Hz. Cross-validated: each "
-        "sixth of the motion's phases is predicted by a model identified without it, including the choice of effects "
-        "and the base tilt. The effects that the arm's file lists were chosen on such motions, and friction changes "
-        "from day to day: on another recording the error can be larger. Repeatability: difference between periods of "
-        "the motion; a fit can be below it where the executed motion differs too.",
+        f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: 6 folds over the "
+        "phase of the motion; effects, base tilt and parameters are estimated anew in each fold. On another recording "
+        "the error can be larger, because friction changes from day to day. Repeatability: difference between periods "
+        "of the motion. The fit error can be smaller if the periods of the executed motion differ.",
     )
     _print_links(console, section, result.nominal_mass)
     _print_base_parameters(console, section)
@@ -227,13 +226,13 @@ def _print_motion_details(console: Console, result: DynamicIdentification) -> No
 
 
 def _print_links(console: Console, section: DynamicSection, nominal_mass: float) -> None:
-    table = make_table("Links", "", "mass [kg]", "+-", "centre of mass [m]", "+-", "")
+    table = make_table("Links, centre of mass in the link frame", "", "mass [kg]", "+-", "centre of mass [m]", "+-", "")
     table.columns[0].no_wrap, table.columns[-1].no_wrap = True, False
     for link in section.links:
         m, *h = link.parameters[:4]
         com = np.array(h) / m
         errors = np.array(link.standard_errors[:4])
-        # First order, mass and first moments taken for independent: the larger of both decides.
+        # First-order propagation of independent errors of mass and first moments.
         spread = float(np.max(np.hypot(errors[1:], com * errors[0]))) / m
         remark = (
             "; ".join(link.bounds) + " *" if link.bounds else ("SDF's mass" if link.mass_identifiability < 0.5 else "")
@@ -245,16 +244,16 @@ def _print_links(console: Console, section: DynamicSection, nominal_mass: float)
     table.add_row("all", f"{total:.4g}", "", "", "", f"SDF: {nominal_mass:.4g}" + " *" * reached)
     console.print(table)
     if reached or any(link.bounds for link in section.links):
-        console.print("* at its bound: the value is that of the bound, not of the motion", style="yellow")
+        console.print("* The estimate is at its bound, so the recording does not determine the value.", style="yellow")
     print_note(
         console,
-        "+-: standard errors of single parameters. A motion determines the base parameters, which are combinations of "
-        "links, far better.",
+        "+-: standard error. A motion determines the base parameters, which combine parameters of several links, more "
+        "accurately than the parameters of one link.",
     )
 
 
 def _print_base_parameters(console: Console, section: DynamicSection) -> None:
-    table = make_table("Base parameters", "", "value", "+-", "unit", "")
+    table = make_table("Base parameters of the dynamics", "", "value", "+-", "unit", "")
     table.columns[0].max_width = _NAME_WIDTH
     for p in section.base_parameters:
         remark = "" if p.identifiability >= MIN_IDENTIFIABILITY else "from the SDF"
@@ -263,7 +262,8 @@ def _print_base_parameters(console: Console, section: DynamicSection) -> None:
         table.add_row(escape(p.name), f"{p.value:+.3g}", f"{p.standard_error:.1g}", p.unit, remark)
     console.print(table)
     print_note(
-        console, "from the SDF: the motion does not determine this parameter. zero?: less than two standard errors."
+        console,
+        "from the SDF: the motion does not determine this parameter. zero?: smaller than two standard errors.",
     )
 
 
@@ -271,8 +271,8 @@ def _print_correlations(console: Console, pairs: Sequence[CorrelatedEstimates]) 
     for pair in pairs:
         what = "difference" if pair.correlation > 0 else "sum"
         console.print(
-            f"not identifiable separately: {pair.first} and {pair.second} (correlation {pair.correlation:+.3f}); only "
-            f"their scaled {what} is known",
+            f"not identifiable separately: {pair.first} and {pair.second} (correlation {pair.correlation:+.3f}). Only "
+            f"their scaled {what} is identifiable.",
             style="yellow",
             markup=False,
         )
@@ -281,7 +281,9 @@ def _print_correlations(console: Console, pairs: Sequence[CorrelatedEstimates]) 
 
 
 def _print_drive(console: Console, section: DynamicSection, dry: dict[str, tuple[float, float]]) -> None:
-    table = make_table("Drive [N m, N m s/rad; N, N s/m]", "", "dry friction", "+-", "viscous", "+-", "offset", "+-")
+    table = make_table(
+        "Friction and offset [N m, N m s/rad; N, N s/m]", "", "dry", "+-", "viscous", "+-", "offset", "+-"
+    )
     for name in dict.fromkeys([*dry, *(e.coordinate for e in section.effects)]):
         cells = [f"{dry[name][0]:.3g}", f"{dry[name][1]:.1g}"] if name in dry else ["", ""]
         for kind in ("viscous", "offset"):
@@ -293,7 +295,7 @@ def _print_drive(console: Console, section: DynamicSection, dry: dict[str, tuple
 
 
 def _print_effects(console: Console, section: DynamicSection) -> None:
-    table = make_table("Effects in the drive", *_EFFECT_COLUMNS)
+    table = make_table("Rotor inertias and joint effects", *_EFFECT_COLUMNS)
     for rotor in section.rotors:
         row = (f"{rotor.value:.3g}", f"{rotor.standard_error:.1g}", "kg m^2")
         table.add_row(f"actuator.{rotor.actuator}", "rotor", "", *row)
@@ -307,45 +309,51 @@ def _effect_cells(e: DriveEffect) -> tuple[str, ...]:
     return e.coordinate, e.kind, scale, f"{e.coefficient:+.3g}", f"{e.standard_error:.1g}", EFFECT_KINDS[e.kind].unit
 
 
-def _print_pose_errors(console: Console, result: StaticIdentification, verdicts: Mapping[str, Verdict]) -> None:
+def _print_pose_errors(
+    console: Console, result: StaticIdentification, verdicts: Mapping[str, Verdict], verbose: bool
+) -> None:
     joints, poses = result.model.joints, len(result.recording)
-    title = f"{result.model.arm.name}, {poses} static poses: RMS holding torque and error"
-    table = make_table(
-        title, "", "torque [N m; N]", "error, cross-validated", "ratio", "feed-forward scale", "range covered",
-        "excluded", "verdict",
-    )  # fmt: skip
+    title = f"{result.model.arm.name}, {poses} static poses: RMS effort and cross-validation error [N m; N]"
+    columns = ("measured", "error", "ratio", "feedforward scale", "range covered", "verdict")
+    table = make_table(title, "", *columns)
     table.columns[-1].justify = "left"
     for j in joints:
         torque, error, verdict = j.rms_zero_torque_included, j.rms_cross_validation_included, verdicts[j.name]
         table.add_row(
             *(j.name, f"{torque:.4f}", f"{error:.4f}", f"{error / torque:.2f}" if torque > 0 else ""),
-            *(f"{j.feedforward_scale:.2f}", f"{100 * j.coverage:.0f} %", f"{j.num_excluded or ''}", verdict),
+            *(f"{j.feedforward_scale:.2f}", f"{100 * j.coverage:.0f} %", verdict),
             style=_STYLES.get(verdict, ""),
         )
     console.print(table)
-    if result.excluded:
-        console.print("--verbose lists the excluded measurements and why.")
+    if num_excluded := sum(j.num_excluded for j in joints):
+        lists = "" if verbose else " --verbose lists them."
+        console.print(f"{num_excluded} of {np.sum(result.measured)} measurements were excluded.{lists}")
     if poses < result.num_rows:
-        console.print(f"{result.num_rows} rows are {poses} distinct poses: repeated samples of a pose are averaged.")
+        console.print(f"The {result.num_rows} rows contain {poses} distinct poses. Samples of one pose were averaged.")
     for j in joints:
         if j.feedforward_scale == 0.0:
-            why = "the recording cannot separate its gravity from friction"
+            why = "the recording does not separate gravity from friction."
             if j.rms_zero_torque == 0.0:
-                why = "no holding torque was measured"
-            console.print(f"{j.name}: feedforward disabled: {why}", style="yellow", markup=False)
+                why = "no holding torque was measured."
+            console.print(f"{j.name}: feedforward disabled, because {why}", style="yellow", markup=False)
     console.print()
 
 
 def _print_pose_details(console: Console, result: StaticIdentification) -> None:
-    """Excluded measurements, parameters and effects with their standard errors, and errors in detail."""
+    """Prints the excluded measurements, the parameters with standard errors, and further errors of each joint."""
+    print_note(
+        console,
+        "Cross-validation error: 10 folds over the poses. Effects, parameters and feedforward scales are estimated "
+        "anew in each fold.",
+    )
     _print_excluded(console, result.excluded)
     print_static_parameters(console, result.model)
 
 
 def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
-    """Parameters of a static model with their standard errors, then how each joint was fitted."""
+    """Prints the parameters of a static model with standard errors, then the errors of each joint."""
     provenance = model.provenance
-    table = make_table("Base parameters", "", "value", "standard error", "unit", "")
+    table = make_table("Base parameters of gravity", "", "value", "standard error", "unit", "")
     units = gravity_parameters(model.arm).base.units
     for p, unit in zip(model.base_parameters, units, strict=True):
         zero = "" if p.distinguishable else "zero?"
@@ -354,7 +362,7 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
     print_note(
         console,
         f"Method {provenance.method}, rank {provenance.rank} of {len(model.base_parameters)}, condition number "
-        f"{provenance.condition_number:.3g}. zero?: less than two standard errors.",
+        f"{provenance.condition_number:.3g}. zero?: smaller than two standard errors.",
     )
     if model.effects:
         table = make_table("Joint effects [N m; N]", "", "value", "standard error", "")
@@ -363,25 +371,23 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
             table.add_row(str(ActuatorEffect.of(e)), *numbers)
         console.print(table)
         console.print()
-    title = "RMS error [N m; N], and with the excluded measurements*"
-    table = make_table(title, "", "fit", "leave-one-out", "torque*", "fit*", "leave-one-out*", "positions [rad; m]")
+    title = "RMS error [N m; N] (* including the excluded measurements)"
+    table = make_table(
+        title, "", "fit", "leave-one-out", "zero torque*", "fit*", "leave-one-out*", "positions [rad; m]"
+    )
     for j in model.joints:
         own = (j.rms_fit_included, j.rms_leave_one_out_included)
         errors = (*own, j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out)
         positions = f"{j.position_lower:+.2f}..{j.position_upper:+.2f}"
         table.add_row(j.name, *(f"{e:.4f}" for e in errors), positions)
     console.print(table)
-    print_note(
-        console,
-        "Cross-validated: each tenth of the poses is predicted from the others, joint effects and feedforward scale "
-        "chosen anew.",
-    )
+    console.print()
 
 
 def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -> None:
     if not excluded:
         return
-    console.print(f"Excluded measurements, in {len({d.where for d in excluded})} poses:", style="yellow")
+    console.print(f"Excluded measurements in {len({d.where for d in excluded})} poses:", style="yellow")
     for measurement in excluded:
         console.print(f"  {measurement.where}: {measurement.reason}", style="yellow", markup=False)
     console.print()
@@ -389,7 +395,7 @@ def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -
 
 def _print_motion_validation(console: Console, validation: DynamicValidation, verbose: bool) -> None:
     name = Path(validation.recording.source).name or "recording"
-    title = f"{validation.model.arm.name}, {name}: RMS effort of the actuators [N m; N]"
+    title = f"{validation.model.arm.name}, motion of {name}: RMS effort and error of the actuators [N m; N]"
     table = make_table(title, "", "measured", "error", "ratio", "repeatability", "verdict")
     table.columns[-1].justify = "left"
     for a in validation.actuators:
@@ -402,17 +408,20 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     if not verbose:
         return
     print_note(console, f"{rule_text(in_motion=True)} Low-pass filter: {validation.cut_off:g} Hz.")
-    table = make_table("Shares of the squared error", "", "bias", "friction-like", "position", "other")
+    table = make_table("Shares of the squared error", "", "bias", "friction-like", "position-dependent", "other")
     for a in validation.actuators:
         shares = (f"{100 * s:.0f} %" for s in (a.bias, a.friction_like, a.position_dependent, a.other))
         table.add_row(a.name, *shares)
     console.print(table)
-    print_note(console, "Large bias or friction: recalibrate. Large position share: the cables pull differently.")
+    print_note(
+        console,
+        "Large share of bias or friction: recalibrate. Large position-dependent share: the cables changed.",
+    )
 
 
 def _print_pose_validation(console: Console, validation: StaticValidation, verbose: bool) -> None:
     name = Path(validation.recording.source).name or "recording"
-    title = f"{validation.model.arm.name}, {validation.poses} poses of {name}: RMS torque [N m; N]"
+    title = f"{validation.model.arm.name}, {validation.poses} poses of {name}: RMS effort and error [N m; N]"
     table = make_table(title, "", "measured", "error", "ratio", "excluded", "verdict")
     table.columns[-1].justify = "left"
     for j in validation.joints:
@@ -425,7 +434,7 @@ def _print_pose_validation(console: Console, validation: StaticValidation, verbo
         return
     print_note(console, rule_text(in_motion=False))
     if validation.excluded:
-        table = make_table("With the excluded measurements", "", "measured", "error", "ratio")
+        table = make_table("RMS effort and error [N m; N], all measurements", "", "measured", "error", "ratio")
         for j in validation.joints:
             ratio = "" if j.relative_error is None else f"{j.relative_error:.2f}"
             table.add_row(j.name, f"{j.rms_torque:.4f}", f"{j.rms_error:.4f}", ratio)

@@ -1,4 +1,4 @@
-"""An arm's equations of gravity as text in a terminal."""
+"""Prints the gravity model of an arm to a terminal."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer
 
 
 def print_symbolic_model(console: Console, gravity: SymbolicGravity, *, verbose: bool = False) -> None:
-    """Prints the base parameters of gravity with the values that the arm's SDF gives them.
+    """Prints the base parameters of gravity with their nominal values from the SDF.
 
     Args:
-        console: to print to.
-        gravity: of an arm.
-        verbose: also print the limits of the joints.
+        console: Console to print to.
+        gravity: Symbolic gravity model of an arm.
+        verbose: Whether to print the joint limits.
     """
     arm, base = gravity.arm, gravity.base
     print_answer(
@@ -23,14 +23,14 @@ def print_symbolic_model(console: Console, gravity: SymbolicGravity, *, verbose:
         f"The gravity torque of {arm.name} depends on {len(base.names)} base parameters.",
         f"dvrk-drake model --arm {arm.source} --format latex",
     )
-    table = make_table(f"{arm.name}: base parameters of gravity", "", "nominal value", "unit")
+    table = make_table(f"{arm.name}: base parameters of gravity", "", "nominal value (SDF)", "unit")
     for name, value, unit in zip(base.names, gravity.base_values, base.units, strict=True):
         table.add_row(escape(name), f"{value:+.5f}", unit)
     console.print(table)
     if not verbose:
         return
     console.print()
-    table = make_table("Joints [rad, N m; m, N if prismatic]", "", "position", "effort limit")
+    table = make_table("Joint limits [rad, N m; m, N if prismatic]", "", "position", "effort")
     for i, name in enumerate(arm.joint_names):
         position = f"{arm.position_lower[i]:+.4f}..{arm.position_upper[i]:+.4f}"
         table.add_row(f"q{i + 1} {name}", position, f"{arm.effort_limits[i]:.4g}")

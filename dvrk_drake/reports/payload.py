@@ -1,4 +1,4 @@
-"""An estimated payload as text in a terminal."""
+"""Prints an estimated payload to a terminal."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from dvrk_drake.analysis.payload.payload import (
     CONFIDENCE,
     Payload,
     PayloadIdentification,
-    as_good,
     better_links,
-    shown_elsewhere,
+    contradicting_links,
+    equally_good_links,
 )
 from dvrk_drake.analysis.payload.point_mass import MAX_MASS
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
@@ -23,25 +23,25 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 def print_payload(
     console: Console, result: PayloadIdentification, *, model_path: str | None = None, verbose: bool = False
 ) -> None:
-    """Prints the mass and its link, or that no payload was found; then mass and place with their intervals.
+    """Prints the mass of the payload and its link, then mass and position with confidence intervals.
 
     Args:
-        console: to print to.
-        result: to print.
-        model_path: file of the arm's model, for the next command; None: the model was identified from the reference.
-        verbose: also print the estimate on every link, and the efforts that the payload explains.
+        console: Console to print to.
+        result: Result to print.
+        model_path: Path of the model, for the suggested next command. None if it was identified from the reference.
+        verbose: Whether to print the estimate on each link, and the efforts that the payload explains.
     """
     payload, estimates = result.payload, result.estimates
-    others = as_good(estimates) if result.link is None else better_links(payload, estimates)
+    others = equally_good_links(estimates) if result.link is None else better_links(payload, estimates)
     names = [other.link for other in others if other is not payload]
     if not payload.found:
-        answer = _none_found(payload, shown_elsewhere(payload, estimates))
+        answer = _none_found(payload, contradicting_links(payload, estimates))
     else:
         answer = f"Payload: {payload.body.mass:.4f} +- {payload.mass_error:.4f} kg on {payload.link}."
     if payload.found and names and result.link is None:
-        answer += f" These recordings do not distinguish it from a payload on {' or '.join(names)}: name the link."
+        answer += f" A payload on {' or '.join(names)} explains the recordings equally well. Give the link with --link."
     elif payload.found and names:
-        answer += f" A payload on {names[0]} explains the change better."
+        answer += f" A payload on {names[0]} explains the change of the efforts better."
     clear = payload.found and not names
     command = f"--arm {result.model.arm.source}" if model_path is None else f"--model {model_path}"
     command = f"dvrk-drake payload REFERENCE LOADED {command} " + ("--json FILE" if clear else "--link LINK")
@@ -57,9 +57,11 @@ def print_payload(
 
 def _estimate_table(payload: Payload) -> Table:
     columns = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
-    table = make_table(f"Payload on {payload.link}", *columns)
+    table = make_table(f"Payload on {payload.link}, position in the frame of the link", *columns)
     rows = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
-    for axis, x, error, base in zip("xyz", payload.body.place, payload.place_error, payload.place_in_base, strict=True):
+    for axis, x, error, base in zip(
+        "xyz", payload.body.position, payload.position_error, payload.position_in_base, strict=True
+    ):
         rows.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
     for k, (name, value, error, base) in enumerate(rows):
         if k and not payload.body.determined[k - 1]:
@@ -73,43 +75,43 @@ def _estimate_table(payload: Payload) -> Table:
 
 
 def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
-    """The estimate on each link, best first."""
-    table = make_table("Links, best first", "", "error*", "mass [kg]", "+- [kg]", "")
+    """Prints the estimate on each link, best first."""
+    table = make_table("Estimates by link, best first", "", "error*", "mass [kg]", "+- [kg]", "")
     table.columns[-1].justify = "left"
-    good = as_good(estimates)
+    good = equally_good_links(estimates)
     for payload in estimates:
-        note = "" if payload not in good else "best" if payload is estimates[0] else "as good"
+        note = "" if payload not in good else "best" if payload is estimates[0] else "equally good"
         mass, error = "none found", ""
         if payload.found:
             mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
-        error_share = f"{100 * payload.left_out:.1f} %"
+        error_share = f"{100 * payload.relative_error:.1f} %"
         table.add_row(payload.link, error_share, mass, error, note if payload.found else "")
     console.print(table)
     print_note(
         console,
-        "* cross-validated over the phases of the motion: RMS error, whitened, as a share of that without payload, "
+        "* cross-validated over the phase of the motion: ratio of the whitened RMS errors with and without payload, "
         "geometric mean over the actuators",
     )
 
 
 def _print_efforts(console: Console, payload: Payload) -> None:
-    table = make_table("RMS efforts [N m; N]", "", "change", "payload", "residual*", "explained")
+    table = make_table("RMS change of the efforts [N m; N]", "", "measured", "payload", "residual*", "explained")
     for actuator in payload.actuators:
         explained = "not loaded" if actuator.explained is None else f"{100 * actuator.explained:.1f} %"
         numbers = (f"{x:.4f}" for x in (actuator.change, actuator.payload, actuator.left))
         table.add_row(actuator.name, *numbers, explained)
     console.print(table)
-    print_note(console, "* after the payload, and what changed in the drives: offsets, friction")
+    print_note(console, "* after subtraction of the payload and of changed offsets and friction")
 
 
 def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
-    """Returns one line with the largest mass that would not show, unless another link shows a payload."""
-    said = f"No payload found on {payload.link}: the interval of its mass includes 0. "
+    """Returns one line with the largest mass that remains undetected, or the link that carries a payload."""
+    answer = f"No payload found on {payload.link}: the interval of its mass includes 0. "
     if elsewhere:
         first = elsewhere[0]
-        share = f"{100 * first.left_out:.1f} %"
-        return said + f"A payload on {first.link} explains the change (cross-validated error {share})."
+        share = f"{100 * first.relative_error:.1f} %"
+        return answer + f"A payload on {first.link} explains the change (cross-validated error {share})."
     if payload.largest_at_com > MAX_MASS:
-        return said + "This motion does not show a mass at the link's centre of mass."
+        return answer + "This motion cannot detect a mass at the centre of mass of the link."
     largest = f"{1e3 * payload.largest_at_com:.3g} g ({100 * CONFIDENCE:.0f} %)"
-    return said + f"At the link's centre of mass it is below {largest}."
+    return answer + f"A mass at the centre of mass of the link is below {largest}."

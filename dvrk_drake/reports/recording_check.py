@@ -1,4 +1,4 @@
-"""The check of a recording as text in a terminal."""
+"""Prints the check of a recording to a terminal."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM",
     Refusals are not printed: the command writes them to stderr. docs/checking_a_recording.md defines the numbers.
 
     Args:
-        console: to print to.
-        report: to print.
-        arm: value of --arm and what follows, for the next command.
-        verbose: also print the notes, and the numbers of each actuator's signals.
+        console: Console to print to.
+        report: Report to print.
+        arm: Value of --arm and further options, for the suggested next command.
+        verbose: Whether to print the notes, and the signal properties of each actuator.
     """
     _print_verdict(console, report, arm)
     notes = [finding for finding in report.findings if finding.severity == "note"]
@@ -65,8 +65,8 @@ def _print_joints(console: Console, report: RecordingReport) -> None:
 
 
 def _print_signals(console: Console, report: RecordingReport) -> None:
-    columns = ("v RMS", "vd RMS", "qd / dq/dt", "qd late", "tau late", "work", "tau cut-off", "qd cut-off")
-    table = make_table("Signals of the actuators [rad/s; m/s, ms, Hz]", "", *columns)
+    columns = ("v RMS", "vd RMS", "qd / dq/dt", "qd delay", "tau delay", "work", "tau cut-off", "qd cut-off")
+    table = make_table("Signals of the actuators [rad, m, s; delays in ms, cut-offs in Hz]", "", *columns)
     for joint in report.joints:
         table.add_row(
             joint.name,
@@ -84,8 +84,8 @@ def _print_signals(console: Console, report: RecordingReport) -> None:
         floors = [joint.floor for joint in report.joints if joint.floor is not None]
         print_note(
             console,
-            f"Repeatability: rms(tau(t) - tau(t + {report.period:.4f} s)) / sqrt(2) / rms(tau), below "
-            f"{report.floor_cut_off:g} Hz; mean {100 * sum(floors) / len(floors):.1f} %.",
+            f"Repeatability: rms(tau(t) - tau(t + {report.period:.4f} s)) / sqrt(2) / rms(tau), low-pass filtered at "
+            f"{report.floor_cut_off:g} Hz. Mean: {100 * sum(floors) / len(floors):.1f} %.",
         )
 
 

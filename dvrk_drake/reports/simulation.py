@@ -1,4 +1,4 @@
-"""A simulation as text in a terminal."""
+"""Prints the result of a simulation to a terminal."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer
 def print_simulation(
     console: Console, simulation: Simulation, arm: Arm, *, scenario: str | None = None, verbose: bool = False
 ) -> None:
-    """Prints the largest distance from the desired positions, over all recorded samples, or from the start.
+    """Prints the largest tracking error or, without desired positions, the largest motion from the start.
 
     Args:
-        console: to print to.
-        simulation: to print.
-        arm: which was simulated.
-        scenario: argument that names it, for the next command, which draws it; None: it is drawn already.
-        verbose: also print positions at the start and at the end, and the effort limits.
+        console: Console to print to.
+        simulation: Simulation to print.
+        arm: Simulated arm.
+        scenario: Argument of the command that selects the scenario, for the suggested next command. None if figures
+            were written already.
+        verbose: Whether to print the start and end positions, and the effort limits.
     """
     recording, desired = simulation.recording, simulation.desired
     reference = recording.q[:1] if desired is None else desired
@@ -37,7 +38,7 @@ def print_simulation(
     kind = "motion" if desired is None else "error"
     table = make_table(
         f"{arm.name}, simulated for {simulation.time[-1]:g} s [rad, N m; m, N if prismatic]",
-        *("", f"largest {kind}", f"{kind} at the end", "largest effort", "share of its limit"),
+        *("", f"largest {kind}", f"{kind} at the end", "largest effort", "effort / limit"),
     )
     for i, name in enumerate(arm.joint_names):
         share = f"{100 * effort[i] / arm.effort_limits[i]:.0f} %"

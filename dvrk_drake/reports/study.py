@@ -1,4 +1,4 @@
-"""A study's summary as text in a terminal."""
+"""Prints the summary of a study to a terminal."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-#: Variations in the answer, and failed runs that are printed without `verbose`.
+#: Maximum number of variations in the answer, and of failed runs that are printed without `verbose`.
 _MAX_COUNT = 3
 
 
 def print_study(
     console: Console, study: Study, rows: Mapping[int, Row], *, study_path: str | None = None, verbose: bool = False
 ) -> None:
-    """Prints the first measure of each variation, then all measures, and errors of runs that failed.
+    """Prints the first measure of each variation, then all measures, and the errors of failed runs.
 
     Args:
-        console: to print to.
-        study: whose summary is printed.
-        rows: results by number of the case.
-        study_path: file of the study, for the next command, which draws it; None: it is drawn already.
-        verbose: print all failed runs, not only the first.
+        console: Console to print to.
+        study: Study to summarize.
+        rows: Results by number of the case.
+        study_path: Path of the study, for the suggested next command. None if figures were written already.
+        verbose: Whether to print all failed runs.
     """
     summaries = summarise(study, rows)
     failed = [case for case in study.cases if case.index in rows and rows[case.index].error]
@@ -49,28 +49,30 @@ def print_study(
     if verbose:
         print_note(
             console,
-            "Yes or no: share of the runs and Wilson's 95 % interval, for independent runs. Numbers: median and 95th "
-            "percentile of the runs.",
+            "Yes-or-no measures: share of the runs, and the 95 % Wilson interval for independent runs. Other measures: "
+            "median and 95th percentile of the runs.",
         )
     if len(study.seeds) > 1:
-        print_note(console, "Several seeds per pose: runs are not independent, so the intervals are too narrow.")
+        print_note(
+            console, "The intervals are too narrow, because runs with different seeds at one pose are not independent."
+        )
     for case in failed if verbose else failed[:_MAX_COUNT]:
         text = f"case {case.index}, {case.variation}, pose {case.pose}, seed {case.seed}: {rows[case.index].error}"
         console.print(text, style="yellow", markup=False)
     if not verbose and len(failed) > _MAX_COUNT:
-        console.print(f"and {len(failed) - _MAX_COUNT} more failed runs: --verbose prints them.", style="yellow")
+        console.print(f"{len(failed) - _MAX_COUNT} more runs failed. --verbose lists them.", style="yellow")
 
 
 def _headline(measure: Measure, summary: Summary) -> str:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
-        return f"{value.yes} of {value.runs} runs"
+        return f"{value.count} of {value.runs} runs"
     return f"median {value.median:.4g} {measure.unit}".strip()
 
 
 def _cells(measure: Measure, summary: Summary) -> list[str]:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
-        share = f"{100 * value.yes / value.runs:.1f} %"
+        share = f"{100 * value.count / value.runs:.1f} %"
         return [share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", ""]
     return [f"{number:.4g} {measure.unit}".strip() for number in (value.median, value.percentile_95, value.largest)]

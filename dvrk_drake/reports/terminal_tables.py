@@ -1,4 +1,4 @@
-"""Console and tables of the terminal: the answer, the next command, then tables of at most 80 columns."""
+"""Prints results to a terminal: a summary, the next command, then tables of at most 80 columns."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from rich.table import Table
 from rich.text import Text
 
 TABLE_WIDTH = 80
-#: Of tables in a file, where names of base parameters are not broken.
+#: Width of tables in a file, where names of base parameters fit on one line.
 WIDTH_OF_FILES = 120
-#: A space inside of a unit in brackets, or before a unit.
+#: Pattern for a space inside a unit in brackets or before a percent sign.
 _IN_UNIT = re.compile(r" (?=[^\[]*\]|%)")
 _NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 
 class TableConsole(Console):
-    """Prints a table as wide as the terminal, or as its numbers need.
+    """Console whose tables never cut off digits.
 
-    In a narrow one headings are stacked and names folded; digits are never lost.
+    In a narrow terminal, headings and names are broken into several lines. A table can be wider than the terminal.
     """
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """As rich's Console does."""
+        """Prints objects like `rich.console.Console`."""
         width = self.width
-        for table in (thing for thing in objects if isinstance(thing, Table)):
+        for table in (item for item in objects if isinstance(item, Table)):
             headings = [str(column.header) for column in table.columns]
             for lines in range(2, 6):
                 if self._width_of(table) <= width:
@@ -43,11 +43,11 @@ class TableConsole(Console):
             self.width = width
 
     def on_broken_pipe(self) -> None:
-        """Leaves it to the program that the reader has seen enough; rich would end the process with an error."""
+        """Raises BrokenPipeError for the program to handle. The method of rich would end the process."""
         raise BrokenPipeError
 
     def _width_of(self, table: Table, folded: bool = False) -> int:
-        """With the numbers on one line each, and with names if not `folded`. Rich's own measure breaks numbers."""
+        """Returns the width of a table in which no number is broken, and no name unless `folded`."""
         free = self.options.update(max_width=10 * TABLE_WIDTH)
         width = 2 * (len(table.columns) - 1)
         for column in table.columns:
@@ -57,7 +57,7 @@ class TableConsole(Console):
 
 
 def _stack(heading: str, lines: int) -> str:
-    """A heading on at most so many lines, if its words allow it; a unit in brackets stays on one line."""
+    """Breaks a heading into at most `lines` lines if possible. A unit in brackets stays on one line."""
     text = _IN_UNIT.sub(_NO_BREAK_SPACE, heading)
     least = max(map(len, textwrap.wrap(text, 1, break_long_words=False)), default=1)
     stacked = (textwrap.wrap(text, width) for width in range(least, len(text) + 2))
@@ -65,7 +65,7 @@ def _stack(heading: str, lines: int) -> str:
 
 
 def make_console() -> Console:
-    """A console on stdout, as wide as the terminal; where it is none, as wide as the tables."""
+    """Returns a console on stdout. If stdout is not a terminal, its width is `TABLE_WIDTH`."""
     console = TableConsole(highlight=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = TABLE_WIDTH
@@ -73,13 +73,13 @@ def make_console() -> Console:
 
 
 def print_answer(console: Console, answer: str, next_step: str | None, style: str = "green") -> None:
-    """Prints what a command found and what to do next; details follow below.
+    """Prints the result of a command and the suggested next step.
 
     Args:
-        console: to print to.
-        answer: one or two sentences.
-        next_step: usually a command; it is not wrapped, so that it can be copied. None: nothing is left to do.
-        style: of the answer.
+        console: Console to print to.
+        answer: Result in one or two sentences.
+        next_step: Next step, usually a command. It is not wrapped, so that it can be copied. None if there is none.
+        style: Style of the answer.
     """
     console.print(answer, style=style, markup=False)
     if next_step is not None:
@@ -93,12 +93,11 @@ def print_note(console: Console, text: str) -> None:
 
 
 def make_table(title: str, *columns: str) -> Table:
-    """An empty table with a bold title; the first column left, the others right."""
-    # A title may be wider than its table, and would be wrapped.
+    """Returns an empty table with a bold title. The first column is left-aligned, all others are right-aligned."""
+    # Without these options, a title that is wider than the table would be wrapped.
     text = Text(title, style="bold", no_wrap=True, overflow="ignore")
     table = Table(title=text, title_justify="left", box=None, pad_edge=False, expand=False)
     for i, column in enumerate(columns):
-        # The name of a base parameter may be long; numbers are never cut.
-        # Units in brackets are no markup.
+        # Only the first column, which can contain long names, is folded. Text() prevents markup in [units].
         table.add_column(Text(column), justify="left" if i == 0 else "right", no_wrap=i > 0, overflow="fold")
     return table

@@ -1,4 +1,4 @@
-"""The interaction force at an arm's handle: text in a terminal, and a file with its numbers."""
+"""Prints the interaction force at the handle of an arm, and writes it to a file."""
 
 from __future__ import annotations
 
@@ -15,37 +15,38 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 
 
 def print_transparency(console: Console, arm: Arm, forces: Sequence[OperatorForces], *, verbose: bool = False) -> None:
-    """Prints the compensation with the smallest interaction force, then force and torque with each.
+    """Prints the compensation with the smallest interaction force, then force and torque of each compensation.
 
     Args:
-        console: to print to.
-        arm: which is simulated.
-        forces: one result per compensation; the first is without compensation.
-        verbose: also print how the numbers are defined.
+        console: Console to print to.
+        arm: Simulated arm.
+        forces: One result per compensation. The first is without compensation.
+        verbose: Whether to print the definition of the numbers.
     """
     best, without = min(forces, key=lambda one: one.rms_force), forces[0]
     answer = f"Smallest interaction force at the handle: {best.rms_force:.2f} N RMS with {best.name}"
-    answer += "." if best is without else f", {without.rms_force:.2f} N with {without.name}."
+    answer += "." if best is without else f", {without.rms_force:.2f} N without compensation."
     print_answer(console, answer, f"dvrk-drake transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER")
     headings = ("RMS force [N]", "95 % force [N]", "RMS torque [mN m]", "95 % torque [mN m]", "largest deviation [mm]")
-    title = f"{arm.name}, simulated: a hand moves the handle for {forces[0].time[-1]:.3g} s"
+    title = f"{arm.name}, simulated: interaction force and torque at the handle during {forces[0].time[-1]:.3g} s"
     table = make_table(title, "compensation", *headings)
     scales, formats = (1, 1, 1e3, 1e3, 1e3), (".2f", ".2f", ".0f", ".0f", ".1f")
     for one in forces:
+        name = "none" if one is without else one.name
         values = zip(_numbers(one).values(), scales, formats, strict=True)
-        table.add_row(one.name, *(f"{scale * value:{form}}" for value, scale, form in values))
+        table.add_row(name, *(f"{scale * value:{form}}" for value, scale, form in values))
     console.print(table)
     if verbose:
         console.print()
         print_note(
             console,
-            "95 %: exceeded in a twentieth of the time. Deviation: of the handle from the path of the hand. "
-            f"The first {GRASP_TIME:g} s are left out.",
+            "95 %: 95th percentile over time. Deviation: distance of the handle from the path of the hand. "
+            f"The first {GRASP_TIME:g} s are excluded.",
         )
 
 
 def write_transparency(path: Path, forces: Sequence[OperatorForces]) -> None:
-    """The table's numbers in SI as CSV, at once or not at all."""
+    """Writes the numbers of the table in SI units to a CSV file, atomically."""
     with atomic_write(path) as stream:
         rows = csv.writer(stream, lineterminator="\n")
         rows.writerow(["compensation", *_numbers(forces[0])])

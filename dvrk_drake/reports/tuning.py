@@ -1,4 +1,4 @@
-"""Tuned gains as text in a terminal."""
+"""Prints tuned gains to a terminal."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from rich.console import Console
 from dvrk_drake.experiments.tuning.bench import band, step_size
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, friction
 from dvrk_drake.experiments.tuning.procedure import JointProcedure
-from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, REST, Comparison, Tuning
+from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, REST_TIME, Comparison, Tuning
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
 def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = None, verbose: bool = False) -> None:
-    """Prints which gains settle most often and then fastest, then how the gains compare.
+    """Prints the best gains, then the comparison of all gains.
+
+    The best gains have the fewest steps that do not settle and then the shortest settling time.
 
     Args:
-        console: to print to.
-        tuning: to print.
-        gains_path: file that the gains are written to, for the next command.
-        verbose: also print how the gains were found, and the comparison of each joint and pose.
+        console: Console to print to.
+        tuning: Tuning to print.
+        gains_path: Path of the written gains, for the suggested next command. None if they were not written.
+        verbose: Whether to print the tuning steps, and the comparison for each joint and pose.
     """
     comparison, name = tuning.comparison, tuning.arm.source
     best = comparison.best(tuning.found)
@@ -49,21 +51,21 @@ def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = N
 
 
 def _print_summary(console: Console, comparison: Comparison) -> None:
-    """One row per condition of the arm, over all joints and poses."""
-    title = f"{comparison.arm.name}, simulated: settled steps, mean settling time"
+    """Prints one row per condition of the arm, over all joints and poses."""
+    title = f"{comparison.arm.name}, simulated: number of settled steps, mean settling time"
     table = make_table(title, "condition", *comparison.gains)
     for c, condition in enumerate(comparison.conditions):
         table.add_row(condition.name, *(_settled(comparison.table(g, "settling")[c].ravel()) for g in comparison.gains))
     console.print(table)
     print_note(
         console,
-        f"All joints step at once, from {len(comparison.poses)} poses. G, M: true gravity torque and inertia differ "
-        "from the model's.",
+        f"All joints step simultaneously, from {len(comparison.poses)} poses. G, M: factors of the true gravity torque "
+        "and inertia with respect to the model. +1 tick: one more time step of delay.",
     )
 
 
 def _print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, ...]) -> None:
-    """Ultimate gains and the gains that follow, two rows per joint."""
+    """Prints the ultimate gains of the paper's procedure and the gains that follow from them."""
     columns = ("step", "dead zone", "ultimate Kp", "period [s]", "growth", "residual")
     table = make_table(f"{arm.name}, the paper's procedure", "", *columns)
     for j, joint in enumerate(joints):
@@ -80,8 +82,8 @@ def _print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, .
     console.print(table)
     print_note(
         console,
-        "dead zone: dry friction over the ultimate Kp; growth: of an oscillation over the one before; >: oscillations "
-        "decay up to this Kp, beyond it the motor only switches; residual: of the step, * while it oscillates.",
+        "dead zone: dry friction / ultimate Kp. growth: ratio of successive amplitudes. >: oscillations decay up to "
+        "this Kp, and the effort saturates above it. residual: error after the step; * during an oscillation.",
     )
     _print_gains(console, f"{arm.name}, gains of the paper's procedure", arm, joints)
 
@@ -95,13 +97,13 @@ def _print_gains(console: Console, title: str, arm: Arm, joints: Sequence[JointP
 
 
 def _print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
-    """Inertia and margins of each joint by the model, and the gains that follow."""
-    columns = ("inertia", "rad/s", "phase", "gain", "limited by")
-    table = make_table(f"{arm.name}, by the model", "", *columns)
-    for name, fact, joint in zip(arm.joint_names, design.facts, design.joints, strict=True):
+    """Prints inertia and stability margins of the model-based design, and its gains."""
+    columns = ("inertia", "frequency [rad/s]", "phase", "gain", "limited by")
+    table = make_table(f"{arm.name}, model-based design", "", *columns)
+    for name, properties, joint in zip(arm.joint_names, design.properties, design.joints, strict=True):
         table.add_row(
             name,
-            "{:.3g}..{:.3g}".format(*fact.inertia),
+            "{:.3g}..{:.3g}".format(*properties.inertia),
             f"{joint.frequency:.1f}",
             "..".join(f"{np.degrees(margins.phase):.0f}" for margins in joint.margins),
             "..".join(f"{margins.gain:.1f}" for margins in joint.margins),
@@ -110,21 +112,22 @@ def _print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     console.print(table)
     print_note(
         console,
-        "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; phase "
-        "[deg] and gain: stability margins there. Limited by other joints: slower than alone, so that all are stable "
-        "at once.",
+        "inertia: smallest (all other joints free) and largest (all other joints locked) over the joint range [kg m^2; "
+        "kg]. frequency: natural frequency of the closed loop. phase [deg] and gain: stability margins. Limited by "
+        "other joints: slower than alone, so that all joints are stable together.",
     )
-    _print_gains(console, f"{arm.name}, gains by the model", arm, design.joints)
+    _print_gains(console, f"{arm.name}, gains of the model-based design", arm, design.joints)
 
 
 def _print_joints(console: Console, comparison: Comparison) -> None:
-    """One table per joint."""
+    """Prints one table per joint."""
     arm, poses = comparison.arm, len(comparison.poses)
     print_note(
         console,
-        "Settling time [s]: afterwards the joint stays inside its band, 2 % of the step or a count of its encoder; "
-        f"the slowest pose; n/{poses}: from n poses it has not settled in {DURATION - REST:g} s. Overshoot, error "
-        "at rest, ripple (peak to peak of the effort at rest over its limit): the worst pose, arm as modelled.",
+        "Settling time [s] of the slowest pose, into a band of 2 % of the step, but at least one encoder count. "
+        f"n/{poses}: not settled within {DURATION - REST_TIME:g} s at n poses. Overshoot, steady-state error and "
+        "ripple "
+        "(peak-to-peak effort at rest / effort limit): largest values over all poses, arm as modelled.",
     )
     for j, joint in enumerate(arm.joint_names):
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])
@@ -148,7 +151,7 @@ def _print_joints(console: Console, comparison: Comparison) -> None:
 
 
 def _print_poses(console: Console, comparison: Comparison) -> None:
-    table = make_table("Settled joints by pose [rad, m], mean settling time", "", *comparison.gains)
+    table = make_table("Number of settled joints by pose [rad; m], mean settling time", "", *comparison.gains)
     for p, q in enumerate(comparison.poses):
         cells = [_settled(comparison.table(which, "settling")[0, p]) for which in comparison.gains]
         table.add_row(" ".join(f"{x:.2f}" for x in q), *cells)

@@ -1,4 +1,4 @@
-"""Simulation of one arm with the ports of its driver. The port names are the same as those of the hardware."""
+"""Simulation of one arm with the same ports as the station of the real arm."""
 
 from __future__ import annotations
 
@@ -26,17 +26,21 @@ from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_ideal_dr
 
 @dataclass(frozen=True)
 class StationPorts:
-    """Names and sizes of the ports of a station with one arm, in simulation and on hardware alike."""
+    """Ports of a station with one arm, in simulation and on hardware.
+
+    Attributes:
+        inputs: Sizes of the input ports by name.
+        outputs: Sizes of the output ports by name.
+    """
 
     inputs: dict[str, int]
     outputs: dict[str, int]
 
 
 def station_ports(arm: Arm) -> StationPorts:
-    """Returns the ports of `arm`'s station, named like the fields of the iiwa's driver in Drake.
+    """Returns the ports of a station. The names are those of Drake's iiwa driver with the arm's name as a prefix.
 
-    The names are prefixed with the arm's lower-case name. Each port has n numbers in the arm's order of joints
-    [rad, rad/s, N m; m, m/s, N].
+    Each port has n numbers, or 2n for a state, in the arm's order of joints [rad, rad/s, N m; m, m/s, N].
     """
     n, name = arm.num_joints, arm.name.lower()
     return StationPorts(
@@ -51,14 +55,17 @@ def station_ports(arm: Arm) -> StationPorts:
 
 
 def arm_plant_config(time_step: float = 1e-3) -> MultibodyPlantConfig:
-    """Returns the configuration of a station's plant: SAP solver, and state output before the step. time_step in s."""
+    """Returns the default configuration of a station's plant, with the given time step [s].
+
+    The contact solver is SAP. Without sampled output ports, the output is the state at the start of a step.
+    """
     return MultibodyPlantConfig(
         time_step=time_step, discrete_contact_approximation="sap", use_sampled_output_ports=False
     )
 
 
 class ArmStation(Diagram):
-    """Simulated arm with the ports of its driver. `HardwareArmStation` has the same ports for the real arm, over LCM.
+    """Simulated arm. `HardwareArmStation` has the same ports for a real arm over LCM.
 
     .. pydrake_system::
 
@@ -76,27 +83,28 @@ class ArmStation(Diagram):
         - body_poses
         - query_object
 
-    `mtml` stands for the arm's lower-case name. The arm's ports have n numbers (`state_estimated` 2n: q, then v) for
-    the independent joints, in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]. The linkage follows
-    them.
+    `mtml` stands for the arm's lower-case name. The arm's ports have n numbers for the independent joints, in the arm's
+    order [rad, rad/s, N m; m, m/s, N on a prismatic joint]. `state_estimated` has 2n numbers: q, then v.
 
     - `effort_commanded`: commanded effort, clamped to the plant's effort limits. Unconnected: zero effort.
-    - `effort_disturbance`: effort that is added after the motors without a limit, e.g. friction, cables or a hand.
-      Unconnected: zero.
-    - `effort_measured`: applied motor effort, the command after the limits.
-    - `state_true` (2n): true q, then v, independent of the `effects` on the measurement.
-    - `plant_state`, `body_poses`, `query_object`: ports of the plant, for the whole tree. The hardware has neither
-      these nor `state_true` and `effort_disturbance`. All other ports are those of `station_ports`.
+    - `effort_disturbance`: effort that is added after the motors without a limit, e.g. of a hand. Unconnected: zero.
+    - `effort_measured`: applied motor effort, i.e. the command after the limits.
+    - `state_true` (2n): true q, then v, without the effects on the measurement.
+    - `plant_state`, `body_poses`, `query_object`: ports of the plant.
 
-    Without `effects`, the station consists of C++ systems and has no state besides the plant's. Measured values are
-    then exact and without delay. `effects` adds those of a real arm, see `ArmEffects`: friction, cables, stops,
-    encoders, motors and delays as stated in `arm.effects`. A discrete controller connected to the station receives the
-    state at the start of a period, and its command acts from the next period on. The delay of one period is the same as
-    on hardware.
+    The ports `effort_disturbance`, `state_true` and those of the plant exist only in simulation. All other ports are
+    those of `station_ports`.
 
-    With either `closure`, Drake's solver holds the linkage to about 1e-8 m at 1 ms, and each joint in its position
-    limits. The coupled limits of the linkage are included with the effect `stops`. The shapes of an arm never collide
-    with each other. They are collision shapes only if `modify_plant` adds a shape that they can touch.
+    **Effects.** Without `effects`, measured values are exact and without delay. The station then consists of C++
+    systems, and only the plant has state. `effects` adds friction, cables, stops, encoders, motors and delays of a real
+    arm; see `ArmEffects`.
+
+    **Timing.** A discrete controller receives the state at the start of a period. Its command acts from the next period
+    on, i.e. with a delay of one period as on hardware.
+
+    **Constraints.** With either `closure`, Drake's solver closes the linkage to about 1e-8 m at a time step of 1 ms and
+    enforces the position limits. The effect `stops` adds the coupled limits. The links of an arm do not collide with
+    each other. They have collision shapes only if `modify_plant` adds a shape that they can touch.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -123,26 +131,25 @@ class ArmStation(Diagram):
         """Builds the station. The arm starts at zero, or at the nearest pose inside its limits.
 
         Args:
-            arm: Arm after which the ports are named, and which the controllers of this station use.
-            plant_config: Configuration of the plant: time step, contact model etc. `arm_plant_config()` by default.
-            meshcat: Meshcat in which the arm is drawn, below the path of its lower-case name.
-                `SetTransform("mtml", X_WB)` places it.
-            closure: Method that closes the linkage's loops, see `add_arm`.
-            plant_arm: Arm that is simulated, `arm` by default. It may have another mounting or SDF with the same
-                joints.
-            modify_plant: Function called with the plant before it is finalized, e.g. to add a payload, damping or other
-                effort limits. Drake can change the inertia of existing links only in a Context, see `SetLinkInertias`.
-            effects: Simulated effects of the real arm, e.g. `arm.effects` or `arm.effects.only(["friction"])`. None by
-                default.
+            arm: Arm that defines the names of the ports. Controllers of this station use it as well.
+            plant_config: Configuration of the plant. None: `arm_plant_config()`.
+            meshcat: Meshcat in which the arm is drawn, below the path of its lower-case name. `SetTransform("mtml",
+                X_WB)` places the arm. None: the arm is not drawn.
+            closure: Method that closes the loops of the linkage; see `add_arm`.
+            plant_arm: Simulated arm, which may have another mounting or SDF with the same joints. None: `arm`.
+            modify_plant: Function that is called with the plant before it is finalized, e.g. to add a payload or
+                damping. Drake can change the inertia of existing links only in a Context; see `SetLinkInertias`.
+            effects: Simulated effects of the real arm, e.g. `arm.effects` or `arm.effects.only(["friction"])`. None: no
+                effects.
             seed: Seed of the effects' noise.
 
         Raises:
-            StationError: The plant's configuration is not valid for an arm, or `plant_arm` has other joints.
+            StationError: The configuration of the plant is not valid for an arm, or `plant_arm` has other joints.
         """
         super().__init__()
         self._arm = arm
         self._ground_truth_arm = plant_arm or arm
-        self._parts: PlantEffects | None = None
+        self._plant_effects: PlantEffects | None = None
         self._drive_step: DriveStep | None = None
         plant_config = plant_config or arm_plant_config()
         if fault := plant_config_fault(plant_config):
@@ -154,23 +161,23 @@ class ArmStation(Diagram):
             )
         builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlant(plant_config, builder)
-        # The plant contains nothing else, so the arm has contacts only with bodies that `modify_plant` adds.
+        # The plant contains only the arm, so the arm has contacts only with bodies that `modify_plant` adds.
         self._instance = add_arm(
             self._plant, self._ground_truth_arm, closure, collision_shapes=modify_plant is not None
         )
         if modify_plant is not None:
             modify_plant(self._plant)
         if effects is not None:
-            self._parts = PlantEffects(self._plant, self._ground_truth_arm, self._instance, effects)
+            self._plant_effects = PlantEffects(self._plant, self._ground_truth_arm, self._instance, effects)
         self._plant.Finalize()
-        self._drop_idle_shapes()
+        self._remove_idle_collision_shapes()
         self._joints = PlantJoints(self._plant, self._ground_truth_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
-            # The visualizer deletes its prefix when it starts. One level below, an earlier SetTransform persists.
+            # The visualizer deletes its path when it starts. An earlier SetTransform at the path above persists.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
-        if effects is None or self._parts is None:
+        if effects is None or self._plant_effects is None:
             ports = add_ideal_drive(builder, self._plant, self._joints, self._instance)
         else:
             drive = DriveWithEffects(
@@ -178,7 +185,7 @@ class ArmStation(Diagram):
                 self._plant,
                 self._instance,
                 self._joints,
-                self._parts,
+                self._plant_effects,
                 effects,
                 seed,
                 self._home(),
@@ -203,50 +210,51 @@ class ArmStation(Diagram):
 
         Args:
             context: Context of this station, not of a Diagram that contains it.
-            q: Pose. It need not be inside the limits.
+            q: Pose (n,) [rad, m], which may be outside the limits.
 
         Raises:
-            StationError: q is not n finite numbers.
+            StationError: q does not have n finite numbers.
         """
         q = np.asarray(q, float)
         if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
-            raise StationError(f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}")
+            raise StationError(
+                f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers [rad, m]; got {q.tolist()}"
+            )
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         set_arm_positions(self.plant, plant_context, self._ground_truth_arm, q)
         q_plant = self.plant.GetPositions(plant_context)
-        if self._parts is not None:
-            self._parts.drive.set_positions(q_plant, q)
+        if self._plant_effects is not None:
+            self._plant_effects.drive.set_positions(q_plant, q)
         self.plant.SetPositions(plant_context, q_plant)
         if self._drive_step is not None:
             self._drive_step.SetAtRest(self.GetMutableSubsystemContext(self._drive_step, context), q)
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
     def GetPositions(self, context: Context) -> NDArray[np.float64]:
-        """Returns the pose (n,) of the independent joints in this station's context."""
+        """Returns the pose (n,) [rad, m] of the independent joints in this station's context."""
         plant_context = self.GetSubsystemContext(self.plant, context)
         q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._joints.index]
         return q
 
     def SetLinkInertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
-        """Changes the inertia of links in this station's context, for an arm that differs from its model.
+        """Changes the inertia of links in this station's context, to simulate an arm that differs from its model.
 
         Args:
             context: Context of this station.
-            inertias: Mapping of link name to spatial inertia M_LLo_L about the link's origin, in its frame
-                [kg, m, kg m^2].
+            inertias: Spatial inertia M_LLo_L [kg, m, kg m^2] about the link's origin in the link's frame, by link name.
 
         Raises:
-            StationError: A link that the arm does not have.
+            StationError: The arm does not have a link of that name.
         """
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._instance)}
         if unknown := sorted(set(inertias) - set(bodies)):
-            raise StationError(f"unknown link {', '.join(unknown)}; links: {', '.join(bodies)}")
+            raise StationError(f"unknown link {', '.join(unknown)}; known links: {', '.join(bodies)}")
         for name, M_LLo_L in inertias.items():
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
-    def _drop_idle_shapes(self) -> None:
-        """Removes the collision shapes if no two of them can collide. They would take a sixth of the time of a step."""
+    def _remove_idle_collision_shapes(self) -> None:
+        """Removes the collision shapes if no two of them can collide, because they would slow down every step."""
         if self._scene_graph.model_inspector().GetCollisionCandidates():
             return
         plant = self.plant
@@ -262,8 +270,8 @@ class ArmStation(Diagram):
         q_plant = self.plant.GetDefaultPositions()
         tree = tree_selector(self.plant, self._ground_truth_arm, self._instance)
         q_plant[tree] = self._ground_truth_arm.linkage.position(home)
-        if self._parts is not None:
-            self._parts.drive.set_positions(q_plant, home)
+        if self._plant_effects is not None:
+            self._plant_effects.drive.set_positions(q_plant, home)
         self.plant.SetDefaultPositions(q_plant)
 
     def _export(self, builder: DiagramBuilder, ports: DrivePorts) -> None:
@@ -284,12 +292,13 @@ class ArmStation(Diagram):
 
 
 def plant_config_fault(config: MultibodyPlantConfig) -> str:
-    """Returns the reason why a station's plant cannot have this configuration. Empty: it can."""
+    """Returns the reason why a configuration is not valid for a station's plant, or ""."""
     if not 0 < config.time_step <= 0.01:
-        return f"time_step must be above 0 and at most 0.01 s: the wrist is lost above; got {config.time_step}"
+        return f"time_step must be above 0 and at most 0.01 s (the wrist is unstable above); got {config.time_step}"
     if config.discrete_contact_approximation == "tamsi":
         return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
     if config.use_sampled_output_ports:
-        # Drake then steps the plant before all discrete updates, which would use measurements from after the step.
+        # With sampled output ports, Drake steps the plant before all discrete updates. These would then use
+        # measurements from after the step.
         return "use_sampled_output_ports must be false, so that a command acts after its measurement"
     return ""

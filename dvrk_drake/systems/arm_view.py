@@ -1,4 +1,4 @@
-"""Display of an arm in Meshcat, posed by its independent joints alone, with a suitable camera position."""
+"""Display of an arm in Meshcat at poses of its independent joints, with a suitable camera position."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
-#: Direction from the target to the camera (base frame), and the magnification of Meshcat's 75 degree view.
+#: Direction from the target to the camera in the base frame. Magnification of Meshcat's view of 75 degrees.
 DIRECTION, ZOOM = (1.1, 1.0, 0.3), 2.8
-#: Half the height of that view at distance 1, and its aspect ratio (width / height) in a common browser window.
+#: Half the height of the view at distance 1. Aspect ratio (width / height) of a common browser window.
 HALF_HEIGHT, ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2
-#: Fraction of the way to the limits that each joint moves in the poses inside the view (the whole range would show the
-#: arm small), and the factor by which the view is wider than these poses.
+#: Distance from home to the poses that the view contains, as a fraction of the distance to the limits. With the whole
+#: range, the arm would be small. Factor by which the view is larger than these poses.
 SHARE, MARGIN = 0.75, 1.05
 
 
 def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the positions (3,) [m, base frame] of a camera and of its target, so that the arm fills the view.
+    """Returns positions (3,) [m] of a camera and of its target in the base frame, so that the arm fills the view.
 
-    The view contains the arm at home and with each joint in turn at SHARE of the way to either limit. So a motion of
-    the arm does not leave the view at once.
+    The view contains the arm at home, and with one joint at a time moved by SHARE of the distance to each limit.
 
     Raises:
         ArmError: The arm has no visual geometry.
@@ -43,7 +42,7 @@ def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def geometry_corners(arm: Arm) -> NDArray[np.float64]:
-    """Returns corners (n, 3) [m, base frame] of the boxes around the visual geometry at the poses inside the view.
+    """Returns the corners (k, 3) [m] of boxes around the visual geometry at all poses in the view, in the base frame.
 
     Raises:
         ArmError: The arm has no visual geometry.
@@ -66,7 +65,7 @@ def geometry_corners(arm: Arm) -> NDArray[np.float64]:
             X_WB = query.GetPoseInWorld(geometry) @ box.pose()
             corners.append([X_WB @ (box.half_width() * sign) for sign in product((-1.0, 1.0), repeat=3)])
     if not corners:
-        raise ArmError(f"{arm.name} has no visual geometry yet")
+        raise ArmError(f"{arm.name} has no visual geometry")
     return np.concatenate(corners)
 
 
@@ -81,10 +80,12 @@ def start_meshcat(
     """Starts Meshcat, Drake's 3D view in a browser, on localhost with a light background.
 
     Args:
-        arm: Arm that the view frames. The caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`.
-        camera, target: Positions (3,) of the camera and of its target [m], for a view without an arm.
-        zoom: Magnification of Meshcat's 75 degree view [1].
-        port: Port in 1024..65535; by default a free one.
+        arm: Arm that fills the view. The caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`. None: `camera`
+            and `target` define the view.
+        camera: Position (3,) [m] of the camera, for a view without an arm.
+        target: Position (3,) [m] of the camera's target, for a view without an arm.
+        zoom: Magnification of Meshcat's view of 75 degrees.
+        port: Port in 1024..65535. None: a free port.
 
     Raises:
         DvrkDrakeError: The port cannot be opened.
@@ -105,7 +106,9 @@ def start_meshcat(
     try:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
     except RuntimeError as error:
-        raise DvrkDrakeError(f"port {port or ''} cannot be opened: is it in use?") from error
+        raise DvrkDrakeError(
+            f"port {port or ''} cannot be opened. If another program uses it, choose another port"
+        ) from error
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.86, 0.89, 0.92])
@@ -118,15 +121,20 @@ def start_meshcat(
 class ArmView:
     """Draws an arm at poses of its independent joints, optionally with sliders for them.
 
-    Drake's own JointSliders move every joint of the tree independently and open the parallelogram. Here, the dependent
-    joints follow from the arm's linkage.
+    The dependent joints follow from the arm's linkage. Drake's JointSliders would move every joint of the tree
+    independently and open the parallelogram.
     """
 
     def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
-        """Draws `arm` in `meshcat` at its home pose: all joints at zero, or as near as their limits allow.
+        """Draws an arm at its home pose: all joints at zero, or at the limit nearest to zero.
+
+        Args:
+            arm: Arm to draw.
+            meshcat: Meshcat in which the arm is drawn.
+            role: Role of the drawn geometry.
 
         Raises:
-            ArmError: The arm has no geometry in that role.
+            ArmError: The arm has no geometry with this role.
         """
         self.arm, self.meshcat = arm, meshcat
         builder = DiagramBuilder()
@@ -134,7 +142,7 @@ class ArmView:
         add_arm(self._plant, arm)
         self._plant.Finalize()
         if scene_graph.model_inspector().NumGeometriesWithRole(role) == 0:
-            raise ArmError(f"{arm.name} has no {'visual' if role == Role.kIllustration else 'collision'} geometry yet")
+            raise ArmError(f"{arm.name} has no {'visual' if role == Role.kIllustration else 'collision'} geometry")
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, MeshcatVisualizerParams(role=role))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
@@ -144,7 +152,7 @@ class ArmView:
         self.show(self._q)
 
     def show(self, q: ArrayLike) -> None:
-        """Draws the pose q (n,) [rad, m]. It need not be inside the limits."""
+        """Draws the pose q (n,) [rad, m], which may be outside the limits."""
         self._q = np.array(q, dtype=float)
         set_arm_positions(self._plant, self._plant.GetMyMutableContextFromRoot(self._context), self.arm, self._q)
         self._diagram.ForcedPublish(self._context)
@@ -157,15 +165,15 @@ class ArmView:
             self.meshcat.AddSlider(name, lower, upper, (upper - lower) / 1000, self._q[i])
 
     def follow_sliders(self) -> NDArray[np.float64]:
-        """Draws the pose of the sliders if it changed, and returns it.
+        """Draws the pose of the sliders if it changed. Returns the drawn pose (n,) [rad, m].
 
-        A coupled limit stops the sliders of its joints. A button without function shows the name of the limit.
+        The sliders of the joints of a coupled limit stop at this limit. A button without function shows its name.
         """
-        wanted = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
-        if np.array_equal(wanted, self._q):
+        requested = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
+        if np.array_equal(requested, self._q):
             return self._q
-        q, stopped_by = self._inside_coupled_limits(wanted)
-        for name, value, target in zip(self._slider_names, wanted, q, strict=True):
+        q, stopped_by = self._inside_coupled_limits(requested)
+        for name, value, target in zip(self._slider_names, requested, q, strict=True):
             if value != target:
                 self.meshcat.SetSliderValue(name, target)
         if stopped_by != self._stopped_by:
@@ -177,13 +185,13 @@ class ArmView:
         self.show([self.meshcat.GetSliderValue(name) for name in self._slider_names])
         return self._q
 
-    def _inside_coupled_limits(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
-        """Returns the pose with the joints of each coupled limit stopped there, and the names of these limits.
+    def _inside_coupled_limits(self, requested: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+        """Returns the pose inside the coupled limits, and a description of the limits that stopped the sliders.
 
-        A slider moves in steps, so the shown pose may be slightly beyond a limit. It then moves no further.
+        A slider moves in steps, so the drawn pose may exceed a limit slightly. It then moves no further.
         """
         A, lower, upper = self.arm.limit_matrix()
-        n, q, stops = self.arm.num_joints, wanted.copy(), []
+        n, q, stops = self.arm.num_joints, requested.copy(), []
         for a, least, most, limit in zip(A[n:], lower[n:], upper[n:], self.arm.coupled_limits, strict=True):
             start, end = a @ self._q, a @ q
             allowed = np.clip(end, min(least, start), max(most, start))

@@ -19,12 +19,12 @@ def add_closed_loop(
     """Adds a station and its controller to a Diagram and connects them.
 
     Args:
-        builder: Builder of the diagram to which they are added.
+        builder: Builder of the Diagram.
         station: Station of the arm.
         controller: Controller of an arm with the same joints: a `GravityPidController`, or a System with an input port
             `state_estimated` (2n) and an output port `effort` (n).
-        desired: Source with one output port: q_d, then v_d (2n,). Without it the controller holds the initial pose.
-        friction: Compensator for a share of the arm's friction.
+        desired: Source with one output port (2n): q_d, then v_d. None: the controller holds the initial pose.
+        friction: Compensator for a share of the arm's friction. None: no compensation.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -51,7 +51,7 @@ def connect_controller(
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:
-    """Adds a controller with the systems that it needs to a `builder` that has the station, and connects them.
+    """Adds a controller to a Diagram that contains the station, and connects both.
 
     The arguments are those of `add_closed_loop`.
     """

@@ -8,10 +8,10 @@ from dvrk_drake.errors import ControllerError
 
 
 class EffortRamp(LeafSystem):
-    """Outputs the measured effort until it is enabled. It then changes to the desired one over `duration`.
+    """Outputs the measured effort until the ramp is enabled, then changes to the desired effort over `duration`.
 
-    A command guard that accepts only efforts near the present ones receives such efforts until its arm follows. The
-    effort on the arm has no step.
+    A command guard accepts the first efforts only near the measured ones. With the ramp, the effort on the arm has no
+    step.
 
     .. pydrake_system::
 
@@ -23,20 +23,31 @@ class EffortRamp(LeafSystem):
         output_ports:
         - effort
 
-    `effort_wanted`, `effort_measured` and `effort` have n numbers [N m; N on a prismatic joint]. `enabled` has one, 0
-    or not. `effort` is start + share * (wanted - start), where start is the last measured effort before it was enabled
-    and share increases from 0 to 1. Both are discrete state, updated every `period` or by a forced discrete update.
+    - `effort_wanted` (n): desired effort [N m; N on a prismatic joint].
+    - `effort_measured` (n): measured effort.
+    - `enabled` (1): 0 disables the ramp, any other value enables it.
+    - `effort` (n): start + share * (effort_wanted - start). start is the last measured effort before the ramp was
+      enabled. share increases from 0 to 1.
+
+    start and share are discrete state, updated every `period` or by a forced discrete update.
     """
 
     def __init__(self, num_joints: int, *, period: float = 1e-3, duration: float = 1.0) -> None:
-        """Creates a ramp for `num_joints` joints with an update `period` and a `duration` of the ramp [s].
+        """Creates a ramp.
+
+        Args:
+            num_joints: Number n of joints.
+            period: Period of the update [s].
+            duration: Duration of the ramp [s].
 
         Raises:
-            ControllerError: They are not positive.
+            ControllerError: Period or duration is not positive.
         """
         super().__init__()
         if not (period > 0 and duration > 0):
-            raise ControllerError(f"period and duration must be positive; got {period}, {duration}")
+            raise ControllerError(
+                f"period and duration must be positive numbers of seconds; got {period} and {duration}"
+            )
         self._increment = period / duration
         self._wanted = self.DeclareVectorInputPort("effort_wanted", num_joints)
         self._measured = self.DeclareVectorInputPort("effort_measured", num_joints)

@@ -14,7 +14,7 @@ from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 
 
 class FrictionCompensator(LeafSystem):
-    """Adds a share of the identified friction to a controller's effort. The sum never moves the arm by itself.
+    """Adds a share of the identified friction to a controller's effort. The compensation cannot start a motion.
 
     .. pydrake_system::
 
@@ -31,20 +31,21 @@ class FrictionCompensator(LeafSystem):
     - `state_estimated` (2n): q, then v.
     - `effort_wanted` (n): effort of a controller, e.g. GravityPidController.
     - `effort` (n): effort_wanted + friction_effort, inside the effort limits.
-    - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k'. The elements are those of the identified
-      friction, see `dvrk_drake.dynamics.actuator_effects`. Dry friction is compensated as a hysteresis that depends on
-      the travel of the joint, not on the sign of its velocity, which is noise near zero.
+    - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k' over the elements k of the identified friction;
+      see `dvrk_drake.dynamics.actuator_effects`. Dry friction is compensated as a hysteresis that depends on the travel
+      of the joint. The sign of the velocity is not used, because it is noise near zero.
 
-    **Passivity.** An elasto-plastic element dissipates c |slip|. The compensating element starts later, at `widening`
-    >= 1 times the travel at which the arm's element slips, so it slips no more than the arm's own. It therefore returns
-    at most `ratio` of the energy that the arm's friction dissipates, besides the energy that it can store,
-    ratio c d widening / 2. Viscous and smoothed Coulomb terms are at most `ratio` of the arm's at every speed. A delay
-    shifts the phase of such a term, but the arm's own term remains larger. The remainder is friction, so no cycle gains
-    energy. It also holds the arm against errors of the gravity compensation, see `safe_ratios`.
+    **Passivity.** An elasto-plastic element with coefficient c and travel d until it slips dissipates c |slip|. The
+    compensating element slips after `widening` >= 1 times this travel, so it never slips more than the arm's element.
+    Apart from its stored energy, ratio c d widening / 2, it therefore returns at most the share `ratio` of the energy
+    that the arm's friction dissipates. Viscous and smoothed Coulomb terms are at most `ratio` times those of the arm at
+    every speed. A delay shifts the phase of such a term, but the arm's own term remains larger. The remaining friction
+    prevents any cycle from gaining energy. It also holds the arm against errors of the gravity compensation; see
+    `safe_ratios`.
 
-    **Time.** The state consists of the deflections of the elements and the last position. It changes every `period`, at
-    initialization, when the elements are relaxed, and by a forced update. While `state_estimated` is not finite,
-    `friction_effort` is zero. Afterwards the elements start relaxed.
+    **Time.** The state consists of the deflections of the elements and the last position. It is updated every `period`,
+    at initialization and by a forced update. At initialization, the elements are relaxed. While `state_estimated` is
+    not finite, `friction_effort` is zero. The elements are relaxed afterwards.
     """
 
     def __init__(
@@ -60,12 +61,12 @@ class FrictionCompensator(LeafSystem):
         """Creates the compensator for an arm's friction.
 
         Args:
-            friction: Identified friction.
-            ratio: Share of it that is compensated, 0..`MAX_RATIO`.
-            hysteresis_ratio: Least share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves a released arm
-                back towards its earlier position, see `safe_ratios`.
-            holding_error: Error (n,) of the gravity compensation [N m, N]. It lowers the ratio where needed.
-            widening: Ratio of the compensation's scales to the identified ones, at least 1.
+            friction: Identified friction of the arm.
+            ratio: Compensated share of the friction, 0..`MAX_RATIO`.
+            hysteresis_ratio: Least compensated share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves a
+                released arm back towards its earlier position; see `safe_ratios`.
+            holding_error: Error (n,) [N m, N] of the gravity compensation, which may reduce the ratio. None: no error.
+            widening: Ratio of the scales of the compensation to the identified scales, 1..10.
             period: Period of the update [s].
 
         Raises:
@@ -74,7 +75,9 @@ class FrictionCompensator(LeafSystem):
         super().__init__()
         check_ratios(ratio, hysteresis_ratio)
         if not (1 <= widening <= 10 and 0 < period < 1):
-            raise ControllerError(f"widening must be 1..10 and period 0..1 s; got {widening:g}, {period:g}")
+            raise ControllerError(
+                f"widening must be 1..10 and period must be 0..1 s; got {widening:g} and {period:g} s"
+            )
         n = friction.arm.num_joints
         error = np.zeros(n) if holding_error is None else holding_error
         self._ratios = safe_ratios(friction, ratio, error, hysteresis_ratio)
@@ -130,11 +133,11 @@ def _advance(
     weights: NDArray[np.float64],
     memory: NDArray[np.float64],
 ) -> None:
-    """Computes one step of all elements, in place in `memory`, see FrictionCompensator."""
+    """Computes one update of all elements, in place in `memory`; see FrictionCompensator."""
     k, n = rows.shape
-    stretch, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
+    deflection, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
     effort[:] = 0.0
-    known = memory[-1] == 1.0
+    was_valid = memory[-1] == 1.0
     memory[-1] = 0.0
     for i in range(2 * n):
         if not abs(state[i]) < IMPLAUSIBLE:  # also true for NaN
@@ -145,9 +148,9 @@ def _advance(
         for i in range(n):
             x += rows[j, i] * state[i]
             v += rows[j, i] * state[n + i]
-        if not known:
-            stretch[j], last[j] = 0.0, x
-        stretch[j], shape = effect_step(codes[j], stretch[j], x - last[j], v, scales[j])
+        if not was_valid:
+            deflection[j], last[j] = 0.0, x
+        deflection[j], shape = effect_step(codes[j], deflection[j], x - last[j], v, scales[j])
         last[j] = x
         for i in range(n):
             effort[i] += weights[j] * shape * rows[j, i]

@@ -44,22 +44,22 @@ class GravityPidController(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `state_estimated` (2n): q, then v. Not connected: ControllerError at initialization.
-    - `desired_state` (2n): q_d, then v_d. Read in "hold" mode only. Unconnected: that mode holds the latched pose. It
-      is latched at initialization, at a change to "hold" and at the end of a fault, so it never jumps.
-    - `effort` (n): command inside the effort limits.
+    - `desired_state` (2n): q_d, then v_d, read only in "hold" mode. Unconnected: "hold" mode holds the latched pose,
+      which is latched at initialization, at a change to "hold" and at the end of a fault.
+    - `effort` (n): commanded effort inside the effort limits.
     - `gravity_effort` (n): G(q) alone, before the limits.
-    - `fault` (1): 1 while `state_estimated` (or a `desired_state` that is read) is not finite or beyond 1e6, else 0.
+    - `fault` (1): 1 while `state_estimated`, or a `desired_state` that is read, is not finite or above 1e6. Else 0.
 
     **Time.** Inputs are sampled and outputs change every `period` seconds and at initialization, which also resets the
-    integrator and latches the pose. With a discrete plant of the same period and without sampled output ports, such as
-    that of ArmStation, the command is one period late, as on hardware. With sampled output ports, Drake's default, the
-    plant steps first and there is no delay. A forced discrete update executes the same step, for loops that are driven
-    by messages. Gains and mode are numeric parameters of the Context and can be changed while running.
+    integrator and latches the pose. With the plant of ArmStation and the same period, the command is one period late,
+    as on hardware. With sampled output ports (Drake's default), the plant steps first and there is no delay. A forced
+    discrete update executes the same step, for loops that are driven by messages. Gains and mode are numeric parameters
+    of the Context and can be changed while running.
 
     **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration (Astrom and
-    Hagglund, Advanced PID Control, 2006, chapter 3). The integrator of a joint stops while its command is beyond the
-    limit and the error would increase it further. It also stops while Kp e alone exceeds the limit, so that a large
-    error does not fill it. The integral is stored as an effort, so a change of Ki causes no step. Ki = 0 resets it.
+    Hagglund, Advanced PID Control, 2006, chapter 3). The integrator of a joint stops while the command exceeds the
+    limit and the error would increase the command further. It also stops while Kp e alone exceeds the limit. The
+    integral is stored as an effort, so a change of Ki causes no step. Ki = 0 resets the integral.
 
     **Fault.** A running Diagram is not stopped by an exception. While an input is not finite, the command is the
     gravity effort of the last finite pose, without PID, so the arm neither falls nor moves to another pose. Before the
@@ -67,8 +67,6 @@ class GravityPidController(LeafSystem):
     finite again.
 
     To compensate gravity of a plant without an identification, use the model from the arm's SDF, as in the example.
-
-    To compensate with a plant's own gravity, nothing identified, use the model that the arm's SDF states, as here.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -94,12 +92,12 @@ class GravityPidController(LeafSystem):
         Args:
             model: Model that defines G(q). Its parameters are copied.
             period: Period of the update [s].
-            gains: Gains with n numbers each; the arm's own by default.
-            mode: Initial mode, "hold", "gravity" or "damped"; see `SetMode`.
-            effort_limits: Largest magnitude (n,) of each joint's effort; the arm's own by default.
+            gains: Gains with n numbers each. None: the gains of the arm.
+            mode: Initial mode: "hold", "gravity" or "damped".
+            effort_limits: Largest magnitude (n,) [N m, N] of each joint's effort. None: the limits of the arm.
 
         Raises:
-            ModelError: The model does not fit its arm.
+            ModelError: The model is not valid for its arm.
             ControllerError: A period, gain, mode or limit is invalid.
         """
         super().__init__()
@@ -120,7 +118,7 @@ class GravityPidController(LeafSystem):
         self._check_gains(gains)
         self._gains = [self.DeclareNumericParameter(BasicVector(k)) for k in (gains.kp, gains.kd, gains.ki)]
         self._mode = self.DeclareNumericParameter(BasicVector([self._mode_number(mode)]))
-        # In the order of the compiled step's arguments. NaN stands for no pose yet.
+        # The order is that of the arguments of the compiled step. NaN means that there is no pose yet.
         effort, gravity_effort, fault, *_ = (
             self.DeclareDiscreteState(BasicVector(np.full(size, value)))
             for size, value in [(n, 0.0), (n, 0.0), (1, 0.0), (n, 0.0), (n, np.nan), (n, np.nan)]
@@ -129,7 +127,7 @@ class GravityPidController(LeafSystem):
         self.DeclareStateOutputPort(name="gravity_effort", state_index=gravity_effort)
         self.DeclareStateOutputPort(name="fault", state_index=fault)
         self._scales_and_limits = np.array([model.feedforward_scale, limits])
-        # Reading each parameter at each update costs 5 us; a cache entry that holds them as one array costs 1 us.
+        # Reading one cache entry at each update is faster than reading each parameter.
         self._settings = self.DeclareCacheEntry(
             "settings",
             ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((5, n)), 0)), calc=self._calc_settings),
@@ -152,7 +150,7 @@ class GravityPidController(LeafSystem):
         """Changes the gains from the next update on.
 
         Raises:
-            ControllerError: A gain is not valid for this arm, see `Arm.gains_fault`.
+            ControllerError: A gain is not valid for this arm; see `Arm.gains_fault`.
         """
         self._check_gains(gains)
         for index, values in zip(self._gains, (gains.kp, gains.kd, gains.ki), strict=True):
@@ -194,8 +192,8 @@ class GravityPidController(LeafSystem):
     ) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.
 
-        The handler runs between two steps of the plant, which evict Python's data from the processor caches. Its time
-        depends on the number of different objects that it accesses, so it uses few objects and local names.
+        The handler runs between two steps of the plant, which evict Python's data from the processor caches. For speed,
+        it accesses few objects, by local names.
         """
         eval_vector_input, settings, period = self.EvalVectorInput, self._settings, self._period
 

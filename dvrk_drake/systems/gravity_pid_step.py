@@ -18,13 +18,17 @@ HOLD, GRAVITY, DAMPED = 0, 1, 2
 def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
     """Returns one update of the controller as a compiled function without allocation.
 
-    Arguments of the function, vectors of n joints unless another size is stated:
-    - `state`, `desired` (2n) and `has_desired`: inputs;
-    - `restart`: true for the update at initialization;
-    - `period` [s]; `mode`: index into `Mode`;
-    - `per_joint` (5, n): kp, kd, ki, feedforward_scale, effort limits; `theta`;
-    - changed in place: `effort`, `gravity`, `fault` (1), `integral`, `latched_q` and `last_q`. The latter two are the
-      pose that is regulated without `desired` and the last finite pose. NaN stands for no such pose yet.
+    The function has these arguments. Vectors have n numbers unless another size is stated.
+
+    - `state` (2n), `desired` (2n), `has_desired`: inputs
+    - `restart`: true for the update at initialization
+    - `period`: period of the update [s]
+    - `mode`: index into `Mode`
+    - `per_joint` (5, n): kp, kd, ki, feedforward_scale, effort limits
+    - `theta`: parameters of the model
+    - `effort`, `gravity`, `fault` (1), `integral`: results, written in place
+    - `latched_q`: pose that is held without `desired`, changed in place; NaN before the first pose
+    - `last_q`: last finite pose, changed in place; NaN before the first pose
     """
 
     def step(

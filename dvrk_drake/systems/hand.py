@@ -1,4 +1,4 @@
-"""Model of an operator's hand: a spring and damper between a frame of the arm and the path that the hand follows."""
+"""Model of an operator's hand: spring and damper between a frame of the arm and a desired pose."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from dvrk_drake.models.schema_fault import number_fault, within
 class Grip:
     """Stiffness, damping and limits of a hand's grip.
 
-    The order of magnitude of the defaults is that of measurements of people: a few hundred N/m at the hand
-    (Mussa-Ivaldi, Hogan and Bizzi, J. Neurosci. 5, 1985). The limits are forces that people exert without effort.
+    The default stiffness has the order of magnitude of human hands: a few hundred N/m (Mussa-Ivaldi, Hogan and Bizzi,
+    J. Neurosci. 5, 1985). The default limits are forces that people exert easily.
 
     Attributes:
         stiffness: Translational stiffness [N/m].
@@ -43,7 +43,7 @@ class Grip:
 
 
 class Hand(LeafSystem):
-    """Pulls a frame G of an arm with base B towards a pose, as the hand of an operator does.
+    """Hand of an operator that pulls a frame G of an arm with base B towards a desired pose.
 
     .. pydrake_system::
 
@@ -57,29 +57,37 @@ class Hand(LeafSystem):
 
     - `state_estimated` (2n): q, then v of the arm's joints [rad, rad/s; m, m/s on a prismatic joint].
     - `X_BG_desired` (RigidTransform): desired pose of the frame. Unconnected: the hand exerts no force.
-    - `effort_disturbance` (n): J' F [N m, N], for `ArmStation`'s port of that name.
-    - `spatial_force` (6): F_G_B, torque [N m], then force [N] of the hand on the arm at G's origin, in B.
+    - `effort_disturbance` (n): joint efforts J' F [N m, N], for `ArmStation`'s port of that name.
+    - `spatial_force` (6): force F of the hand on the arm at the origin of G, expressed in B: torque [N m], then
+      force [N].
 
     Spring and damper are evaluated at the end of the coming step, to first order (linearly implicit Euler):
-    (1 + h (D + h K) J M^-1 J') F = K (e - h V) - D V. h is the station's time step, e the difference to the desired
-    pose (rotation vector, then translation), V the frame's velocity and M the arm's mass matrix. A stiff hand therefore
-    does not cause oscillations of a light wrist, for any gains. As h goes to zero, F = K e - D V.
 
-    Where torque or force exceeds its limit, both are limited, and each is then computed again with the other one fixed.
-    This accounts for the larger rotation of a wrist that slips in the hand during the step. So the hand adds no energy
+        (1 + h (D + h K) J M^-1 J') F = K (e - h V) - D V
+
+    - h: time step of the station
+    - e: difference to the desired pose (rotation vector, then translation)
+    - V: spatial velocity of the frame
+    - M: mass matrix of the arm
+    - K, D: stiffness and damping
+
+    A stiff hand therefore causes no oscillations of a light wrist, for any gains. As h goes to zero, F = K e - D V.
+
+    If torque or force exceeds its limit, both are limited. Each of them is then computed again with the other one
+    fixed, because a wrist that slips in the hand rotates further during the step. The hand therefore adds no energy
     beyond its own work.
 
     While a state or pose is not finite, the hand exerts no force.
     """
 
     def __init__(self, arm: Arm, frame_name: str = "dh_7", grip: Grip | None = None, time_step: float = 1e-3) -> None:
-        """Creates a hand on the frame of that name in `arm`'s SDF.
+        """Creates a hand.
 
         Args:
-            arm: Arm whose station the hand moves.
-            frame_name: Name of the frame G; by default an MTM's handle.
-            grip: Properties of the grip; `Grip()` by default.
-            time_step: Time step h of the station's plant [s].
+            arm: Arm that the hand moves.
+            frame_name: Name of the frame G in the arm's SDF. The default is the handle of an MTM.
+            grip: Properties of the grip. None: `Grip()`.
+            time_step: Time step h of the plant [s].
 
         Raises:
             ArmError: The frame does not exist.
@@ -88,9 +96,9 @@ class Hand(LeafSystem):
         super().__init__()
         grip = grip or Grip()
         if fault := number_fault(grip):
-            raise StationError(f"a hand's {fault}")
+            raise StationError(f"grip of the hand: {fault}")
         if not (np.isfinite(time_step) and time_step > 0):
-            raise StationError(f"a hand's time_step must be a positive number; got {time_step}")
+            raise StationError(f"time_step of the hand must be a positive number of seconds; got {time_step}")
         self._frame = ArmFrame(arm, frame_name)
         self._grip, self._time_step = grip, time_step
         self._K = np.repeat([grip.rotational_stiffness, grip.stiffness], 3)
@@ -112,17 +120,17 @@ class Hand(LeafSystem):
         output.SetFromVector(self._force_and_jacobian(context)[0])
 
     def _force_and_jacobian(self, context: Context) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns F_G_B (6,) and J (6, n)."""
-        nothing = np.zeros(6), np.zeros((6, self._num_joints))
+        """Returns the spatial force F (6,) and the Jacobian J (6, n)."""
+        no_force = np.zeros(6), np.zeros((6, self._num_joints))
         if not self.get_input_port(1).HasValue(context):
-            return nothing
+            return no_force
         q, v = np.split(self.get_input_port(0).Eval(context), 2)
         X_BG_desired = self.get_input_port(1).Eval(context)
         if not all(np.all(np.abs(x) < IMPLAUSIBLE) for x in (q, v, X_BG_desired.GetAsMatrix34())):
-            return nothing
+            return no_force
         X_BG, J = self._frame.pose(q), self._frame.jacobian(q)
-        turn = (X_BG_desired.rotation() @ X_BG.rotation().inverse()).ToAngleAxis()
-        e = np.concatenate([turn.angle() * turn.axis(), X_BG_desired.translation() - X_BG.translation()])
+        rotation = (X_BG_desired.rotation() @ X_BG.rotation().inverse()).ToAngleAxis()
+        e = np.concatenate([rotation.angle() * rotation.axis(), X_BG_desired.translation() - X_BG.translation()])
         V, h = J @ v, self._time_step
         mobility = J @ np.linalg.solve(self._frame.mass_matrix(q), J.T)
         A = np.eye(6) + (h * (self._D + h * self._K))[:, None] * mobility
@@ -148,7 +156,7 @@ def _limited(vector: NDArray[np.floating], limit: float) -> NDArray[np.floating]
 
 
 class PoseTrajectorySource(LeafSystem):
-    """Outputs the pose of a trajectory at the context's time. Outside of its time span it outputs the nearest end pose.
+    """Outputs the pose of a trajectory at the time of the context, or the nearest end pose outside the time span.
 
     .. pydrake_system::
 
@@ -156,7 +164,7 @@ class PoseTrajectorySource(LeafSystem):
         output_ports:
         - pose
 
-    - `pose` (RigidTransform). Drake's TrajectorySource gives vectors only.
+    - `pose` (RigidTransform): pose of the trajectory. Drake's TrajectorySource outputs only vectors.
     """
 
     def __init__(self, trajectory: PiecewisePose) -> None:
@@ -175,7 +183,7 @@ class PoseTrajectorySource(LeafSystem):
 
 
 class HandPath(LeafSystem):
-    """Outputs the pose X_BG of a frame G of an arm with base B whose joints follow a trajectory.
+    """Outputs the pose X_BG of a frame G of an arm with base B, for a joint trajectory.
 
     .. pydrake_system::
 
@@ -183,12 +191,17 @@ class HandPath(LeafSystem):
         output_ports:
         - X_BG_desired
 
-    - `X_BG_desired` (RigidTransform): for `Hand`'s port of that name. Before the start and after the end of the
-      trajectory it is NaN, so the hand exerts no force.
+    - `X_BG_desired` (RigidTransform): pose for `Hand`'s port of that name. It is NaN before the start and after the end
+      of the trajectory, so the hand exerts no force.
     """
 
     def __init__(self, arm: Arm, frame_name: str, trajectory: PiecewisePolynomial) -> None:
-        """Creates the path of the frame of that name in `arm`'s SDF along a joint `trajectory` (n) [rad, m].
+        """Creates the path.
+
+        Args:
+            arm: Arm with n joints.
+            frame_name: Name of the frame G in the arm's SDF.
+            trajectory: Joint trajectory (n) [rad, m].
 
         Raises:
             ArmError: The frame does not exist.

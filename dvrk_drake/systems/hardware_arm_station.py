@@ -1,4 +1,4 @@
-"""Station of one real arm over LCM with the ports of its simulation."""
+"""Station of one real arm over LCM, with the same ports as the simulated station."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 
 class HardwareArmStation(Diagram):
-    """Real arm, connected over LCM, with those ports of `ArmStation` that a driver has.
+    """Real arm, connected over LCM. It has those ports of `ArmStation` that exist on hardware.
 
     .. pydrake_system::
 
@@ -25,23 +25,27 @@ class HardwareArmStation(Diagram):
         - mtml.state_estimated
         - mtml.effort_measured
 
-    `mtml` stands for the arm's lower-case name. Sizes and units are those of `ArmStation`. Measured values are those of
-    the last DVRK_STATUS message, and NaN before the first one. Efforts are sent in DVRK_COMMAND messages every
-    `driver.status_period` and on forced publishing. The arm's command guard checks them. Unconnected: the messages
-    command HOLD.
+    `mtml` stands for the arm's lower-case name. Sizes and units are those of `ArmStation`.
 
-    After the guard's watchdog took over, e.g. because this process was stopped for 50 ms, efforts act again only when
-    an operator resumes: stop this process, inspect the arm, run `dvrk-drake run --reset`, stop it, start this again.
+    Measured values are those of the last DVRK_STATUS message, and NaN before the first message. Efforts are sent in
+    DVRK_COMMAND messages every `driver.status_period` and on forced publishing. The command guard of the arm checks
+    them. If the effort input is unconnected, the messages command HOLD.
+
+    If the watchdog of the guard took over, e.g. because this process was stopped for 50 ms, an operator must resume:
+
+    1. Stop this process and inspect the arm.
+    2. Run `dvrk-drake run --reset`, then stop it.
+    3. Start this process again.
     """
 
     def __init__(self, arm: Arm, *, driver: DvrkDriver | None = None, lcm: DrakeLcmInterface | None = None) -> None:
         """Builds the station.
 
         Args:
-            arm: Arm after which the ports and the channels are named.
-            driver: Configuration of the driver; `DvrkDriver()` by default.
-            lcm: LCM interface whose `HandleSubscriptions` the caller calls, for loops that are driven by messages. By
-                default a new one at `driver.lcm_url`, which a Simulator of this station handles.
+            arm: Arm that defines the names of ports and channels.
+            driver: Configuration of the driver. None: `DvrkDriver()`.
+            lcm: LCM interface whose `HandleSubscriptions` the caller calls, for loops that are driven by messages.
+                None: a new interface at `driver.lcm_url`, which a Simulator of this station handles.
 
         Raises:
             KeyFileError: The driver's key cannot be used.

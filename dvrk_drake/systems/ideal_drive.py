@@ -20,22 +20,22 @@ class PlantJoints:
     """Independent joints of an arm in a finalized plant, in the arm's order.
 
     Attributes:
-        index: Indices (n,) into the plant's q and v.
-        selection: Matrix (nv, n) from joint efforts to generalized forces; its transpose selects the joint positions.
+        index: Indices (n,) of the joints in the plant's q and v.
+        selection: Matrix (nv, n) from joint efforts to generalized forces. The transpose selects the joint positions.
         actuators: Actuators of the arm's instance, in Drake's order.
-        actuation: Matrix (len(actuators), n) from efforts of the joints' motors to efforts of all actuators. The other
-            actuators are massless rotors on the linkage that only represent inertia. Their effort is zero.
-        effort_limits: Effort limits (n,) of the joints' motors [N m, N].
+        actuation: Matrix (len(actuators), n) from joint efforts to efforts of all actuators. Actuators that do not
+            drive a joint of the arm only represent rotor inertia of the linkage. Their effort is zero.
+        effort_limits: Effort limits (n,) [N m, N] of the joints' motors.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
         """Finds the joints of the `arm` that `add_arm` added to `plant` as `instance`.
 
         Raises:
-            StationError: A floating body, or a joint without a motor.
+            StationError: The plant has a floating body, or a joint has no motor.
         """
         if plant.num_positions() != plant.num_velocities():
-            raise StationError("modify_plant must not add floating bodies: weld them to the arm")
+            raise StationError("modify_plant must not add floating bodies. Weld them to the arm")
         names = list(arm.tree_joint_names)
         tree, n = tree_selector(plant, arm, instance), arm.num_joints
         self.index: NDArray[np.int_] = tree[[names.index(joint) for joint in arm.joint_names]]
@@ -45,8 +45,10 @@ class PlantJoints:
             plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)
         ]
         driven = [actuator.joint().name() for actuator in self.actuators]
-        if undriven := [joint for joint in arm.joint_names if joint not in driven]:
-            raise StationError(f"{' '.join(arm.sdf)}: joint {', '.join(undriven)} has no <effort>, so no motor")
+        if without_motor := [joint for joint in arm.joint_names if joint not in driven]:
+            raise StationError(
+                f"{' '.join(arm.sdf)}: joint {', '.join(without_motor)} has no <effort> and therefore no motor"
+            )
         columns = [driven.index(joint) for joint in arm.joint_names]
         self.actuation = np.zeros((len(self.actuators), n))
         self.actuation[columns, range(n)] = 1.0
@@ -55,7 +57,7 @@ class PlantJoints:
 
 @dataclass(frozen=True)
 class DrivePorts:
-    """Ports that a drive provides to its station, see `ArmStation`. Vectors of the joints are in the arm's order."""
+    """Ports that a drive provides to its station; see `ArmStation`. Vectors are in the arm's order of joints."""
 
     effort_commanded: InputPort
     effort_disturbance: InputPort
@@ -67,10 +69,10 @@ class DrivePorts:
 def add_ideal_drive(
     builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints, instance: ModelInstanceIndex
 ) -> DrivePorts:
-    """Connects a finalized plant's inputs and returns the ports. All added systems are C++ and have no state."""
+    """Connects the inputs of a finalized plant and returns the ports. All added systems are C++ and have no state."""
     n = len(joints.index)
     commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
-    # The plant clamps as well but does not output the result. Clamp here at its limits, to measure the effort.
+    # The plant also clamps but does not output the result. The effort is clamped here for the effort measurement.
     limits = joints.effort_limits
     clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
     to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=joints.actuation))

@@ -1,6 +1,6 @@
-"""Configuration of a station, as a schema for Drake's yaml_load_typed, and the station that it describes.
+"""Configuration of a station, as a schema for Drake's yaml_load_typed, and creation of the station.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
 from dataclasses import dataclass, field
@@ -33,12 +33,12 @@ class ArmConfig:
     """Arm of a station or of a scenario, and the options of its simulation.
 
     Attributes:
-        arm: Name, or path of an arm's YAML file. Paths are relative to the working directory of the command.
-        closure: Method that closes the linkage's loops: "ball" or "mimic".
-        gravity: Gravity vector (3,) in the base frame [m/s^2]; the arm's own by default.
+        arm: Name of an arm, or path of the arm's YAML file relative to the working directory.
+        closure: Method that closes the loops of the linkage: "ball" or "mimic".
+        gravity: Gravity vector (3,) in the base frame [m/s^2]. None: the gravity vector of the arm.
         effects: Additional position-dependent effects in the drive of the simulated arm. Controllers do not model them.
-        stretch: Mapping of actuator to an elastic cable of the simulated arm, besides those of `simulated_effects`.
-        simulated_effects: Names of the parts of the arm's own `effects` that are simulated; ["all"] for all of them.
+        stretch: Elastic cables of the simulated arm by actuator, in addition to those of `simulated_effects`.
+        simulated_effects: Names of the simulated parts of the arm's `effects`; ["all"] for all parts.
         seed: Seed of all noise.
     """
 
@@ -52,7 +52,7 @@ class ArmConfig:
 
     @cached_property
     def mounted_arm(self) -> Arm:
-        """Returns the arm with the gravity vector of the configuration."""
+        """Arm with the gravity vector of the configuration."""
         arm = load_arm(self.arm)
         return arm if self.gravity is None else arm.with_gravity(self.gravity)
 
@@ -61,7 +61,7 @@ class ArmConfig:
         """Effects of the simulated arm: `simulated_effects`, `effects` and `stretch`. None if there are none.
 
         Raises:
-            ArmError: A name of an unknown part.
+            ArmError: A name in `simulated_effects` is unknown.
         """
         if not (self.simulated_effects or self.effects or self.stretch):
             return None
@@ -69,7 +69,7 @@ class ArmConfig:
         return own.joined(ArmEffects(cables=self.effects, stretch=self.stretch))
 
     def arm_fault(self) -> str:
-        """Describes the first field that cannot be simulated: a number, the closure or the effects. Empty: none.
+        """Describes the first field that is not valid for a simulation, or returns "" if all fields are valid.
 
         Raises:
             ArmError: The arm cannot be loaded.
@@ -97,7 +97,7 @@ class StationConfig(ArmConfig):
     """Schema of a station file: one arm, simulated or real.
 
     Attributes:
-        plant: Configuration of the simulated plant. The defaults are those of `arm_plant_config`.
+        plant: Configuration of the simulated plant. The default is `arm_plant_config()`.
         simulator: Configuration for `ApplySimulatorConfig`, which the caller applies.
         driver: Configuration of the hardware driver. Its paths are relative to the station file.
     """
@@ -110,7 +110,7 @@ class StationConfig(ArmConfig):
         """Checks the values.
 
         Raises:
-            StationError: A value is not allowed. The message states the field, its value and the allowed range.
+            StationError: A value is not allowed. The message states the field, the value and the allowed range.
             ArmError: The arm cannot be loaded.
         """
         if fault := self.arm_fault():
@@ -146,13 +146,13 @@ def make_arm_station(
     meshcat: Meshcat | None = None,
     lcm: DrakeLcmInterface | None = None,
 ) -> ArmStation | HardwareArmStation:
-    """Returns the station of `config`. As with Drake's MakeHardwareStation, both kinds have the same ports.
+    """Creates a station. As with Drake's MakeHardwareStation, the simulated and the real arm have the same ports.
 
     Args:
         config: Configuration of the station; `simulator` is not used here.
-        hardware: True for the real arm instead of its simulation.
-        meshcat: Meshcat that draws the simulated arm.
-        lcm: LCM interface of the hardware, see `HardwareArmStation`.
+        hardware: True for the real arm, False for a simulated arm.
+        meshcat: Meshcat in which the simulated arm is drawn. None: the arm is not drawn.
+        lcm: LCM interface for the real arm; see `HardwareArmStation`.
 
     Raises:
         StationError, ArmError: The configuration is not allowed.

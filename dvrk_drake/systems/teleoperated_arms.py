@@ -1,4 +1,4 @@
-"""Simulated teleoperation: a hand moves a master arm in gravity compensation, which leads a PSM."""
+"""Simulated teleoperation: a hand moves a master arm in gravity compensation, and a PSM follows it."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ class TeleoperatedArms(Diagram):
 
     `mtml` and `psm` stand for the arms' lower-case names.
 
-    - `X_MG_desired` (RigidTransform): desired pose of the master's handle in the master's base, set by the hand.
-      Unconnected: no force acts on the master.
-    - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: those of `Teleoperation`.
-    - `state_estimated`: those of the two stations.
+    - `X_MG_desired` (RigidTransform): desired pose of the master's handle in the master's base, towards which the hand
+      pulls. Unconnected: the hand exerts no force.
+    - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: ports of `Teleoperation`.
+    - `state_estimated`: ports of the two stations.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -66,7 +66,8 @@ class TeleoperatedArms(Diagram):
         Args:
             master: MTM.
             follower: PSM.
-            scale, R_FM: See `Teleoperation`.
+            scale: Ratio of the displacements; see `Teleoperation`.
+            R_FM: Rotation from the master's base to the follower's base; see `Teleoperation`.
             meshcat: Meshcat in which both arms are drawn, below paths of their lower-case names. `SetTransform` places
                 them.
         """
@@ -78,10 +79,10 @@ class TeleoperatedArms(Diagram):
         self.teleoperation = builder.AddNamedSystem(
             "teleoperation", Teleoperation(master, follower, scale=scale, R_FM=R_FM)
         )
-        carry = builder.AddNamedSystem(
+        master_controller = builder.AddNamedSystem(
             "master_controller", GravityPidController(IdentifiedModel.from_arm(master), mode="gravity")
         )
-        regulate = builder.AddNamedSystem(
+        follower_controller = builder.AddNamedSystem(
             "follower_controller", GravityPidController(IdentifiedModel.from_arm(follower))
         )
         hand = builder.AddNamedSystem("hand", Hand(master, MASTER_FRAME))
@@ -92,17 +93,17 @@ class TeleoperatedArms(Diagram):
             self.follower.GetOutputPort(f"{F}.state_estimated"),
         )
         connect = builder.Connect
-        connect(state_M, carry.GetInputPort("state_estimated"))
+        connect(state_M, master_controller.GetInputPort("state_estimated"))
         connect(state_M, hand.GetInputPort("state_estimated"))
-        connect(carry.GetOutputPort("effort"), self.master.GetInputPort(f"{M}.effort_commanded"))
+        connect(master_controller.GetOutputPort("effort"), self.master.GetInputPort(f"{M}.effort_commanded"))
         connect(hand.GetOutputPort("effort_disturbance"), self.master.GetInputPort(f"{M}.effort_disturbance"))
         connect(self.master.GetOutputPort(f"{M}.position_measured"), self.teleoperation.GetInputPort("master_position"))
         connect(
             self.follower.GetOutputPort(f"{F}.position_measured"), self.teleoperation.GetInputPort("follower_position")
         )
-        connect(self.teleoperation.GetOutputPort("desired_state"), regulate.GetInputPort("desired_state"))
-        connect(state_F, regulate.GetInputPort("state_estimated"))
-        connect(regulate.GetOutputPort("effort"), self.follower.GetInputPort(f"{F}.effort_commanded"))
+        connect(self.teleoperation.GetOutputPort("desired_state"), follower_controller.GetInputPort("desired_state"))
+        connect(state_F, follower_controller.GetInputPort("state_estimated"))
+        connect(follower_controller.GetOutputPort("effort"), self.follower.GetInputPort(f"{F}.effort_commanded"))
 
         builder.ExportInput(hand.GetInputPort("X_BG_desired"), "X_MG_desired")
         for name in ("engaged", "jaw_angle"):
@@ -123,11 +124,11 @@ class TeleoperatedArms(Diagram):
             station.SetPositions(self.GetMutableSubsystemContext(station, context), q)
 
     def CalcX_MG(self, context: Context) -> RigidTransform:
-        """Returns the pose of the master's handle in its base."""
+        """Returns the pose of the master's handle in the master's base."""
         return self._pose(self.master, MASTER_FRAME, context)
 
     def CalcX_FT(self, context: Context) -> RigidTransform:
-        """Returns the pose of the follower's tip in its base."""
+        """Returns the pose of the follower's tip in the follower's base."""
         return self._pose(self.follower, FOLLOWER_FRAME, context)
 
     def _pose(self, station: ArmStation, frame_name: str, context: Context) -> RigidTransform:

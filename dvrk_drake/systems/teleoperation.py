@@ -13,11 +13,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.plant import make_arm_plant
 
-#: Leading and following frames: the dVRK's measured_cp of both arms, at the wrist centre and at the wrist yaw axis.
+#: Frames of the master and of the follower. They are the frames of the dVRK's measured_cp, at the wrist centre of the
+#: MTM and at the wrist yaw axis of the PSM.
 MASTER_FRAME, FOLLOWER_FRAME = "dh_7", "dh_6"
-#: Least depth of the follower's wrist centre beyond its remote centre of motion [m]. Yaw and pitch are singular there.
+#: Least distance [m] of the follower's wrist centre from the remote centre of motion, where yaw and pitch are singular.
 MIN_DEPTH = 0.02
-#: Largest lag [s]. A follower behind its command by more than its fastest joint motion in this time does not follow.
+#: Largest lag of the follower [s]. The allowed position error of a joint is its velocity limit times this lag.
 MAX_LAG = 0.1
 
 
@@ -41,38 +42,39 @@ class Teleoperation(LeafSystem):
 
     - `master_position` (n of the master), `follower_position` (n of the follower): measured joint positions.
     - `engaged` (1): clutch state. Above 0.5 the follower follows. Pressing the dVRK's clutch pedal disengages.
-    - `jaw_angle` (1): desired opening of the jaw, e.g. the master's gripper angle. Unconnected: the jaw is held.
+    - `jaw_angle` (1): desired opening of the jaw, e.g. the master's gripper angle. Unconnected: the jaw does not move.
     - `desired_state` (2n of the follower): commanded joint positions, then their rates, for `GravityPidController`.
     - `following` (1): 1 while the follower follows the master, else 0.
-    - `fault` (1): 1 while an input is unusable or the follower is not at its commanded position, else 0.
+    - `fault` (1): 1 while an input is not valid or the follower is not at its commanded position, else 0.
 
-    **Control law.** X_MG is the pose of the master's handle in its base, X_FT that of the follower's tip in its base.
-    Both are stored when the clutch engages (index 0). R_FM is the rotation between the bases as seen by the operator:
+    **Control law.** X_MG is the pose of the handle in the master's base. X_FT is the pose of the tip in the follower's
+    base. Both are stored when the clutch engages (index 0). R_FM is the rotation from the master's to the follower's
+    base, as seen by the operator:
 
         p_FT = p_FT0 + scale R_FM (p_MG - p_MG0),    R_FT = R_FM R_MG R_MG0' R_FM' R_FT0
 
-    Engaging therefore never moves the follower, and the difference of the two orientations is kept. (The dVRK aligns
-    the master's wrist instead. A master in gravity compensation has no controller for this.)
+    Engaging the clutch therefore does not move the follower, and the difference of the two orientations stays constant.
+    (The dVRK aligns the master's wrist instead. A master in gravity compensation has no controller for this.)
 
     **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits. Each joint then moves
     towards them within its velocity limit. A pose without a solution, such as at and above the remote centre of motion,
-    moves only the jaw. The relation of the poses is kept beyond a limit. The tip continues where the master returns
-    inside the limit.
+    moves only the jaw. When the handle moves beyond a limit and returns, the tip stops at the limit and then moves
+    again with the same relation to the handle.
 
     **Hold.** `desired_state` is constant with zero rates in any of these cases:
 
     - The clutch is open.
-    - `master_position` or `jaw_angle` is not finite or beyond 1e6.
-    - The follower is farther from the command than its velocity limits allow in `MAX_LAG`. The jaw is excepted, because
-      it may press on an object.
-    - The instrument is inside its cannula, less than `MIN_DEPTH` beyond the remote centre.
+    - `master_position` or `jaw_angle` is not finite or above 1e6.
+    - The follower is farther from the command than its velocity limits allow in `MAX_LAG`. The jaw is not checked,
+      because it may press on an object.
+    - The instrument is inside the cannula, i.e. less than `MIN_DEPTH` beyond the remote centre.
 
-    Afterwards the clutch engages again. With an open clutch, the command is set to the measured position of a follower
-    that was moved externally. Before the first finite follower_position, `desired_state` is NaN, which the controller
-    rejects.
+    Afterwards, the clutch engages again. If the follower was moved externally while the clutch was open, the command is
+    set to the measured position. Before the first finite follower_position, `desired_state` is NaN, which the
+    controller rejects.
 
-    Ports carry no age, so a receiver of delayed messages must open the clutch. Inputs are sampled and outputs change
-    every `period` seconds and at initialization, which resets the state.
+    The ports do not contain the age of a value, so a receiver of delayed messages must open the clutch. Inputs are
+    sampled and outputs change every `period` seconds and at initialization, which resets the state.
     """
 
     def __init__(
@@ -87,15 +89,15 @@ class Teleoperation(LeafSystem):
         """Creates the system for a `master` with the frame "dh_7" and a `follower` with the kinematics of a PSM.
 
         Args:
-            master: Arm that leads.
+            master: Arm that the operator moves.
             follower: Arm that follows.
             scale: Ratio of the displacements of tip and handle, above 0 and at most 1; see `SetScale`.
-            R_FM: Rotation from the master's base to the follower's. By default the identity, for parallel bases.
+            R_FM: Rotation from the master's base to the follower's base. None: identity, for parallel bases.
             period: Period of the update [s].
 
         Raises:
-            ArmError: An arm of another kind.
-            ControllerError: Scale or period out of range, or a follower without velocity limits.
+            ArmError: An arm is of another kind.
+            ControllerError: Scale or period is out of range, or the follower has no velocity limits.
         """
         super().__init__()
         if not (np.isfinite(period) and period > 0):
@@ -152,10 +154,10 @@ class Teleoperation(LeafSystem):
         is_engaged = engaged[0] > 0.5
 
         lags = not np.all(np.abs(q_follower - q_d) <= self._max_lag)  # also true of NaN
-        if lags and _usable(q_follower) and (not is_engaged or np.isnan(q_d[0])):
+        if lags and _is_valid(q_follower) and (not is_engaged or np.isnan(q_d[0])):
             q_d[:] = q_follower
             lags = False
-        fault = lags or not (_usable(q_master) and _usable(jaw) and _usable(engaged))
+        fault = lags or not (_is_valid(q_master) and _is_valid(jaw) and _is_valid(engaged))
         inserted = q_d[2] + self._inverse.depth_at_zero >= MIN_DEPTH - 1e-6
         follows = is_engaged and not fault and inserted
         v_d[:] = 0.0
@@ -167,12 +169,12 @@ class Teleoperation(LeafSystem):
         state.get_mutable_value(_FAULT)[0] = float(fault)
 
     def _target(self, q_master: NDArray[np.float64], q_d: NDArray[np.float64], state: DiscreteValues) -> RigidTransform:
-        """Returns the desired X_FT. If the follower did not follow before, stores the poses and returns its own one."""
+        """Returns the desired X_FT. When following begins, stores the present poses, so X_FT is the present pose."""
         X_MG = self._master.pose(q_master)
-        memory = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
+        poses = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
         if state.get_value(_FOLLOWING)[0] == 0.0:
-            memory[0], memory[1] = X_MG.GetAsMatrix34(), self._follower.pose(q_d).GetAsMatrix34()
-        R_MG0, p_MG0, R_FT0, p_FT0 = memory[0, :, :3], memory[0, :, 3], memory[1, :, :3], memory[1, :, 3]
+            poses[0], poses[1] = X_MG.GetAsMatrix34(), self._follower.pose(q_d).GetAsMatrix34()
+        R_MG0, p_MG0, R_FT0, p_FT0 = poses[0, :, :3], poses[0, :, 3], poses[1, :, :3], poses[1, :, 3]
         R_FM, scale = self._R_FM.matrix(), state.get_value(_SCALE)[0]
         R_FT = R_FM @ X_MG.rotation().matrix() @ R_MG0.T @ R_FM.T @ R_FT0
         return RigidTransform(
@@ -180,11 +182,11 @@ class Teleoperation(LeafSystem):
         )
 
     def _rates(self, X_FT: RigidTransform, jaw: NDArray[np.float64], q_d: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns joint rates (n,) for one period, towards the pose and jaw angle and inside all limits."""
+        """Returns the joint rates (n,) for one period towards the pose and jaw angle, inside all limits."""
         solution = self._inverse.solve(X_FT, q_d)
-        wanted = np.concatenate([q_d[:6] if solution is None else solution, jaw])
-        way = np.clip(wanted, self._lower, self._upper) - q_d
-        return np.clip(way / self._period, -self._speed, self._speed)
+        target = np.concatenate([q_d[:6] if solution is None else solution, jaw])
+        change = np.clip(target, self._lower, self._upper) - q_d
+        return np.clip(change / self._period, -self._speed, self._speed)
 
     def _read(self, context: Context, port: int) -> NDArray[np.float64]:
         vector = self.EvalVectorInput(context, port)
@@ -197,7 +199,7 @@ _JAW = 3  # index of the input port
 _DESIRED, _FOLLOWING, _FAULT, _SCALE, _POSES = range(5)  # indices of the discrete state groups
 
 
-def _usable(values: NDArray[np.float64]) -> bool:
+def _is_valid(values: NDArray[np.float64]) -> bool:
     return bool(np.all(np.abs(values) < IMPLAUSIBLE))  # false for NaN
 
 
@@ -206,5 +208,7 @@ def _velocity_limits(arm: Arm) -> NDArray[np.float64]:
     plant = make_arm_plant(arm)
     limits = np.array([plant.GetJointByName(name).velocity_upper_limits()[0] for name in arm.joint_names])
     if not np.all(np.isfinite(limits)):
-        raise ControllerError(f"{arm.name}: a joint of its SDF has no <velocity> limit, so it cannot follow a master")
+        raise ControllerError(
+            f"{arm.name}: a joint has no velocity limit (<velocity> in the SDF). A follower needs one"
+        )
     return limits

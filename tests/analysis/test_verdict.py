@@ -176,9 +176,9 @@ def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys
     for required in ("usable", "good"):
         command = ["validate", bad, "--model", model, "--require", required]
         assert main([*command, "--json", str(report), "--overwrite"]) == 2
-        said = capsys.readouterr()
-        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in refusal(said.err)
-        assert said.out.startswith("Verdict: do not use (shoulder_pitch). ")
+        output = capsys.readouterr()
+        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in refusal(output.err)
+        assert output.out.startswith("Verdict: do not use (shoulder_pitch). ")
         found = json.loads(report.read_text())
         assert found["verdict"] == "do not use" and found["rule"] == rule_text(in_motion=False)
         assert [j["verdict"] for j in found["joints"]] == ["off", "do not use", "good", "good", "good", "good", "off"]
@@ -206,27 +206,27 @@ def test_identification_recording_gives_no_saved_verdicts(files, tmp_path, capsy
     assert main(["validate", good, "--model", model]) == 0
     assert "the model was identified from this recording" in capsys.readouterr().err
     assert main(["validate", good, "--model", model, "--save"]) == 2
-    assert "--save needs a recording that the model was not identified from" in capsys.readouterr().err
+    assert "the model was identified from this recording; --save requires another one" in capsys.readouterr().err
     assert (tmp_path / "model.yaml").read_bytes() == before
 
 
 def test_run_warns_of_saved_verdicts(files, capsys):
     model, good, bad = files
     loaded = IdentifiedModel.load(model)
-    assert "no other recording has validated this model; cross-validated: " in model_warning(model, loaded)
+    assert "not validated on another recording; verdict by cross-validation: " in model_warning(model, loaded)
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     saved = IdentifiedModel.load(model)
     assert dataclasses.replace(saved, validation=None) == loaded
     warning = model_warning(model, saved)
-    assert f"did not pass validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
+    assert f"failed validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
     assert main(["validate", good, "--model", model, "--save"]) == 2
-    assert f"has verdicts from {bad} already" in capsys.readouterr().err
+    assert f"contains verdicts from {bad}" in capsys.readouterr().err
     assert main(["validate", good, "--model", model, "--save", "--overwrite"]) == 0
     assert model_warning(model, IdentifiedModel.load(model)) == ""
 
 
 def test_saved_verdicts_include_all_joints(truth, tmp_path):
-    with pytest.raises(ModelError, match=r"validation\.verdicts must name these joints: outer_yaw"):
+    with pytest.raises(ModelError, match=r"verdicts has entries for outer_yaw; it needs one entry for each joint"):
         dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", {"outer_yaw": "good"})).check()
     verdicts = {joint.name: "good" for joint in truth.joints} | {"wrist_roll": "splendid"}
     with pytest.raises(ModelError, match=r'verdicts\.wrist_roll is "splendid"; allowed: off, good, usable'):

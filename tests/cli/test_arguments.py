@@ -1,4 +1,4 @@
-"""The arguments of the commands: help, refusals, renamed options, completion of a shell."""
+"""Tests of the command-line arguments: help, errors, renamed options, shell completion."""
 
 import subprocess
 import sys
@@ -33,7 +33,7 @@ REQUIRED = {
 
 
 def refused(capsys, *arguments):
-    """The one line on stderr of a command that is refused."""
+    """Runs a command that must fail without output, and returns its error line."""
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert not captured.out
@@ -53,32 +53,35 @@ def refused(capsys, *arguments):
         (["identify", "a.csv", "--arm", "psm"], "--output is required; see dvrk-drake identify --help"),
         (["identify", "a.csv", "b.csv", "--arm", "psm", "--output", "m.yaml"], "Unexpected argument: b.csv; see"),
         (["tune", "--arm", "psm", "--method", "guess"], 'Invalid value "guess" for --method. Choose from: "paper"'),
-        (["demo", "--seed", "-1"], 'Invalid value "-1" for --seed: must be a whole number from 0; see'),
+        (["demo", "--seed", "-1"], 'Invalid value "-1" for --seed: must be a whole number, 0 or larger; see'),
         (["demo", "--seed", "1.5"], 'Invalid value for --seed: must be a whole number, not "1.5"; see'),
         (["view", "--arm", "psm", "--port", "web"], '--port: must be a whole number, not "web"; see'),
         (["study", "s.yaml", "--output", "r.csv", "--workers", "0"], "--workers: must be a number of processes"),
-        (["record", "--arm", "psm", "--output", "r.csv", "--duration", "nan"], "must be a number of seconds above 0"),
-        (["export", "--sdf", "out.sdf"], "give one of --model, --arm; see dvrk-drake export --help"),
-        (["export", "--arm", "psm", "--model", "m.yaml", "--sdf", "o"], "give one of --model, --arm; see"),
-        (["collect", "--arm", "psm", "--poses", "p.yaml"], "give one of --output, --teach, --random; see"),
+        (
+            ["record", "--arm", "psm", "--output", "r.csv", "--duration", "nan"],
+            "must be a number of seconds greater than 0",
+        ),
+        (["export", "--sdf", "out.sdf"], "give exactly one of --model, --arm; see dvrk-drake export --help"),
+        (["export", "--arm", "psm", "--model", "m.yaml", "--sdf", "o"], "give exactly one of --model, --arm; see"),
+        (["collect", "--arm", "psm", "--poses", "p.yaml"], "give exactly one of --output, --teach, --random; see"),
         (["study", "s.yaml", "--output", "r.csv", "--workers", "1", "--scheduler", "x"], "give at most one of"),
-        (["simulate", "psm"], "psm is an arm, not a scenario; name it with --arm psm"),
-        (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; name it with --arm psm"),
+        (["simulate", "psm"], "psm is an arm, not a scenario; use --arm psm"),
+        (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; use --arm psm"),
         (["model", "--arm", "mtmrr"], 'unknown arm "mtmrr"; did you mean "mtmr"'),
         (["model", "--arm", "mtmx"], 'unknown arm "mtmx"; known arms'),
     ],
 )
-def test_bad_arguments_are_refused_in_one_line(arguments, message, capsys):
+def test_invalid_arguments_give_one_line(arguments, message, capsys):
     assert message in refused(capsys, *arguments)
 
 
-def test_too_few_numbers_are_refused(capsys):
+def test_rejects_too_few_numbers(capsys):
     assert "--gravity needs 3 values, got 2" in refused(capsys, "model", "--arm", "psm", "--gravity", "1", "2")
 
 
 @pytest.mark.parametrize(("command", "old"), [(command, old) for command in RENAMED for old in RENAMED[command]])
-def test_an_old_option_names_the_new_one(command, old, capsys):
-    """With "", the old argument had a place instead of a name."""
+def test_error_for_a_renamed_option_has_the_new_name(command, old, capsys):
+    """The key "" stands for a positional argument that became an option."""
     new = RENAMED[command][old]
     options = {name for argument in app[command].assemble_argument_collection() for name in argument.names}
     assert new.split()[0] in options and old not in options
@@ -103,7 +106,7 @@ sys.exit(f"imported: {slow}" if slow else code)
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
-def test_help_imports_nothing_slow_and_fits_80_columns(command, monkeypatch):
+def test_help_imports_no_slow_modules_and_fits_80_columns(command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     arguments = [sys.executable, "-c", IMPORTS, *command.split(), "--help"]
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
@@ -123,8 +126,8 @@ def test_commands_are_in_groups(capsys):
     assert capsys.readouterr().out == printed
 
 
-def test_one_thing_has_one_name():
-    """The options that the commands share; each other one is of its command."""
+def test_shared_options_have_one_name():
+    """Options with the same meaning have the same name in all commands."""
     names = {
         command: {name for argument in app[command].assemble_argument_collection() for name in argument.names}
         for command in COMMANDS
@@ -148,5 +151,5 @@ def test_completion_is_installed(shell, tmp_path, monkeypatch, capsys):
     capsys.readouterr()
 
 
-def test_a_folder_as_the_table_of_transparency_names_plots(capsys):
+def test_transparency_rejects_a_folder_as_output(capsys):
     assert "figures are written to --plots" in refused(capsys, "transparency", "--arm", "mtml", "--output", "folder")

@@ -1,4 +1,4 @@
-"""Output of the commands, and one line with exit code 2 for bad input."""
+"""Tests of the command output, and of exit code 2 with one error line for invalid input."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from dvrk_drake.recordings.recording import Recording, read_recording, write_rec
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A recording of exact poses with a little noise, and the model that identify made of it."""
+    """Returns a folder with two recordings of static poses and the model identified from the first."""
     folder = tmp_path_factory.mktemp("cli")
     arm = load_arm("mtmr")
     generator = np.random.default_rng(0)
@@ -37,7 +37,7 @@ def folder(tmp_path_factory):
 
 
 def fails(capsys, *arguments):
-    """The one line on stderr of a command that must be refused."""
+    """Runs a command that must fail, and returns its error line."""
     assert main([str(a) for a in arguments]) == 2
     return refusal(capsys.readouterr().err)
 
@@ -52,7 +52,7 @@ def test_identify_writes_a_model_and_plots(folder):
     assert {p.name for p in (folder / "plots").iterdir()} == {"torque_error.png", "predicted.png"}
 
 
-def test_identify_prints_all_parameters_when_it_is_verbose(folder, tmp_path, monkeypatch, capsys):
+def test_verbose_identify_prints_all_parameters(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "160")  # names on one line
     model = tmp_path / "model.yaml"
     assert main(["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", str(model), "-v"]) == 0
@@ -83,7 +83,7 @@ def test_validate_writes_json(folder, capsys):
 
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-def test_predict_writes_rows_in_the_recordings_coordinates(folder, tmp_path, coordinates):
+def test_predict_uses_the_coordinates_of_the_recording(folder, tmp_path, coordinates):
     arm = load_arm("mtmr")
     q = read_recording(folder / "other.csv").q
     recorded = q if coordinates == "joint" else arm.transmission.position(q)
@@ -98,7 +98,7 @@ def test_predict_writes_rows_in_the_recordings_coordinates(folder, tmp_path, coo
     np.testing.assert_allclose(tau, expected, atol=1e-12)
 
 
-def test_exported_python_and_c_compute_the_plants_torque(tmp_path, capsys):
+def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
     arm = load_arm("mtml")
     model = compile_static_model(arm)
     q = np.random.default_rng(0).uniform(-2, 2, (5, 7))
@@ -133,7 +133,7 @@ def test_exported_python_and_c_compute_the_plants_torque(tmp_path, capsys):
         np.testing.assert_allclose(out, tau, atol=1e-12)
 
 
-def test_latex_names_every_parameter_and_torque(capsys):
+def test_latex_contains_all_parameters_and_torques(capsys):
     assert main(["model", "--arm", "mtml", "--format", "latex"]) == 0
     text = capsys.readouterr().out
     for i in range(1, 13):
@@ -147,7 +147,7 @@ def test_latex_names_every_parameter_and_torque(capsys):
     assert text.count(r"\left(") == text.count(r"\right)")
 
 
-def test_mounting_changes_the_base_set_and_is_named(capsys):
+def test_gravity_option_changes_the_base_parameters(capsys):
     assert main(["model", "--arm", "mtml", "--gravity", "0", "9.81", "0"]) == 0
     assert "m1 c1x" in capsys.readouterr().out
     for language in ("c", "python", "latex"):
@@ -156,7 +156,7 @@ def test_mounting_changes_the_base_set_and_is_named(capsys):
         assert "gravity (0, 9.81, 0) m/s^2" in first
 
 
-def test_an_input_is_never_replaced(folder, capsys):
+def test_input_files_are_never_replaced(folder, capsys):
     poses, model = folder / "poses.csv", folder / "model.yaml"
     before = poses.read_bytes(), model.read_bytes()
     assert "is an input" in fails(capsys, "identify", poses, "--arm", "mtmr", "--output", poses)
@@ -167,7 +167,7 @@ def test_an_input_is_never_replaced(folder, capsys):
     assert (poses.read_bytes(), model.read_bytes()) == before
 
 
-#: Commands that write a file, without its name; inputs need not exist, as the output is looked at first.
+#: Commands that write a file, without its path. The inputs need not exist, because the output is checked first.
 WRITE_A_FILE = [
     "identify none.csv --arm mtml --output",
     "validate none.csv --model none.yaml --json",
@@ -189,25 +189,25 @@ WRITE_A_FILE = [
     "key --output",
     "record --arm mtml --lcm-url memq:// --output",
 ]
-#: These never replace a file.
+#: Commands that never replace a file.
 KEEP_ALWAYS = ("key", "record")
 
 
 @pytest.mark.parametrize("command", WRITE_A_FILE)
-def test_an_existing_file_is_kept_without_overwrite(command, tmp_path, monkeypatch, capsys):
+def test_existing_file_is_kept_without_overwrite(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     mine = tmp_path / "mine.csv"
     mine.write_text("mine")
     error = fails(capsys, *command.split(), "mine.csv")
-    assert error.startswith("dvrk-drake: error: mine.csv: exists already")
+    assert error.startswith("dvrk-drake: error: mine.csv") and "exists" in error
     if not command.startswith(KEEP_ALWAYS):
-        assert error.endswith("name another file, or replace it with --overwrite")
+        assert error.endswith("choose another file, or replace it with --overwrite")
     if "none" in command:
         assert "none" in fails(capsys, *command.split(), "mine.csv", "--overwrite")
     assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
 
 
-#: Commands that write a folder, without its name.
+#: Commands that write a folder, without its path.
 WRITE_A_FOLDER = [
     "identify none.csv --arm mtml --output new.yaml --plots",
     "check none.csv --arm mtml --plots",
@@ -221,12 +221,12 @@ WRITE_A_FOLDER = [
 
 
 @pytest.mark.parametrize("command", WRITE_A_FOLDER)
-def test_a_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkeypatch, capsys):
+def test_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("mine")
     error = fails(capsys, *command.split(), "full")
-    assert error.endswith("full: holds files already; name another folder, or write into it with --overwrite")
+    assert error.endswith("full: folder is not empty; choose another folder, or write into it with --overwrite")
     if "none" in command:
         assert "none" in fails(capsys, *command.split(), "full", "--overwrite")
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine.txt"]
@@ -245,7 +245,7 @@ def test_a_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkey
         ("key --output o.key", ["o.key"]),
     ],
 )
-def test_commands_print_what_they_wrote(command, written, folder, tmp_path, monkeypatch, capsys):
+def test_commands_print_the_written_paths(command, written, folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(command.format(folder).split()) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wrote ")]
@@ -256,13 +256,13 @@ def test_commands_print_what_they_wrote(command, written, folder, tmp_path, monk
 def test_validate_keeps_a_folder_with_files(folder, capsys):
     validate = ["validate", f"{folder}/other.csv", "--model", f"{folder}/model.yaml", "--plots", f"{folder}/plots"]
     before = {path: path.read_bytes() for path in (folder / "plots").iterdir()}
-    assert "holds files already" in fails(capsys, *validate)
+    assert "folder is not empty" in fails(capsys, *validate)
     assert {path: path.read_bytes() for path in (folder / "plots").iterdir()} == before
     assert main([*validate, "--overwrite"]) == 0
     assert f"wrote {folder}/plots\n" in capsys.readouterr().out
 
 
-def test_an_existing_output_is_replaced_on_request(tmp_path, capsys):
+def test_overwrite_replaces_an_existing_output(tmp_path, capsys):
     out = tmp_path / "g.c"
     out.write_text("mine")
     assert main(["model", "--arm", "mtml", "--format", "c", "--output", str(out), "--overwrite"]) == 0
@@ -270,8 +270,8 @@ def test_an_existing_output_is_replaced_on_request(tmp_path, capsys):
     assert capsys.readouterr().out == f"wrote {out}\n"
 
 
-def test_all_commands_take_an_arm_file(folder, tmp_path, capsys):
-    """A calibrated coupled limit in a file; the model stores its path."""
+def test_commands_accept_an_arm_file(folder, tmp_path, capsys):
+    """The arm file has a calibrated coupled limit. The model stores the path of the arm file."""
     text = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("name: MTMR", "name: OURS")
     arm_file = tmp_path / "ours.yaml"
     arm_file.write_text(text + "coupled_limits:\n  parallelogram: [-0.22, 0.5]\n")
@@ -286,7 +286,7 @@ def test_all_commands_take_an_arm_file(folder, tmp_path, capsys):
     assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "model", "--arm", tmp_path / "other.yaml")
 
 
-def test_validate_warns_of_a_motion_and_writes_null(folder, tmp_path, capsys):
+def test_validate_warns_about_a_motion_and_writes_null(folder, tmp_path, capsys):
     recording = read_recording(folder / "other.csv")
     tau = recording.tau.copy()
     tau[:, 6] = 0.0
@@ -297,7 +297,7 @@ def test_validate_warns_of_a_motion_and_writes_null(folder, tmp_path, capsys):
     assert json.loads((tmp_path / "v.json").read_text())["joints"][6]["relative_error"] is None
 
 
-def test_interrupt_while_importing_is_one_line_and_130():
+def test_interrupt_during_import_gives_one_line_and_130():
     code = (
         "import os, signal, sys, dvrk_drake.cli as cli, importlib\n"
         "real = importlib.import_module\n"
@@ -326,7 +326,7 @@ sys.exit(main())
 
 
 @pytest.mark.parametrize("module", ["dvrk_drake.cli.program", "rich.progress", "pydrake", "matplotlib"])
-def test_interrupt_at_any_import_is_one_line(module):
+def test_interrupt_at_any_import_gives_one_line(module):
     words = ["check", "none.csv", "--arm", "mtml", "--plots", "never"]
     code = INTERRUPTED_IMPORT.format(words=[module, *words])
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -356,7 +356,7 @@ sys.exit(main())
 
 
 @pytest.mark.parametrize("command", ["arm", "run", "collect", "teach"])
-def test_an_interrupt_is_not_lost_where_numba_compiles(command, tmp_path):
+def test_interrupt_is_not_lost_during_numba_compilation(command, tmp_path):
     poses, out = str(tmp_path / "poses.yaml"), str(tmp_path / "out.csv")
     words = [command]
     if command in ("collect", "teach"):
@@ -368,29 +368,29 @@ def test_an_interrupt_is_not_lost_where_numba_compiles(command, tmp_path):
     assert process.returncode == 130
 
 
-def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
+def test_invalid_input_gives_one_line(folder, capsys, tmp_path):
     poses, model = folder / "poses.csv", folder / "model.yaml"
     out = tmp_path / "never.yaml"
     identify = ("identify", poses, "--arm", "mtmr", "--output")
     assert "its folder does not exist" in fails(capsys, *identify, tmp_path / "no" / "m.yaml")
     assert "no such file" in fails(capsys, "identify", tmp_path / "x.csv", "--arm", "mtmr", "--output", out)
     assert "no such file" in fails(capsys, "validate", poses, "--model", tmp_path / "x.yaml")
-    assert "is weightless: gravity must be 1 m/s^2 or more" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
+    assert "gravity is 0 m/s^2; it must be 1 m/s^2 or more" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
 
     text = poses.read_text().splitlines()
     bad = tmp_path / "bad.csv"
     for lines, message in (
-        ([text[0].replace("tau4", "torque4"), *text[1:]], f"{bad}:1: missing column tau4"),
-        ([text[0], text[1].replace(text[1].split(",")[9], "nan"), *text[2:]], f"{bad}:2: tau3 is nan"),
-        ([text[0], *text[1:3], text[3] + ",1"], f"{bad}:4: has 15 cells, the header names 14"),
-        ([], f"{bad}: is empty"),
-        (text[:4], f"{bad}: has 3 distinct poses, too few"),
+        ([text[0].replace("tau4", "torque4"), *text[1:]], f"{bad}, line 1: missing column tau4"),
+        ([text[0], text[1].replace(text[1].split(",")[9], "nan"), *text[2:]], f"{bad}, line 2: tau3 is nan"),
+        ([text[0], *text[1:3], text[3] + ",1"], f"{bad}, line 4: the row has 15 cells, the header has 14"),
+        ([], f"{bad} is empty"),
+        (text[:4], f"{bad}: 3 distinct poses found"),
     ):
         bad.write_text("\n".join(lines))
         assert message in fails(capsys, "identify", bad, "--arm", "mtmr", "--output", out)
     recording = read_recording(poses)
     write_recording(Recording(q=np.degrees(recording.q), tau=recording.tau), bad)
-    assert "are these degrees, or is it another arm?" in fails(
+    assert "Are the positions in degrees instead of rad" in fails(
         capsys, "identify", bad, "--arm", "mtmr", "--output", out
     )
     write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
@@ -413,26 +413,26 @@ def test_convert(tmp_path, capsys):
     np.testing.assert_array_equal(ours.tau, values[:, 14:])
 
 
-def test_two_outputs_of_one_name_are_refused(folder, tmp_path, monkeypatch, capsys):
+def test_rejects_the_same_path_for_two_outputs(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     export = ["export", "--model", f"{folder}/model.yaml", "--sdf", "o.sdf", "--urdf"]
     identify = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", "o", "--plots", "o"]
     for command in ([*export, "./o.sdf"], identify):
-        assert "is named for two outputs" in fails(capsys, *command)
+        assert "is given for two outputs" in fails(capsys, *command)
     assert not list(tmp_path.iterdir())
 
 
-def test_meshes_are_not_replaced_unasked(folder, tmp_path, capsys):
+def test_meshes_are_not_replaced_by_default(folder, tmp_path, capsys):
     (tmp_path / "o_meshes").mkdir()
     (tmp_path / "o_meshes/mine.txt").write_text("mine")
     export = ["export", "--model", f"{folder}/model.yaml", "--sdf", f"{tmp_path}/o.sdf"]
-    assert "o_meshes: holds files already" in fails(capsys, *export)
+    assert "o_meshes: the folder contains files already" in fails(capsys, *export)
     assert not (tmp_path / "o.sdf").exists()
     assert main([*export, "--overwrite"]) == 0
     assert (tmp_path / "o_meshes/mine.txt").read_text() == "mine"
 
 
-def test_a_closed_pipe_loses_no_model(folder, tmp_path):
+def test_model_is_saved_before_a_closed_pipe(folder, tmp_path):
     read, write = os.pipe()
     os.close(read)
     command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", f"{tmp_path}/m.yaml"]
@@ -444,7 +444,7 @@ def test_a_closed_pipe_loses_no_model(folder, tmp_path):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full here")
-def test_a_full_disk_is_one_line():
+def test_full_disk_gives_one_line():
     command = [sys.executable, "-m", "dvrk_drake.cli", "model", "--arm", "mtml"]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)

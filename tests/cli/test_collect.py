@@ -1,4 +1,4 @@
-"""The command collect, with an arm that sticks in place of the network."""
+"""Tests of the command collect with a simulated sticking arm instead of the network."""
 
 import os
 import sys
@@ -18,7 +18,7 @@ from dvrk_drake.recordings.recording import read_recording
 
 @pytest.fixture
 def simulated(monkeypatch):
-    """Options for what happens; `main` then controls a StickyArm."""
+    """Makes `main` control a StickyArm, and returns the settings of the simulation."""
     arm = load_arm("mtml")
     what = SimpleNamespace(stopped=lambda sticky: False, off_at=None, arms=[])
 
@@ -27,12 +27,12 @@ def simulated(monkeypatch):
         what.arms.append(StickyArm(arm, IdentifiedModel.from_arm(arm), np.zeros(7), near_poses()[0]))
         return controller, lambda: None, PERIOD
 
-    def control(link, controller, stopped, tell, lead):
+    def control(link, controller, stopped, report, on_status):
         sticky = what.arms[-1]
         while not stopped():
             status, time = sticky.status(), PERIOD * sticky.ticks
             sticky.off = sticky.ticks == what.off_at
-            sticky.step(controller.answer(status, time, lead(status, time)))
+            sticky.step(controller.answer(status, time, on_status(status, time)))
 
     monkeypatch.setattr("dvrk_drake.cli.collect.ready_controller", ready)
     monkeypatch.setattr("dvrk_drake.processes.control.control", control)
@@ -42,32 +42,32 @@ def simulated(monkeypatch):
     return what
 
 
-def test_the_command_stops_goes_on_and_says_so(simulated, tmp_path, capsys):
+def test_collect_stops_and_continues(simulated, tmp_path, capsys):
     poses, output = tmp_path / "p.yaml", tmp_path / "o.csv"
     save_poses(near_poses(2), load_arm("mtml"), poses)
     command = ["collect", "--arm", "mtml", "--poses", str(poses), "--output", str(output)]
     command += ["--traverse-time", "1", "--no-both-sides"]
     simulated.stopped = lambda sticky: sticky.ticks > 1000
     assert main(command) == 130
-    said = capsys.readouterr()
-    assert f"{output}: 0 of 2 poses" in said.out and said.err == "dvrk-drake: interrupted\n"
+    captured = capsys.readouterr()
+    assert f"{output}: 0 of 2 poses" in captured.out and captured.err == "dvrk-drake: interrupted\n"
 
     simulated.stopped, simulated.off_at = lambda sticky: output.exists() and sticky.ticks > 2900, 2900
     assert main(command) == 2
-    said = capsys.readouterr()
-    assert f"{output}: 1 of 2 poses" in said.out
-    assert said.err.startswith("dvrk-drake: error: MTML took over and holds") and said.err.count("\n") == 1
+    captured = capsys.readouterr()
+    assert f"{output}: 1 of 2 poses" in captured.out
+    assert captured.err.startswith("dvrk-drake: error: MTML took over and holds") and captured.err.count("\n") == 1
 
     simulated.stopped, simulated.off_at = lambda sticky: False, None
     assert main(command) == 0
-    assert "1 poses of MTML to visit" in capsys.readouterr().out
+    assert "1 poses of MTML remain" in capsys.readouterr().out
     assert main(command) == 0
-    assert f"{output}: has all 2 poses already" in capsys.readouterr().out
-    assert len(simulated.arms) == 3  # the arm was not asked again
+    assert f"{output}: contains all 2 poses already" in capsys.readouterr().out
+    assert len(simulated.arms) == 3  # the last command did not control the arm
     np.testing.assert_allclose(read_recording(output).q, near_poses(2), atol=2e-3)
 
 
-def test_the_command_teaches(simulated, tmp_path, monkeypatch, capsys):
+def test_collect_teaches_poses(simulated, tmp_path, monkeypatch, capsys):
     poses, arm = tmp_path / "p.yaml", load_arm("mtml")
     reading, writing = os.pipe()
     monkeypatch.setattr(sys, "stdin", os.fdopen(reading))
@@ -75,4 +75,4 @@ def test_the_command_teaches(simulated, tmp_path, monkeypatch, capsys):
     simulated.stopped = lambda sticky: sticky.ticks > 3000
     assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--teach", "--at-rest"]) == 0
     np.testing.assert_allclose(load_poses(poses, arm), near_poses(1), atol=0.01)
-    assert "pose 1 taken\n" in capsys.readouterr().out
+    assert "pose 1 recorded\n" in capsys.readouterr().out

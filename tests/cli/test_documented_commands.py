@@ -1,4 +1,4 @@
-"""The commands in the documentation can be typed: whole lines are accepted, and all options exist."""
+"""The commands in the documentation are valid: lines can be parsed, and all options exist."""
 
 import re
 import shlex
@@ -12,9 +12,9 @@ from dvrk_drake.cli.program import COMMANDS  # noqa: F401  (adds the commands)
 
 NAMES = [name for name in app if not name.startswith("-")]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("*.*")]
-#: A line of a code block, or of an example's comment.
+#: Pattern for a command in a line of a code block or of a comment in an example.
 LINE = re.compile(r"^[ #$]*(?:[A-Z_]+=\S+ )*dvrk-drake (?P<words>[a-z].*)$", re.MULTILINE)
-#: A command with an option in a sentence; it may be incomplete.
+#: Pattern for a command with an option in running text. The command may be incomplete.
 INLINE = re.compile(rf"`(?:dvrk-drake )?(?P<words>(?:{'|'.join(NAMES)}) [^`]*--[^`]*)`")
 
 
@@ -23,13 +23,13 @@ def options_of(command):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_documented_commands_can_be_typed(page):
+def test_documented_commands_are_valid(page):
     text = page.read_text()
     for found in LINE.finditer(text):
         words = shlex.split(found["words"], comments=True)
         words = words[: words.index("|")] if "|" in words else words
         if "..." in words or any(word.startswith("[") for word in words):
-            continue  # a pattern, whose options are checked below
+            continue  # the options of a pattern are checked below
         try:
             app.parse_args(words, print_error=False, exit_on_error=False)
         except CycloptsError as error:
@@ -40,14 +40,14 @@ def test_documented_commands_can_be_typed(page):
         assert not unknown, f"dvrk-drake {found['words']}"
 
 
-def test_printed_commands_have_these_options():
-    """In messages, docstrings and what commands print to be typed next."""
+def test_printed_commands_have_valid_options():
+    """Checks commands in messages, docstrings and suggested next steps."""
     for path in (ROOT / "dvrk_drake").rglob("*.py"):
         for found in re.finditer(rf"dvrk-drake ({'|'.join(NAMES)})\b([^\"`;,\n]*)", path.read_text()):
             unknown = set(re.findall(r"(?<!\S)(--[a-z][a-z-]*)", found[2])) - options_of(found[1])
             assert not unknown, f"{path.name}: {found[0]}"
 
 
-def test_the_documentation_has_every_command():
+def test_documentation_contains_all_commands():
     text = "".join(page.read_text() for page in PAGES)
     assert {found["words"].split()[0] for found in LINE.finditer(text)} >= set(NAMES) - {"demo"}

@@ -1,4 +1,4 @@
-"""Ctrl-C while a command works: one line, exit code 130, and no folder or file that was made for nothing."""
+"""Ctrl-C during a command gives one line and exit code 130, and leaves no empty files or folders."""
 
 import importlib
 
@@ -9,7 +9,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError
 
 STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1}]\n"
-#: Command with its options, and the function that does its work.
+#: Mapping from a command to its options and to the function that does the work.
 COMMANDS = {
     "simulate": (["--arm", "psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),
     "transparency": (
@@ -24,7 +24,7 @@ COMMANDS = {
 
 @pytest.fixture
 def interrupted(monkeypatch, tmp_path):
-    """Runs a command in an empty folder whose work ends with `error`; returns the exit code."""
+    """Returns a function that runs a command whose work raises `error`, and returns the exit code."""
     monkeypatch.chdir(tmp_path)
 
     def run(command, error, before=lambda: None):
@@ -43,7 +43,7 @@ def interrupted(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_nothing_is_left(command, interrupted, tmp_path, capsys):
+def test_interrupted_command_leaves_no_files(command, interrupted, tmp_path, capsys):
     assert interrupted(command, KeyboardInterrupt(), lambda: (tmp_path / "new/p").is_dir() or pytest.fail("made later"))
     assert messages(capsys.readouterr().err) == ["dvrk-drake: interrupted"]
     assert interrupted(command, KeyboardInterrupt()) == 130
@@ -52,7 +52,7 @@ def test_nothing_is_left(command, interrupted, tmp_path, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ["study.yaml"]
 
 
-def test_what_was_there_or_holds_a_result_stays(interrupted, tmp_path):
+def test_existing_folders_and_results_are_kept(interrupted, tmp_path):
     (tmp_path / "new").mkdir()
     assert interrupted("reproduce", KeyboardInterrupt()) == 130
     assert [p.name for p in tmp_path.iterdir() if p.is_dir()] == ["new"]

@@ -1,4 +1,4 @@
-"""Progress of a command's steps: a line per step off a terminal, bars on one."""
+"""Tests of the progress display: bars on a terminal, otherwise one line per step."""
 
 import io
 
@@ -10,7 +10,7 @@ from dvrk_drake.cli import support
 from dvrk_drake.cli.support import Steps
 
 
-def test_off_a_terminal_each_step_is_one_line(capsys):
+def test_each_step_is_one_line_without_a_terminal(capsys):
     with Steps("reading", "identifying", "validating") as steps:
         for share in (0.0, 0.5, 1.0):
             steps("reading", share)
@@ -37,7 +37,7 @@ def terminal(monkeypatch):
     return screen
 
 
-def test_on_a_terminal_each_step_has_a_bar_and_its_number(terminal, capsys):
+def test_each_step_has_a_numbered_bar_on_a_terminal(terminal, capsys):
     with Steps("reading", "identifying") as steps:
         steps("reading", 0.5)
         steps("identifying", 0.25)
@@ -49,7 +49,7 @@ def test_on_a_terminal_each_step_has_a_bar_and_its_number(terminal, capsys):
     assert not captured.err and not captured.out
 
 
-def test_finished_bars_give_way(terminal):
+def test_finished_bars_are_removed(terminal):
     names = [f"step{i}" for i in range(support.MAX_BARS + 3)]
     with Steps(*names) as steps:
         for name in names:

@@ -1,9 +1,9 @@
-"""Effects in the drive: one definition for a batch and for a step, and what each kind must do."""
+"""Tests the properties of the kinds of drive effects."""
 
 import numpy as np
 import pytest
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, slides
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, is_prismatic
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import load_arm
@@ -15,26 +15,26 @@ LOAD = np.abs(np.cos(X))
 
 
 @pytest.mark.parametrize("kind", EFFECT_KINDS)
-def test_a_step_in_time_gives_the_column(kind):
+def test_steps_equal_the_column(kind):
     effect = ActuatorEffect("actuator.pitch", kind, 0.05)
-    state, before, played = 0.0, X[0], []
+    state, previous, shapes = 0.0, X[0], []
     for x, v, load in zip(X, V, LOAD, strict=True):
-        state, shape = effect.step(state, x - before, x, v, load)
-        played.append(shape)
-        before = x
-    np.testing.assert_allclose(played, effect.column(X, V, LOAD), rtol=0, atol=1e-12)
+        state, shape = effect.step(state, x - previous, x, v, load)
+        shapes.append(shape)
+        previous = x
+    np.testing.assert_allclose(shapes, effect.column(X, V, LOAD), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", [kind for kind, what in EFFECT_KINDS.items() if what.dissipative])
-def test_friction_takes_energy_over_every_closed_path(kind):
+@pytest.mark.parametrize("kind", [name for name, kind in EFFECT_KINDS.items() if kind.dissipative])
+def test_friction_dissipates_energy(kind):
     column = ActuatorEffect("actuator.pitch", kind, 0.02).column(X, V, LOAD)
-    # What a spring would still hold at the end is little beside what friction took on the way.
+    # The energy stored at the end is small compared with the dissipated energy.
     work = np.sum(0.5 * (column[1:] + column[:-1]) * np.diff(X))
     assert work > 0
     assert np.max(np.abs(column)) <= (np.max(np.abs(V)) if kind == "viscous" else 1.0) + 1e-12
 
 
-def test_a_presliding_element_is_a_spring_until_it_slips():
+def test_presliding_element_is_a_spring_before_sliding():
     d = 0.1
     path = np.concatenate([np.linspace(0, 0.05, 50), np.linspace(0.05, 0.5, 50), np.linspace(0.5, 0.45, 50)])
     shape = ActuatorEffect("actuator.pitch", "presliding", d).column(path, 0 * path)
@@ -43,8 +43,8 @@ def test_a_presliding_element_is_a_spring_until_it_slips():
     np.testing.assert_allclose(shape[100:], 1 - (0.5 - path[100:]) / d, atol=1e-12)
 
 
-def test_friction_under_load_is_coulomb_times_the_gravity_torque():
-    """In the model and in the columns that identify it."""
+def test_load_friction_is_coulomb_friction_times_the_load():
+    """The load is the gravity effort of the actuator."""
     arm = load_arm("psm")
     regressor = DynamicRegressor(arm)
     q = arm.sample_poses(40, np.random.default_rng(0))
@@ -58,7 +58,7 @@ def test_friction_under_load_is_coulomb_times_the_gravity_torque():
     assert np.ptp(weight[:, 1]) > 0.1
 
 
-def test_effects_do_equal_work_on_actuators_and_coordinates():
+def test_coordinates_equal_joint_and_finger_positions():
     for name in ("mtmr", "psm"):
         arm = load_arm(name)
         rows = arm.effect_coordinates
@@ -73,4 +73,4 @@ def test_effects_do_equal_work_on_actuators_and_coordinates():
     rows = arm.effect_coordinates
     a = arm.transmission.position(q)
     assert rows["finger_1"] @ a == pytest.approx(q[5] - q[6] / 2)
-    assert slides(arm, "actuator.insertion") and not slides(arm, "finger_1")
+    assert is_prismatic(arm, "actuator.insertion") and not is_prismatic(arm, "finger_1")

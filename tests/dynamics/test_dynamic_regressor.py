@@ -1,4 +1,4 @@
-"""The dynamic regressor against the inverse dynamics of Drake's own plant, projected through the linkage."""
+"""Compares the dynamic regressor with Drake's inverse dynamics of the plant, projected through the linkage."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def random_motion(arm: Arm, count: int, seed: int = 0):
 
 
 def drake_torque(plant: MultibodyPlant, context: Context, arm: Arm, q, v, vd):
-    """G' (M vd + C v - tau_g) of the whole tree, sample by sample."""
+    """Returns G' (M vd + C v - tau_g) of the whole tree for each sample."""
     selector = tree_selector(plant, arm)
     tau = np.empty(q.shape)
     for i in range(len(q)):
@@ -41,10 +41,10 @@ def drake_torque(plant: MultibodyPlant, context: Context, arm: Arm, q, v, vd):
     return tau
 
 
-def assert_equal_torque(ours, drakes):
-    """To 1e-10 of each joint's own scale: 1e-10 N m where torques are N m, less on a wrist."""
-    scale = np.minimum(np.abs(drakes).max(axis=0), 1.0)
-    np.testing.assert_array_less(np.abs(ours - drakes).max(axis=0), 1e-10 * np.maximum(scale, 1e-6))
+def assert_equal_torque(actual, expected):
+    """Compares torques with a tolerance of 1e-10 relative to the largest torque of the joint, at most 1e-10 N m."""
+    scale = np.minimum(np.abs(expected).max(axis=0), 1.0)
+    np.testing.assert_array_less(np.abs(actual - expected).max(axis=0), 1e-10 * np.maximum(scale, 1e-6))
 
 
 @pytest.fixture(scope="module", params=["mtml", "mtmr", "psm"])
@@ -53,7 +53,7 @@ def arm(request):
 
 
 @pytest.mark.parametrize("gravity", MOUNTINGS)
-def test_equals_the_plants_inverse_dynamics(arm, gravity):
+def test_equals_the_inverse_dynamics_of_the_plant(arm, gravity):
     arm = arm.with_gravity(gravity)
     model = DynamicRegressor(arm)
     motion = random_motion(arm, 100)
@@ -65,14 +65,14 @@ def test_equals_the_plants_inverse_dynamics(arm, gravity):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_equals_the_plant_with_other_parameters(arm, seed):
-    """Every link and every rotor is given another inertia, in the plant and in the parameters."""
+    """All links and rotors have random inertias, in the plant and in the parameters."""
     model = DynamicRegressor(arm)
     generator = np.random.default_rng(seed)
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     parameters = []
     for link in model.links:
-        points = generator.normal(0, 0.2, (6, 3))  # a body of six point masses
+        points = generator.normal(0, 0.2, (6, 3))  # The link consists of six point masses.
         masses = generator.uniform(0.1, 1, 6)
         inertia = sum(m * ((p @ p) * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, points, strict=True))
         ten = [masses.sum(), *(masses @ points), *np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -82,7 +82,7 @@ def test_equals_the_plant_with_other_parameters(arm, seed):
     D_joint = np.zeros((arm.num_joints,) * 2)
     for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
         if actuator.default_rotor_inertia() == 0:
-            continue  # the MTM's motors 3 and 4 are links, not rotors of one joint
+            continue  # The SDF models the MTM's motors 3 and 4 as links.
         inertia = generator.uniform(1e-6, 1e-5)
         actuator.SetRotorInertia(context, inertia)
         joint = arm.joint_names.index(actuator.joint().name())
@@ -91,12 +91,12 @@ def test_equals_the_plant_with_other_parameters(arm, seed):
     D = J_inverse.T @ D_joint @ J_inverse
     rotors = [D[tuple(arm.joint_names.index(name) for name in rotor.actuators)] for rotor in model.rotors]
     motion = random_motion(arm, 50, seed)
-    ours = model.torque(*motion, np.concatenate([*parameters, rotors]))
-    assert_equal_torque(ours, drake_torque(plant, context, arm, *motion))
+    actual = model.torque(*motion, np.concatenate([*parameters, rotors]))
+    assert_equal_torque(actual, drake_torque(plant, context, arm, *motion))
 
 
 def test_rotors_act_in_actuator_coordinates(arm):
-    """tau_joint = J' diag(I_a) J vd, with the transmission's J."""
+    """The joint torque is J' diag(I_a) J vd, where J is the matrix of the transmission."""
     model = DynamicRegressor(arm)
     q, v, vd = random_motion(arm, 20)
     inertias = np.linspace(1e-4, 1e-3, arm.num_joints)
@@ -108,7 +108,7 @@ def test_rotors_act_in_actuator_coordinates(arm):
     np.testing.assert_allclose(model.torque(q, v, vd, parameters), vd @ J.T * inertias @ J, rtol=1e-12, atol=1e-12)
 
 
-def test_mass_matrix_is_the_plants(arm):
+def test_mass_matrix_equals_that_of_the_plant(arm):
     model = DynamicRegressor(arm)
     q, _, _ = random_motion(arm, 20)
     M = model.mass_matrix(q, model.values)
@@ -125,24 +125,24 @@ def test_mass_matrix_is_the_plants(arm):
 
 
 @pytest.mark.parametrize("count", [0, 1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 7])
-def test_many_samples_equal_single_ones(arm, count):
-    """The last block is full, has one sample or is missing."""
+def test_many_samples_equal_single_samples(arm, count):
+    """The last block is full, has one sample or does not exist."""
     model = DynamicRegressor(arm)
     motion = random_motion(arm, count)
     Y = model.regressor(*motion)
     assert Y.shape == (count, arm.num_joints, len(model.names))
-    ones = [model.regressor(*(x[i : i + 1] for x in motion)) for i in range(count)]
-    np.testing.assert_allclose(Y, np.reshape(ones, Y.shape), rtol=0, atol=1e-12 * np.abs(Y).max(initial=0.0))
+    single = [model.regressor(*(x[i : i + 1] for x in motion)) for i in range(count)]
+    np.testing.assert_allclose(Y, np.reshape(single, Y.shape), rtol=0, atol=1e-12 * np.abs(Y).max(initial=0.0))
 
 
-def test_torque_in_chunks_is_regressor_times_parameters(arm):
+def test_torque_equals_regressor_times_parameters(arm):
     model = DynamicRegressor(arm)
     motion = random_motion(arm, 1500)
     expected = model.regressor(*motion) @ model.values
     np.testing.assert_allclose(model.torque(*motion, model.values), expected, rtol=0, atol=1e-12)
 
 
-def test_writes_to_memory_that_is_given(arm):
+def test_writes_to_the_output_array(arm):
     model = DynamicRegressor(arm)
     motion = random_motion(arm, 700)
     out = np.full((700, arm.num_joints, len(model.names)), np.nan)
@@ -154,7 +154,7 @@ def test_writes_to_memory_that_is_given(arm):
         model.regressor(*motion, out=np.asfortranarray(out))
 
 
-def test_bad_input_is_refused(arm):
+def test_rejects_wrong_shapes(arm):
     model = DynamicRegressor(arm)
     q, v, vd = random_motion(arm, 3)
     with pytest.raises(ModelError, match="allowed"):

@@ -1,4 +1,4 @@
-"""The base parameters of gravity by numbers, against those of the symbolic potential energies of all links."""
+"""Compares numeric base parameters of gravity with base parameters from symbolic potential energies."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Joints of an arm built like a UR: name, parent's offset [m], axis. Three neighbouring ones are parallel.
+#: Name, offset from the parent joint [m] and axis of the joints of a UR-like arm. Three successive joints are parallel.
 UR_LIKE = [
     ("pan", (0, 0, 0.18), "0 0 1"),
     ("lift", (0, 0.17, 0), "0 1 0"),
@@ -55,8 +55,8 @@ def arm(request, ur_like):
     return arm.with_gravity([0.1, -0.5, -9.79]) if tilted else arm
 
 
-def test_base_parameters_are_those_of_the_symbolic_derivation(arm):
-    """All parameters are derived here, where `derive_gravity` writes out only those of the base."""
+def test_base_parameters_equal_the_symbolic_derivation(arm):
+    """The test uses all standard parameters. `derive_gravity` uses only the columns of the base set."""
     parameters, plant = gravity_parameters(arm), SymbolicPlant(arm)
     energies = [plant.potential_energy(p.label, p.axis) for p in parameters.standard_parameters]
     columns = [[plant.ring.to_sympy(plant.ring.derivative(e, q)) for e in energies] for q in plant.q]
@@ -65,7 +65,7 @@ def test_base_parameters_are_those_of_the_symbolic_derivation(arm):
     base = reduce_to_base(
         np.concatenate([np.array(regressor(*q), dtype=float) for q in poses]),
         parameters.standard_parameters,
-        numeric._readable_preference(parameters.standard_parameters),
+        numeric._preference_order(parameters.standard_parameters),
         numeric.named_lengths(shared_plant(arm), plant.bodies),
     )
     assert base.names == parameters.base.names
@@ -73,8 +73,8 @@ def test_base_parameters_are_those_of_the_symbolic_derivation(arm):
     np.testing.assert_allclose(base.combination, parameters.base.combination, rtol=0, atol=1e-9)
 
 
-def test_base_parameters_of_any_links_hold_them(arm):
-    """The same torque as the full dynamics at rest, for links that the SDF does not have; rotors stay balanced."""
+def test_combination_gives_the_gravity_torque_of_random_links(arm):
+    """Random links have the gravity torque of the full dynamics. The rotors remain balanced."""
     regressor, parameters = DynamicRegressor(arm), gravity_parameters(arm)
     links = [link.link for link in regressor.links]
     q = np.random.default_rng(5).uniform(-1, 1, (40, arm.num_joints))
@@ -86,7 +86,7 @@ def test_base_parameters_of_any_links_hold_them(arm):
     np.testing.assert_allclose(Y @ (phi - lift)[:, None], 0, atol=1e-9)
 
 
-def test_columns_are_combinations_of_independent_ones():
+def test_columns_are_combinations_of_independent_columns():
     generator = np.random.default_rng(7)
     Y = generator.normal(size=(60, 5)) @ generator.normal(size=(5, 11))
     Y[:, 3] = 0.0

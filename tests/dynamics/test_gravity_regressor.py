@@ -1,4 +1,4 @@
-"""The symbolic gravity torque against the paper's regressor, the dVRK's mapping and the numeric plant."""
+"""Compares the symbolic gravity torque with the paper, the dVRK's controller and the numeric plant."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 
-#: Section III.H of the paper, in its own order.
+#: Base parameters in the order of the paper, section III.H.
 PAPER_PARAMETERS = {
     "L2 (m2+...+m7) + m2 c2x",
     "m2 c2y",
@@ -49,19 +49,19 @@ def random_q():
 
 
 def evaluate(gravity, q):
-    """The symbolic regressor by sympy's own evaluation, independent of our code generator."""
+    """Evaluates the symbolic regressor with sympy, independently of `codegen`."""
     function = sympy.lambdify([*gravity.q, GRAVITY], gravity.regressor, modules="numpy")
     return np.array([np.array(function(*pose, 9.81), dtype=float) for pose in q])
 
 
-def test_serial_arm_has_the_papers_parameters_and_regressor(arm, random_q):
+def test_serial_arm_has_parameters_and_regressor_of_the_paper(arm, random_q):
     gravity = derive_gravity(arm, "paper", serial=True)
     assert set(gravity.base.names) == PAPER_PARAMETERS
-    ours = evaluate(gravity, random_q)
-    papers = np.array([9.81 * paper_regressor(q) for q in random_q])
-    # The same parameters, so the same columns, in another order.
+    actual = evaluate(gravity, random_q)
+    expected = np.array([9.81 * paper_regressor(q) for q in random_q])
+    # Equal parameters have equal columns, in a different order.
     for column in range(12):
-        distance = np.abs(ours - papers[:, :, [column]]).max(axis=(0, 1))
+        distance = np.abs(actual - expected[:, :, [column]]).max(axis=(0, 1))
         assert distance.min() < 1e-12, column
 
 
@@ -72,7 +72,7 @@ def test_linkage_changes_names_only(arm, random_q):
     assert len(whole.base.names) == 12
 
 
-def test_frames_are_a_change_of_base(arm, random_q):
+def test_other_frames_transform_the_base_parameters(arm, random_q):
     dvrk, paper = evaluate(derive_gravity(arm, "dh"), random_q), evaluate(derive_gravity(arm, "paper"), random_q)
     T = np.linalg.lstsq(dvrk.reshape(-1, 12), paper.reshape(-1, 12), rcond=None)[0]
     np.testing.assert_allclose(dvrk @ T, paper, atol=1e-12)
@@ -83,7 +83,7 @@ def test_frames_are_a_change_of_base(arm, random_q):
 
 
 def test_dvrk_controller_mapping(arm):
-    """Columns 0..9 of the dVRK's gravity-compensation regressor (facts/dvrk.md section 4, checked mapping)."""
+    """Tests columns 0 to 9 of the regressor of the dVRK's controller."""
     gravity = derive_gravity(arm)
     numbers = dict(zip(gravity.base.names, gravity.base_values, strict=True))
     q = np.random.default_rng(0).uniform(-1, 1, (20, 7))
@@ -111,7 +111,7 @@ def test_dvrk_controller_mapping(arm):
 
 
 @pytest.mark.parametrize("direction", [(0, 0, -9.81), (0, 9.81, 0), (3.0, -2.0, -9.0)])
-def test_regressor_times_parameters_is_the_plants_holding_torque(any_arm, random_q, direction):
+def test_torque_equals_the_holding_torque_of_the_plant(any_arm, random_q, direction):
     mounted = any_arm.with_gravity(direction)
     model = compile_static_model(mounted)
     plant = make_arm_plant(mounted)
@@ -139,8 +139,8 @@ def test_torque_is_the_gradient_of_the_potential(any_arm, random_q):
     constants = []
     for q in random_q:
         set_arm_positions(plant, context, arm, q)
-        ours = (np.array(potential(*q), float) @ gravity.base_values)[0]
-        constants.append(plant.CalcPotentialEnergy(context) - ours)
+        actual = (np.array(potential(*q), float) @ gravity.base_values)[0]
+        constants.append(plant.CalcPotentialEnergy(context) - actual)
     assert np.ptp(constants) < 1e-12
 
 
@@ -152,7 +152,7 @@ def test_torque_is_the_gradient_of_the_potential(any_arm, random_q):
         ("psm", "dh", "1 2 3 4 5 6 back_crank bottom_bar top_bar front_crank counterweight finger_1 finger_2"),
     ],
 )
-def test_symbolic_frames_are_the_plants(random_q, name, frames, labels):
+def test_symbolic_frames_equal_those_of_the_plant(random_q, name, frames, labels):
     arm = load_arm(name)
     symbolic = SymbolicPlant(arm, frames)
     poses = symbolic.frame_poses()
@@ -170,15 +170,15 @@ def test_symbolic_frames_are_the_plants(random_q, name, frames, labels):
             )
 
 
-def test_base_set_is_complete_when_masses_change(any_arm, random_q):
-    """The combination formulas hold for any masses, not only the SDF's: perturb every link and compare."""
+def test_torque_is_correct_for_random_masses(any_arm, random_q):
+    """The base parameters give the holding torque of the plant with random masses."""
     arm, gravity = any_arm, derive_gravity(any_arm)
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     generator = np.random.default_rng(8)
     values = gravity.standard_values.copy()
     labels = [p.label for p in gravity.standard_parameters if not p.axis]
-    # Part of the link that carries it, for gravity.
+    # For gravity, the rotor is part of the link that carries the motor.
     rotors = {"4": [plant.GetBodyByName("motor_4_link")]} if arm.name == "MTMR" else {}
     for label in labels:
         k = 4 * labels.index(label)
@@ -193,7 +193,7 @@ def test_base_set_is_complete_when_masses_change(any_arm, random_q):
         np.testing.assert_allclose(tau, holding_torque(plant, context, arm), atol=1e-12)
 
 
-def test_joint_effects_add_their_own_torque(arm):
+def test_joint_effects_add_their_torque(arm):
     effects = (ActuatorEffect("joint.wrist_platform", "cable sine", 1.0), ActuatorEffect("joint.outer_yaw", "offset"))
     plain, model = compile_static_model(arm), compile_static_model(arm, effects)
     q = np.random.default_rng(0).normal(size=(5, 7))
@@ -204,13 +204,13 @@ def test_joint_effects_add_their_own_torque(arm):
     np.testing.assert_allclose(extra, expected, atol=1e-12)
 
 
-def test_unknown_frames_are_refused(arm):
+def test_rejects_unknown_frames(arm):
     with pytest.raises(ArmError, match='no frames "craig_1"'):
         derive_gravity(arm, "craig")
 
 
-def test_derivation_is_as_quick_as_a_known_expansion():
-    """A ratio of processor times in one new process: it depends neither on the machine nor on other processes."""
+def test_derivation_is_faster_than_a_reference_expansion():
+    """Compares processor times in one new process, so that the ratio does not depend on the machine."""
     code = (
         "import time, sympy\n"
         "from dvrk_drake.models.arm import load_arm\n"
@@ -222,4 +222,4 @@ def test_derivation_is_as_quick_as_a_known_expansion():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     derivation, reference = map(float, output)
-    assert derivation < reference  # measured: about 0.2
+    assert derivation < reference  # The measured ratio is about 0.2.

@@ -1,4 +1,4 @@
-"""The bodies of a model with dynamics: what is written moves as the model says."""
+"""Tests that an exported SDF has the dynamics of the model."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from dvrk_drake.models.effects_schema import DriveEffect
 
 
 def dynamic_model(arm: Arm, rotors: dict[str, float]) -> IdentifiedModel:
-    """A model whose links are not the SDF's, with these rotors and no others."""
+    """Returns a model with links that differ from the SDF, and with only the given rotors."""
     generator = np.random.default_rng(5)
     model = IdentifiedModel.from_arm(arm)
     links = []
@@ -46,7 +46,7 @@ def parameters_of(model: IdentifiedModel, regressor: DynamicRegressor) -> np.nda
     return np.concatenate([phi, np.zeros(len(regressor.values) - len(phi))])
 
 
-def written(model: IdentifiedModel, path) -> DynamicRegressor:
+def load_exported(model: IdentifiedModel, path) -> DynamicRegressor:
     arm, bodies = model.arm, model_bodies(model)
     write_sdf(arm, bodies.links, path, "a test", bodies.rotors)
     return DynamicRegressor(dataclasses.replace(arm, sdf=(str(path),)))
@@ -59,20 +59,20 @@ def written(model: IdentifiedModel, path) -> DynamicRegressor:
         ("psm", {"yaw": 0.005, "roll": 1e-4}),
     ],
 )
-def test_the_written_arm_moves_as_the_model_says(name, rotors, tmp_path):
+def test_exported_sdf_has_the_dynamics_of_the_model(name, rotors, tmp_path):
     arm = load_arm(name)
     model = dynamic_model(arm, rotors)
-    ours, theirs = DynamicRegressor(arm), written(model, tmp_path / "arm.sdf")
+    original, exported = DynamicRegressor(arm), load_exported(model, tmp_path / "arm.sdf")
     generator = np.random.default_rng(6)
     q = arm.sample_poses(50, generator)
     motion = q, generator.normal(size=q.shape), 5 * generator.normal(size=q.shape)
-    expected = ours.torque(*motion, parameters_of(model, ours))
-    actual = theirs.torque(*motion, theirs.values)
+    expected = original.torque(*motion, parameters_of(model, original))
+    actual = exported.torque(*motion, exported.values)
     assert np.abs((actual - expected) / np.abs(expected).max(axis=0)).max() < 1e-12
 
 
 @pytest.mark.parametrize(("actuator", "link"), [("elbow_pitch", "crank_link"), ("wrist_platform", "motor_4_link")])
-def test_a_motor_of_several_joints_is_a_link_of_its_own(actuator, link, tmp_path):
+def test_motor_of_several_joints_is_part_of_a_link(actuator, link, tmp_path):
     arm = load_arm("mtml")
     row = arm.transmission.matrix[arm.joint_names.index(actuator)]
     assert np.count_nonzero(row) == 2
@@ -85,17 +85,20 @@ def test_a_motor_of_several_joints_is_a_link_of_its_own(actuator, link, tmp_path
     ]
     assert changed == [link]
     q = arm.sample_poses(20, np.random.default_rng(7))
-    M = [r.mass_matrix(q, r.values) for r in (written(model, tmp_path / "a.sdf"), written(without, tmp_path / "b.sdf"))]
+    M = [
+        r.mass_matrix(q, r.values)
+        for r in (load_exported(model, tmp_path / "a.sdf"), load_exported(without, tmp_path / "b.sdf"))
+    ]
     added = M[0] - M[1]
-    # The joints that turn it about its own axis: all that I J' J says of the last of them.
+    # Compare the elements of I J' J for the last joint that rotates the motor about its axis.
     j = int(np.flatnonzero(row)[-1])
     np.testing.assert_allclose(added[:, 1:4, j], inertia * np.tile(row[1:4] * row[j], (20, 1)), rtol=0, atol=1e-12)
     assert np.linalg.eigvalsh(M[0]).min() > 0
 
 
-def test_what_sdf_cannot_say_is_told(tmp_path, capsys):
+def test_terms_that_sdf_does_not_support_are_printed(tmp_path, capsys):
     model, path = tmp_path / "model.yaml", tmp_path / "arm.sdf"
     dynamic_model(load_arm("psm"), {"wrist_yaw": 1e-5}).save(model)
     assert main(["export", "--model", str(model), "--sdf", str(path), "--urdf", str(tmp_path / "arm.urdf")]) == 0
     out = capsys.readouterr().out
-    assert "couple joints" in out and "wrist_yaw" in out and "1 effects in the drive" in out
+    assert "couple joints" in out and "wrist_yaw" in out and "1 drive effects" in out

@@ -1,4 +1,4 @@
-"""Links from gravity base parameters alone: they have exactly these, they can exist, and no nearer ones do."""
+"""Tests that `nearest_links` returns physically consistent links with given base parameters of gravity."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
-from dvrk_drake.dynamics.model_links import MIN_SHARE, nearest_links
+from dvrk_drake.dynamics.model_links import MIN_EIGENVALUE_RATIO, nearest_links
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm
 
@@ -16,8 +16,8 @@ def other_base_values(arm, size):
     return values + size * np.random.default_rng(0).normal(size=len(values)) * np.abs(values).max()
 
 
-def relative(arm, links):
-    """Z of every link: 1 where it is the SDF's."""
+def relative_pseudo_inertias(arm, links):
+    """Returns Z (4, 4) of each link, which is the identity for a link of the SDF."""
     factors = [np.linalg.cholesky(link.pseudo_inertia()) for link in link_inertias(arm)]
     return [
         np.linalg.solve(L, np.linalg.solve(L, link.pseudo_inertia()).T) for L, link in zip(factors, links, strict=True)
@@ -25,7 +25,7 @@ def relative(arm, links):
 
 
 @pytest.mark.parametrize(("name", "size"), [("mtml", 0.01), ("mtml", 0.2), ("psm", 0.05)])
-def test_they_have_the_base_parameters_and_can_exist(name, size):
+def test_links_are_consistent_and_have_the_base_parameters(name, size):
     arm = load_arm(name)
     values = other_base_values(arm, size)
     links = nearest_links(arm, values)
@@ -35,10 +35,10 @@ def test_they_have_the_base_parameters_and_can_exist(name, size):
     tau = regressor.torque(q, np.zeros_like(q), np.zeros_like(q), parameters)
     expected = compile_static_model(arm).torque(q, values)
     np.testing.assert_allclose(tau, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
-    assert min(np.linalg.eigvalsh(Z).min() for Z in relative(arm, links)) > 0.99 * MIN_SHARE
+    assert min(np.linalg.eigvalsh(Z).min() for Z in relative_pseudo_inertias(arm, links)) > 0.99 * MIN_EIGENVALUE_RATIO
 
 
-def test_nothing_changes_where_nothing_is_asked():
+def test_base_parameters_of_the_sdf_give_the_links_of_the_sdf():
     for name in ("mtml", "psm"):
         arm = load_arm(name)
         links = nearest_links(arm, derive_gravity(arm).base_values)
@@ -46,19 +46,19 @@ def test_nothing_changes_where_nothing_is_asked():
             np.testing.assert_allclose(after.parameters, before.parameters, rtol=1e-10, atol=1e-13)
 
 
-def test_no_feasible_step_towards_the_sdf_remains():
-    """At a projection onto a convex set every other member of it lies at an obtuse angle from where one came."""
+def test_links_are_the_nearest_to_the_sdf():
+    """Tests the optimality condition of a projection onto a convex set, with random elements of the set."""
     arm = load_arm("mtml")
     values = other_base_values(arm, 0.2)
-    nearest = np.array(relative(arm, nearest_links(arm, values)))
-    active = min(np.linalg.eigvalsh(Z).min() for Z in nearest) < 1.5 * MIN_SHARE
-    assert active  # the cone's edge was met, so this was Clarabel's work
+    nearest = np.array(relative_pseudo_inertias(arm, nearest_links(arm, values)))
+    active = min(np.linalg.eigvalsh(Z).min() for Z in nearest) < 1.5 * MIN_EIGENVALUE_RATIO
+    assert active  # The constraint Z > MIN_EIGENVALUE_RATIO is active, so Clarabel computed the result.
     towards_sdf = np.eye(4) - nearest
     generator = np.random.default_rng(2)
     for _ in range(2):
-        # Members of the set: bodies of other base parameters, moved to these by the nearest change again.
+        # The average of links with base parameters symmetric about `values` is an element of the convex set.
         start = values + 0.3 * generator.normal(size=len(values)) * np.abs(values).max()
-        middle = np.array(relative(arm, nearest_links(arm, 2 * values - start)))
-        other = np.array(relative(arm, nearest_links(arm, start)))
-        member = (middle + other) / 2  # convex: feasible, and its base parameters are `values`
+        middle = np.array(relative_pseudo_inertias(arm, nearest_links(arm, 2 * values - start)))
+        other = np.array(relative_pseudo_inertias(arm, nearest_links(arm, start)))
+        member = (middle + other) / 2
         assert np.sum(towards_sdf * (member - nearest)) <= 1e-5 * np.linalg.norm(member - nearest)

@@ -1,4 +1,4 @@
-"""The convex program: parameters that a body can have, nearest to what the rows say."""
+"""Tests the convex program for physically consistent parameters."""
 
 import numpy as np
 import pytest
@@ -11,10 +11,10 @@ from dvrk_drake.dynamics.physical_consistency import (
     TOTAL_MASS_TOLERANCE,
     LinkScale,
     bounding_boxes,
+    box_margins,
     consistent_parameters,
     least_eigenvalue_bound,
     log_det_curvature,
-    room_in_box,
 )
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
@@ -50,7 +50,7 @@ def solve(links, boxes, R, b):
 
 
 def log_det_prior(x, links):
-    """LOG_DET_WEIGHT times the sum of trace(S0^-1 S) - log det(S0^-1 S)."""
+    """Returns LOG_DET_WEIGHT times the sum of trace(S0^-1 S) - log det(S0^-1 S) over the links."""
     total = 0.0
     for k, link in enumerate(links):
         floor = least_eigenvalue_bound(link) * np.eye(4)
@@ -60,19 +60,19 @@ def log_det_prior(x, links):
 
 
 def log_det_slope(own, link):
-    """(10,) derivative of a link's log-det prior by its parameters."""
+    """Returns the gradient (10,) of a link's log-det prior with respect to its parameters."""
     floor = least_eigenvalue_bound(link) * np.eye(4)
     S0_inverse, S_inverse = (np.linalg.inv(J - floor) for J in (link.pseudo_inertia(), pseudo_inertia(own)))
     return LOG_DET_WEIGHT * np.array([np.trace((S0_inverse - S_inverse) @ pseudo_inertia(e)) for e in np.eye(10)])
 
 
-def test_the_sdfs_links_are_not_touched(links, boxes, nominal, scale):
+def test_parameters_of_the_sdf_are_not_changed(links, boxes, nominal, scale):
     x = solve(links, boxes, np.diag(1 / scale), nominal / scale)
     assert np.max(np.abs(x - nominal) / scale) < 1e-4
 
 
-def test_what_cannot_exist_becomes_what_can_at_least_cost(links, boxes, nominal, scale):
-    """All conditions hold, and no way to another body that meets them goes down: the program is convex."""
+def test_inconsistent_parameters_become_consistent_at_least_cost(links, boxes, nominal, scale):
+    """The result satisfies all constraints, and the cost does not decrease towards other consistent parameters."""
     generator = np.random.default_rng(0)
     wanted = nominal + 3 * scale * generator.normal(size=len(nominal))
     x = solve(links, boxes, np.diag(1 / scale), wanted / scale)
@@ -81,7 +81,7 @@ def test_what_cannot_exist_becomes_what_can_at_least_cost(links, boxes, nominal,
         assert np.linalg.eigvalsh(pseudo_inertia(own))[0] >= least_eigenvalue_bound(link)
         low, high = (share * link.parameters[0] for share in MASS_RANGE)
         assert low * (1 - 1e-6) <= own[0] <= high * (1 + 1e-6)
-        assert np.min(room_in_box(own, boxes[link.link])) > -1e-5
+        assert np.min(box_margins(own, boxes[link.link])) > -1e-5
         com, box = own[1:4] / own[0], boxes[link.link]
         assert np.all(np.abs(com - box.center) <= box.half_width * (1 + 1e-5))
     assert abs(np.sum(x[::10]) / np.sum(nominal[::10]) - 1) <= TOTAL_MASS_TOLERANCE + 1e-6
@@ -93,8 +93,8 @@ def test_what_cannot_exist_becomes_what_can_at_least_cost(links, boxes, nominal,
         assert cost(x + 1e-3 * (other - x)) >= cost(x) - 1e-4
 
 
-def test_links_of_which_the_rows_say_nothing_stay_the_sdfs(links, boxes, nominal, scale):
-    """The Gaussian prior is weak here, so the log-det one holds them, and both have their least cost at the SDF's."""
+def test_links_without_data_keep_the_parameters_of_the_sdf(links, boxes, nominal, scale):
+    """The Gaussian prior is weak, so the log-det prior determines these links. Both have their minimum at the SDF."""
     weak = 1e-2 / scale
     row = np.zeros(len(nominal))
     row[:10] = 1 / scale[:10]
@@ -106,24 +106,24 @@ def test_links_of_which_the_rows_say_nothing_stay_the_sdfs(links, boxes, nominal
     assert np.max(np.abs(x - nominal)[10:] / scale[10:]) < 1e-3
 
 
-def test_where_the_rows_say_nothing_the_priors_decide(links, boxes, nominal, scale):
-    """Directions without data are determined by the priors alone: their gradient has no part in the null space."""
+def test_priors_determine_directions_without_data(links, boxes, nominal, scale):
+    """The gradient of the priors vanishes in directions that the data do not determine."""
     generator = np.random.default_rng(3)
-    seen = generator.normal(size=(12, len(nominal))) / scale
-    target = seen @ nominal + 2 * generator.normal(size=12)
-    stacked = np.vstack([np.diag(1 / scale), 30 * seen])
+    rows = generator.normal(size=(12, len(nominal))) / scale
+    target = rows @ nominal + 2 * generator.normal(size=12)
+    stacked = np.vstack([np.diag(1 / scale), 30 * rows])
     R = np.linalg.qr(stacked, mode="r")
     x = solve(links, boxes, R, np.linalg.solve(R.T, stacked.T @ np.append(nominal / scale, 30 * target)))
-    np.testing.assert_allclose(seen @ x, target, atol=0.1)
+    np.testing.assert_allclose(rows @ x, target, atol=0.1)
     slope = np.concatenate([log_det_slope(x[10 * k : 10 * k + 10], link) for k, link in enumerate(links)])
     gradient = (x - nominal) / scale + slope * scale
     H = np.eye(len(x)) + log_det_curvature(x, links) * np.outer(scale, scale)
 
-    def gain(directions):  # by which the priors' cost would fall, were one free to move along these
+    def gain(directions):  # Decrease of the cost of the priors at its minimum along these directions.
         g = directions @ gradient
         return 0.5 * g @ np.linalg.solve(directions @ H @ directions.T, g)
 
-    null = np.linalg.svd(seen * scale)[2][12:]
+    null = np.linalg.svd(rows * scale)[2][12:]
     assert gain(null) < 1e-3 < 1e-2 * gain(np.eye(len(x)))
 
 
@@ -136,15 +136,15 @@ def test_curvature_is_the_second_derivative(links, nominal, scale):
         assert np.max(np.abs(up - down - H[chosen])) < 1e-3 * np.max(np.abs(H[chosen]))
 
 
-def test_bounds_are_kept(links, boxes, nominal, scale):
+def test_lower_bounds_are_satisfied(links, boxes, nominal, scale):
     scale, wanted = np.append(scale, 1e-5), np.append(nominal, -1.0)
     lower = np.append(np.full(len(nominal), -np.inf), 1e-6)
     x = consistent_parameters(np.diag(1 / scale), wanted / scale, links, boxes, lower)
     assert x[-1] == pytest.approx(1e-6, rel=1e-3)
 
 
-def test_a_program_that_has_no_solution_is_refused(links, boxes, nominal, scale):
+def test_rejects_a_program_without_a_solution(links, boxes, nominal, scale):
     lower = np.full(len(nominal), -np.inf)
-    lower[0] = 100 * links[0].parameters[0]  # more than the range of the mass allows
-    with pytest.raises(IdentificationError, match="did not converge: Clarabel says"):
+    lower[0] = 100 * links[0].parameters[0]  # Exceeds the upper bound of the mass.
+    with pytest.raises(IdentificationError, match=r"did not converge \(Clarabel: "):
         consistent_parameters(np.diag(1 / scale), nominal / scale, links, boxes, lower)

@@ -26,7 +26,7 @@ def test_inverse_kinematics_inverts_forward_kinematics():
         np.testing.assert_allclose(inverse.solve(X_FT, q), q[:6], rtol=0, atol=1e-9)
 
 
-def test_inverse_kinematics_takes_the_nearest_turn_of_the_roll():
+def test_roll_is_within_half_a_revolution_of_the_guess():
     inverse = PsmInverseKinematics(PSM)
     q = Q_F.copy()
     for roll in (-4.0, -0.5, 4.0):
@@ -46,6 +46,6 @@ def test_no_solution_above_the_remote_centre():
     assert PsmInverseKinematics(PSM, min_depth=0.02).solve(tip(q), q) is None
 
 
-def test_inverse_kinematics_refuses_an_arm_of_another_kind():
-    with pytest.raises(ArmError, match="MTML has not the kinematics of a PSM"):
+def test_rejects_an_arm_that_is_not_a_psm():
+    with pytest.raises(ArmError, match="MTML does not have the kinematics of a PSM"):
         PsmInverseKinematics(MTM)

@@ -1,4 +1,4 @@
-"""Reproduction of the paper: published numbers against its data, ours against known solutions, and errors."""
+"""Reproduction of the paper: published numbers, simulations with known solutions, pages, and errors."""
 
 import csv
 import dataclasses
@@ -30,15 +30,15 @@ from dvrk_drake.experiments.reproduction.published import (
     PaperRecordings,
     paper_model,
     paper_torque,
-    with_zeroed,
+    with_zero_torque,
 )
-from dvrk_drake.experiments.reproduction.session import Identified, ReproductionSession, SampleSizes
+from dvrk_drake.experiments.reproduction.session import IdentifiedArm, ReproductionSession, SampleSizes
 from dvrk_drake.experiments.reproduction.step_response import (
     PERIOD,
+    longest_period,
+    oscillation_modes,
     paper_simulated_arm,
     simulate_paper_controller,
-    slowest_swing,
-    swings,
 )
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
@@ -70,23 +70,23 @@ def test_dh_table_of_plant_matches_paper():
 @pytest.mark.parametrize("parameters", [published.PARAMETERS, tuple(np.linspace(-1, 2, 12))])
 def test_paper_torque_matches_its_regressor(parameters):
     q = ARM.sample_poses(30, np.random.default_rng(2))
-    expected = [published.CONTROLLED_WITH * paper_regressor(pose) @ parameters for pose in q]
+    expected = [published.CONTROL_GRAVITY * paper_regressor(pose) @ parameters for pose in q]
     np.testing.assert_allclose(paper_torque(ARM, q, parameters), expected, atol=1e-11)
 
 
 @pytest.mark.slow
-def test_paper_model_in_base_parameters_and_zeroed():
+def test_paper_model_and_zero_torque_of_joints():
     q = ARM.sample_poses(30, np.random.default_rng(3))
     model = paper_model(ARM)
     np.testing.assert_allclose(model.holding_torque(q), paper_torque(ARM, q), atol=1e-12)
-    zeroed = with_zeroed(model, (4, 5, 6)).holding_torque(q)
+    zeroed = with_zero_torque(model, (4, 5, 6)).holding_torque(q)
     np.testing.assert_allclose(zeroed[:, 4:], 0.0, atol=1e-12)
     np.testing.assert_allclose(zeroed[:, :4], model.holding_torque(q)[:, :4], atol=1e-12)
 
 
 def test_published_parameters_are_least_squares_solution(shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
-    Y = published.IDENTIFIED_WITH * np.array([paper_regressor(pose) for pose in recording.q])
+    Y = published.IDENTIFICATION_GRAVITY * np.array([paper_regressor(pose) for pose in recording.q])
     fitted = np.linalg.lstsq(Y.reshape(-1, 12), recording.measured_effort().ravel(), rcond=None)[0]
     # The parameters are published to four digits. The last one differs in the team's file (.0008).
     np.testing.assert_allclose(published.PARAMETERS[:-1], fitted[:-1], atol=5.1e-5)
@@ -102,7 +102,7 @@ def test_published_means_match_data(shared_data):
     with open(shared_data / "mtm_static/paper_fig5_fig6_drift_trials.csv") as stream:
         rows = list(csv.reader(stream))[1:]
     final = {row[0]: np.array(row[1:7], float) for row in rows}
-    # Values read off plots and rounded.
+    # The values are digitised from plots and rounded.
     np.testing.assert_allclose(published.FIGURE_5[:5], final["Errors8_FullTorques"][:5], atol=6e-4)
     np.testing.assert_allclose(published.FIGURE_6, final["Errors1"], atol=6e-4)
     full = [abs(values) for name, values in final.items() if "Full" in name]
@@ -163,17 +163,17 @@ def test_page_links_its_tables_and_figures(tmp_path):
         assert list(csv.reader(stream)) == [["", "J1"], ["ours", "1"], ["theirs", "a, b"]]
 
 
-def test_table_1_alone_is_a_page(no_recordings, tmp_path):
+def test_page_with_table_1_only(no_recordings, tmp_path):
     page = write_page(tmp_path, [reproduce_table_1()], [])
     assert "L3 = 0.3645 | 0.3645" in page.read_text()
     assert (tmp_path / "table1.csv").stat().st_size > 0
 
 
 def test_finished_figures_are_written_if_others_fail(no_recordings, monkeypatch, tmp_path):
-    def fails(session):
+    def fail(session):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(run._MAKERS, "fig7", fails)
+    monkeypatch.setitem(run._MAKERS, "fig7", fail)
     with pytest.raises(KeyboardInterrupt):
         run.reproduce(["table1", "fig7"], tmp_path, PaperRecordings(None))
     page = (tmp_path / "index.md").read_text()
@@ -191,7 +191,7 @@ def test_shares_have_wilson_interval():
 
 def test_joint_is_held_if_it_never_leaves_band():
     positions = np.zeros((3, 5, 7))
-    positions[0, 2, 4] = 0.0151  # there and back
+    positions[0, 2, 4] = 0.0151  # moves out of the band and back
     positions[1, -1, 4] = -0.0149
     positions[2] += 1.0  # at rest at another pose
     drifts = Drifts(ARM, positions)
@@ -216,7 +216,7 @@ def truth(tmp_path_factory):
 def test_exact_model_holds_arm_and_zero_torque_does_not(truth, tmp_path):
     exact, nothing = tmp_path / "exact.yaml", tmp_path / "nothing.yaml"
     truth.model.save(exact)
-    with_zeroed(truth.model, range(7)).save(nothing)
+    with_zero_torque(truth.model, range(7)).save(nothing)
     start = ARM.sample_poses(1, np.random.default_rng(5), margin=0.2)[0]
     cases = [Release(PAPER_ARM, truth.arm, ("all",), str(model), start, duration=1.0) for model in (exact, nothing)]
     with ThreadPoolExecutor(1) as executor:
@@ -233,19 +233,19 @@ def test_ground_truth_arm_matches_its_model(truth):
     q = ARM.sample_poses(20, np.random.default_rng(7))
     effects = truth.model.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
     assert np.abs(effects[:, 3]).max() > 0.01  # cables
-    drawn = IdentifiedModel.from_arm(ARM).holding_torque(q)
-    assert np.abs(truth.model.holding_torque(q) - effects - drawn).max() > 0.02  # differs from the nominal model
+    nominal = IdentifiedModel.from_arm(ARM).holding_torque(q)
+    assert np.abs(truth.model.holding_torque(q) - effects - nominal).max() > 0.02  # differs from the nominal model
 
 
 def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
     arm = paper_simulated_arm(ARM, tmp_path / "paper.sdf")
-    (faulty, shapes), (right, _) = swings(arm, faulty=True), swings(arm, faulty=False)
+    (faulty, shapes), (correct, _) = oscillation_modes(arm, faulty=True), oscillation_modes(arm, faulty=False)
     undamped = np.flatnonzero(np.abs(faulty.real) < 1e-9)
     assert len(undamped) == 1
     assert np.argmax(np.abs(shapes[:, undamped[0]])) == 6  # only joint 7
-    assert right.real.max() < -0.01
+    assert correct.real.max() < -0.01
     # Link inertias of 1 kg m^2 reproduce the published period of J2, within the accuracy of a digitised plot.
-    assert slowest_swing(arm) == pytest.approx(published.FIGURE_7_READ["J2 period"], rel=0.25)
+    assert longest_period(arm) == pytest.approx(published.FIGURE_7_VALUES["J2 period"], rel=0.25)
 
 
 def test_paper_controller_moves_its_arm_to_zero(tmp_path):
@@ -278,23 +278,23 @@ def test_hysteresis_compensation_holds_arm_after_approach(tmp_path):
     truth, exact = GroundTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
     truth.model.save(exact)
     start = ARM.sample_poses(1, np.random.default_rng(10), margin=0.2)[0]
-    case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, led=True, duration=1.5, seed=10)
+    case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, with_approach=True, duration=1.5, seed=10)
     with ThreadPoolExecutor(1) as executor:
-        gone, kept = (
+        uncompensated, compensated = (
             Drifts(arm, positions[None]).largest[0]
             for positions in release_all([case, dataclasses.replace(case, hysteresis_ratio=0.9)], executor)
         )
-    assert np.all(gone[1:3] > 0.04) and np.all(kept < BAND[0])
+    assert np.all(uncompensated[1:3] > 0.04) and np.all(compensated < BAND[0])
 
 
-def exact_laboratory(truth, folder, executor, sample_sizes):
-    """Session with an MTM that was identified without error."""
+def exact_session(truth, folder, executor, sample_sizes):
+    """Returns a session with an exactly identified MTM."""
     file = folder / "exact.yaml"
     truth.model.save(file)
     q = ARM.sample_poses(20, np.random.default_rng(9))
     poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
     session = ReproductionSession(folder, PaperRecordings(None), executor, sample_sizes=sample_sizes)
-    session.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
+    session.__dict__["mtm"] = IdentifiedArm(truth, poses, truth.model, file)
     return session
 
 
@@ -302,7 +302,7 @@ def exact_laboratory(truth, folder, executor, sample_sizes):
 def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
     sample_sizes = SampleSizes(releases=3, paper_releases=2, hand_guided_releases=1, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
-        section = reproduce_figure_5(exact_laboratory(truth, tmp_path, executor, sample_sizes))
+        section = reproduce_figure_5(exact_session(truth, tmp_path, executor, sample_sizes))
     page = write_page(tmp_path, [section], []).read_text()
     assert len(section.figures) == 2
     assert all((tmp_path / figure).read_bytes().startswith(b"\x89PNG") for figure in section.figures)
@@ -319,7 +319,7 @@ def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
 @pytest.mark.slow
 def test_compensation_reduces_operator_force(truth, tmp_path):
     with ThreadPoolExecutor(1) as executor:
-        section = reproduce_transparency(exact_laboratory(truth, tmp_path, executor, SampleSizes(path_poses=2)))
+        section = reproduce_transparency(exact_session(truth, tmp_path, executor, SampleSizes(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]
     assert force[0] > force[2] > force[3] > 0  # unpowered, our model, our model with friction compensation
     assert (tmp_path / "transparency.png").read_bytes().startswith(b"\x89PNG")

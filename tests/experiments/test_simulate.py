@@ -41,28 +41,28 @@ def test_reaches_targets_on_time_and_rests():
 
 
 @pytest.mark.slow
-def test_handle_reaches_goal_while_joint_4_sticks():
-    """Joint 4 of examples/simulated_effects.yaml: six coordinates fix the handle, and joints 6 and 7 compensate."""
+def test_handle_reaches_target_while_joint_4_sticks():
+    """In examples/simulated_effects.yaml joint 4 sticks, and joints 6 and 7 move instead."""
     example = str(ROOT / "examples" / "simulated_effects.yaml")
     with_friction, without = (
         simulate(load_scenario(example, ["duration=3", *settings])).state_true[-1, :7]
         for settings in ([], ["simulated_effects=[cables, springs, stops, saturation, encoder, effort, delay]"])
     )
     arm = load_arm("mtml")
-    led = np.array(load_scenario(example, []).hand.path[-1].pose)
-    assert abs(led[3]) == 0.3 and abs(with_friction[3]) < 0.01
-    # Without friction joint 4 moves, since the pose of the handle does not determine it.
+    target_pose = np.array(load_scenario(example, []).hand.path[-1].pose)
+    assert abs(target_pose[3]) == 0.3 and abs(with_friction[3]) < 0.01
+    # Without friction joint 4 moves, since the handle pose does not determine the seven joint positions.
     assert abs(without[3]) > 0.05
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     poses = []
-    for q in (led, with_friction):
+    for q in (target_pose, with_friction):
         set_arm_positions(plant, context, arm, q)
         poses.append(plant.GetFrameByName("dh_7").CalcPoseInWorld(context))
-    apart = poses[0].inverse() @ poses[1]
-    assert np.linalg.norm(apart.translation()) < 2e-3 and apart.rotation().ToAngleAxis().angle() < 0.02
-    # With joint 4 at its target and the others unchanged, the handle has another pose.
-    assert np.abs(with_friction - led)[4:].max() > 0.1
+    difference = poses[0].inverse() @ poses[1]
+    assert np.linalg.norm(difference.translation()) < 2e-3 and difference.rotation().ToAngleAxis().angle() < 0.02
+    # Joints 5 to 7 deviate from the target positions.
+    assert np.abs(with_friction - target_pose)[4:].max() > 0.1
 
 
 def test_scenario_is_deterministic_and_seed_changes_noise(tmp_path):
@@ -91,7 +91,7 @@ def test_every_arm_holds_its_start_pose(name, mode):
     assert (simulation.desired is None) == (mode == "gravity")
 
 
-def test_mounting_requires_its_own_gravity_model(tmp_path):
+def test_gravity_direction_requires_matching_model(tmp_path):
     model = tmp_path / "upright.yaml"
     IdentifiedModel.from_arm(PSM).save(model)
     settings = ["duration=0.5", "controller.mode=gravity", "gravity=[0,-9.81,0]", f"start={ZERO}"]
@@ -104,10 +104,10 @@ def test_mounting_requires_its_own_gravity_model(tmp_path):
 
 
 def test_scenario_gains_are_used():
-    limp = "controller.gains={kp: [0.02,0.02,0.5,0.01,0.01,0.01,0.01], kd: [0,0,0,0,0,0,0], ki: [0,0,0,0,0,0,0]}"
+    low_gains = "controller.gains={kp: [0.02,0.02,0.5,0.01,0.01,0.01,0.01], kd: [0,0,0,0,0,0,0], ki: [0,0,0,0,0,0,0]}"
     target = "targets=[{time: 0.5, pose: [0.1,0,0.1,0,0,0,0]}]"
     moved = []
-    for more in ([], [limp]):
+    for more in ([], [low_gains]):
         q = simulate(load_scenario("psm", ["duration=1", f"start={ZERO}", target, *more])).recording.q
         moved.append(q[-1, 0])
     assert moved[0] == pytest.approx(0.1, abs=2e-3)
@@ -152,10 +152,10 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("duration=long", 'psm: duration is "long"; allowed: a number'),
         ("controller.parameter_error=abc", 'psm: controller.parameter_error is "abc"; allowed: a number'),
         ("controler.mode=hold", 'key "controler" is unknown; did you mean "controller"? allowed in a scenario'),
-        ("simulated_effects=all", 'psm: simulated_effects is "all"; allowed: a list of texts, e.g. [all]'),
+        ("simulated_effects=all", 'psm: simulated_effects is "all"; allowed: a list of strings, e.g. [all]'),
         ("simulated_effects=[al]", "unknown effect al; allowed: all, friction"),
-        ("targets=3", "targets is 3; allowed: a list of tables with the keys time, pose"),
-        ("seed=1.5", "seed is 1.5; allowed: a whole number"),
+        ("targets=3", "targets is 3; allowed: a list of mappings with the keys time, pose"),
+        ("seed=1.5", "seed is 1.5; allowed: an integer"),
         ("stretch.yaw.stiffness=soft", 'stretch.yaw.stiffness is "soft"; allowed: a number'),
         ("controller.gains.kp=[1, a]", 'controller.gains.kp[1] is "a"; allowed: a number'),
         ("duration=", "duration is empty; allowed: a number"),
@@ -167,21 +167,24 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("controller.model=nothing.yaml", "nothing.yaml: no such file"),
         ("gravity=[0, 0, 981]", "gravity[2] is 981; allowed: -30..30 m/s^2"),
         ("start=[0, 0, 0.1, 0, 0, 0]", "start has 6 numbers; PSM has 7 joints: yaw, pitch, insertion"),
-        ("start=[0, 0, 100, 0, 0, 0, 0]", "insertion = 100 is outside 0..0.24 [rad, m] of PSM; is insertion in mm?"),
+        (
+            "start=[0, 0, 100, 0, 0, 0, 0]",
+            "insertion = 100 is outside 0..0.24 [rad, m] of PSM. Give insertion in m, not in mm.",
+        ),
         ("start=[3, 0, 0.1, 0, 0, 0, 0]", "yaw = 3 is outside -1.588..1.588 [rad, m] of PSM"),
         ("start=[0, .nan, 0.1, 0, 0, 0, 0]", "start[1] is nan; allowed: a finite number"),
         ("targets=[{time: 1, pose: [0, 0]}]", "targets[0].pose has 2 numbers"),
         (
             f"targets=[{{time: 9, pose: {ZERO}}}]",
-            "targets[0].time = 9 s must be after 0 s and at most the duration, 5 s",
+            "targets[0].time is 9 s; allowed: after 0 s, up to the duration of 5 s",
         ),
         (f"targets=[{{time: .nan, pose: {ZERO}}}]", "targets[0].time is nan; allowed: a finite number"),
         ("effects=[{coordinate: elbow, kind: offset}]", 'effects[0].coordinate is "elbow"; allowed: actuator.yaw'),
         ("effects=[{coordinate: joint.yaw, kind: viscous}]", 'effects[0].kind is "viscous"; allowed: offset, spring'),
         ("seed=-1", "seed is -1"),
         ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: mtml, mtmr, psm'),
-        ("duration", "--set duration: must be key=value"),
-        ("start=[0,", "--set start=[0,: not YAML"),
+        ("duration", "--set duration: a setting must be key=value"),
+        ("start=[0,", "--set start=[0,: invalid YAML"),
     ],
 )
 def test_invalid_settings_give_one_line_error(setting, message, capsys, tmp_path):
@@ -196,8 +199,8 @@ def test_rejects_files_that_are_not_scenarios(tmp_path):
     with pytest.raises(ScenarioError, match="no such file"):
         load_scenario(str(path))
     for text, message in (
-        ("[1, 2]", "must be keys and values"),
-        ("arm: [", "not YAML"),
+        ("[1, 2]", "must have keys and values"),
+        ("arm: [", "invalid YAML"),
         ("duration: 2", "arm is missing"),
     ):
         path.write_text(text)
@@ -205,7 +208,7 @@ def test_rejects_files_that_are_not_scenarios(tmp_path):
             load_scenario(str(path))
 
 
-def test_arm_from_file(tmp_path):
+def test_simulates_arm_from_file(tmp_path):
     path = tmp_path / "ours.yaml"
     path.write_text((MODELS_FOLDER / "arms/mtml.yaml").read_text().replace("name: MTML", "name: OURS"))
     scenario = load_scenario(str(path), ["duration=0.02"])
@@ -220,9 +223,9 @@ def test_error_names_unknown_instrument(tmp_path):
     assert main(["simulate", str(scenario)]) == 2
 
 
-def test_targets_need_mode_hold():
+def test_targets_require_mode_hold():
     scenario = Scenario(arm="psm", targets=[Target(1.0, [0, 0, 0.1, 0, 0, 0, 0])])
     scenario.check()
     scenario.controller.mode = "gravity"
-    with pytest.raises(ScenarioError, match=r'targets need controller\.mode "hold"'):
+    with pytest.raises(ScenarioError, match=r'targets require controller\.mode "hold"'):
         scenario.check()

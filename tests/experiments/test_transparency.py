@@ -1,4 +1,4 @@
-"""Operator forces: identities of the measurement, and the expected order of the compensations."""
+"""Operator forces: known forces at rest, and the order of the forces with different compensations."""
 
 import csv
 
@@ -20,21 +20,21 @@ MODEL = IdentifiedModel.from_arm(ARM)
 REST = np.array([0.1, 0.3, -0.1, 0.4, 0.3, 0.1, 0.2])
 
 
-def resting(seconds):
+def constant_pose(seconds):
     return PiecewisePolynomial.ZeroOrderHold([0.0, seconds], np.array([REST, REST]).T)
 
 
-def test_no_force_on_hand_holding_compensated_arm():
-    forces = simulate_operator(ARM, resting(1.5), Compensation("gravity", MODEL))
+def test_no_hand_force_on_compensated_arm():
+    forces = simulate_operator(ARM, constant_pose(1.5), Compensation("gravity", MODEL))
     assert forces.rms_force < 1e-6 and forces.rms_torque < 1e-6
     assert forces.deviation.max() < 1e-6
 
 
-def test_hand_carries_weight_of_unpowered_arm():
-    """At rest in the hand's grip, J' F equals the holding torque."""
-    forces = simulate_operator(ARM, resting(3.0), Compensation("nothing"))
+def test_hand_force_equals_weight_of_unpowered_arm():
+    """The force of the grip equals its stiffness times the deviation of the handle."""
+    forces = simulate_operator(ARM, constant_pose(3.0), Compensation("nothing"))
     assert forces.rms_force > 1.0
-    # The handle sags until the spring force of the grip, with the stiffness of `Grip`, carries the arm.
+    # At rest, the spring force of the grip balances the weight of the arm. 600 N/m is the stiffness of `Grip`.
     late = forces.time > 2.9
     np.testing.assert_allclose(
         np.linalg.norm(forces.force[late], axis=1), 600.0 * forces.deviation[late], rtol=0.02, atol=0
@@ -46,8 +46,8 @@ def test_each_compensation_reduces_operator_force():
     path = random_path(ARM, poses=3)
     friction = ARM.effects.only(["friction", "encoder", "delay"])
     listed = [Compensation("nothing"), Compensation("gravity", MODEL), Compensation("friction", MODEL, 0.6)]
-    limp, gravity, both = (simulate_operator(ARM, path, one, effects=friction) for one in listed)
-    assert limp.rms_force > 2 * gravity.rms_force
+    unpowered, gravity, both = (simulate_operator(ARM, path, one, effects=friction) for one in listed)
+    assert unpowered.rms_force > 2 * gravity.rms_force
     assert gravity.rms_force > 1.3 * both.rms_force
     assert gravity.rms_torque > both.rms_torque
 
@@ -63,7 +63,7 @@ def test_recorded_path_respects_limits_and_speed():
     assert np.all(values <= ARM.position_upper + 1e-12) and np.all(values >= ARM.position_lower - 1e-12)
     expected = np.clip(middle + (half + 0.05) * np.sin(4.0), ARM.position_lower, ARM.position_upper)
     np.testing.assert_allclose(path.value(2.0).ravel(), expected, atol=2e-3)
-    with pytest.raises(ScenarioError, match="leaves the limits of MTML"):
+    with pytest.raises(ScenarioError, match="exceeds the limits of MTML"):
         recorded_path(ARM, Recording(q=middle + (half + 0.2) * np.sin(t)[:, None], t=t, tau=np.zeros_like(q)))
     with pytest.raises(ScenarioError, match="speed is 0"):
         recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
@@ -71,13 +71,13 @@ def test_recorded_path_respects_limits_and_speed():
         recorded_path(ARM, Recording(q=q, tau=np.zeros_like(q)))
     with pytest.raises(ScenarioError, match="has 2 different times"):
         recorded_path(ARM, Recording(q=q[:2], t=t[:2]))
-    with pytest.raises(ScenarioError, match="parallelogram leaves the limits of MTML"):
+    with pytest.raises(ScenarioError, match="parallelogram exceeds the limits of MTML"):
         recorded_path(ARM, Recording(q=q + 0.6 * np.array([0, 1, 1, 0, 0, 0, 0]), t=t))
     moved = Recording(q=q, t=t).in_actuator_coordinates(ARM)
     np.testing.assert_allclose(recorded_path(ARM, moved, 0.5).value(2.0), path.value(2.0), atol=1e-12)
 
 
-def test_psm_is_moved_at_its_instrument():
+def test_hand_moves_psm_at_its_instrument():
     psm = load_arm("psm")
     assert (handle_frame(ARM), handle_frame(psm)) == ("dh_7", "dh_6")
     pose = np.clip(0.1, psm.position_lower, psm.position_upper)
@@ -89,7 +89,7 @@ def test_psm_is_moved_at_its_instrument():
 
 
 def test_command_writes_table(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.experiments.transparency.random_path", lambda arm: resting(1.2))
+    monkeypatch.setattr("dvrk_drake.experiments.transparency.random_path", lambda arm: constant_pose(1.2))
     model, table = tmp_path / "ours.yaml", tmp_path / "table.csv"
     MODEL.save(model)
     arguments = ["transparency", "--arm", "mtml", "--model", str(model), "--simulated-effects", "friction"]
@@ -103,16 +103,16 @@ def test_command_writes_table(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--friction-ratio", "1"], "between 0 and 0.6"),
         (["--model", "nothing.yaml"], "nothing.yaml: no such file"),
         (["--simulated-effects", "wings"], "unknown effect wings; allowed: all, friction"),
         (["--frame", "dh_9"], 'MTML: its SDF has no frame "dh_9"; it has dh_0, dh_1'),
-        (["--speed", "2"], "--speed is that of a recorded motion; name one with --path"),
+        (["--speed", "2"], "--speed requires --path with a recorded motion"),
         (["--path", "nowhere.csv"], "nowhere.csv"),
     ],
 )
-def test_bad_input_gives_one_line_and_exit_code_2(arguments, said, capsys):
+def test_invalid_input_gives_one_line_and_exit_code_2(arguments, message, capsys):
     assert main(["transparency", "--arm", "mtml", *arguments]) == 2
-    assert said in refusal(capsys.readouterr().err)
+    assert message in refusal(capsys.readouterr().err)

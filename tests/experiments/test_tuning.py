@@ -18,20 +18,25 @@ from dvrk_drake.experiments.study.study import local_executor
 from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response, band, published_gains, step_size
 from dvrk_drake.experiments.tuning.model_based import (
     GAIN_MARGIN,
+    MAX_COUNT_EFFORT,
     PHASE_MARGIN,
-    SHAKE,
-    JointFacts,
+    JointProperties,
     design_arm,
     design_joint,
     mass_matrices,
     sampling_of,
 )
-from dvrk_drake.experiments.tuning.procedure import RELEASE, find_ultimate_gain, judge_oscillation, tune_joint
+from dvrk_drake.experiments.tuning.procedure import (
+    RELEASE_DURATION,
+    evaluate_oscillation,
+    find_ultimate_gain,
+    tune_joint,
+)
 from dvrk_drake.experiments.tuning.sampled_loop import SampledLoop, Sampling, place
 from dvrk_drake.experiments.tuning.tuning import (
     CONDITIONS,
     DURATION,
-    REST,
+    REST_TIME,
     Comparison,
     StepMeasures,
     measure_step,
@@ -71,7 +76,7 @@ def single(kp, kd, ki=0.0):
 
 
 def analytic_ultimate(M, b, lag):
-    """Returns K and the period for which M s^2 + b s + K exp(-s lag) = 0 has the root s = j w."""
+    """Returns the gain K and the period for which M s^2 + b s + K exp(-s lag) = 0 has the root s = j w."""
     w = brentq(lambda w: np.tan(w * lag) * M * w - b, 1e-6, 0.499 * np.pi / lag)
     return M * w**2 / np.cos(w * lag), 2 * np.pi / w
 
@@ -92,7 +97,7 @@ def test_frictionless_joint_oscillates_with_every_gain():
     # the release shows the required four swings, i.e. two periods.
     M = 0.05
     assert find_ultimate_gain(LinearJoint(M, Sampling(), 0.0)).gain == pytest.approx(
-        M * (2 * np.pi * 2 / RELEASE) ** 2, rel=0.06
+        M * (2 * np.pi * 2 / RELEASE_DURATION) ** 2, rel=0.06
     )
 
 
@@ -106,7 +111,7 @@ def test_procedure_damps_linear_joint():
     sampling = Sampling()
     result = tune_joint(LinearJoint(0.1, sampling, 0.2))
     assert result.damped
-    assert result.kp == pytest.approx(result.ultimate.gain * result.kp_lowered)
+    assert result.kp == pytest.approx(result.ultimate.gain * result.kp_ratio)
     t, error = LinearJoint(0.1, sampling, 0.2).respond(result.kp, result.kd, result.ki, 2.0)
     assert -error.min() < 0.05 * LinearJoint.step + LinearJoint.count
     assert np.abs(error[t > 1.6]).max() < LinearJoint.band
@@ -118,7 +123,7 @@ def test_growth_and_period_of_known_oscillation(ratio):
     w = 40.0
     t = 1e-3 * np.arange(1501)
     x = 0.3 + 0.05 * np.exp(-ratio * w * t) * np.cos(w * np.sqrt(1 - ratio**2) * t)
-    found = judge_oscillation(t, x, 1e-5)
+    found = evaluate_oscillation(t, x, 1e-5)
     assert found.growth == pytest.approx(np.exp(-np.pi * ratio / np.sqrt(1 - ratio**2)), rel=1e-3)
     assert found.period == pytest.approx(2 * np.pi / w / np.sqrt(1 - ratio**2), rel=0.01)
     assert found.sustained == (ratio < 0)
@@ -126,14 +131,14 @@ def test_growth_and_period_of_known_oscillation(ratio):
 
 def test_sticking_or_creeping_is_no_oscillation():
     t = 1e-3 * np.arange(1000)
-    assert judge_oscillation(t, np.full(1000, 0.05), 1e-4).growth == 0.0
-    assert judge_oscillation(t, 0.05 * np.exp(-5 * t), 1e-4).growth == 0.0
+    assert evaluate_oscillation(t, np.full(1000, 0.05), 1e-4).growth == 0.0
+    assert evaluate_oscillation(t, 0.05 * np.exp(-5 * t), 1e-4).growth == 0.0
     # Encoder quantisation does not count as a swing.
-    assert judge_oscillation(t, 3e-3 * np.round(np.sin(60 * t)), 6.1e-3).swings == 0
+    assert evaluate_oscillation(t, 3e-3 * np.round(np.sin(60 * t)), 6.1e-3).swings == 0
 
 
 def poles(loop, gains, sampling):
-    """Returns the closed-loop poles in s [rad/s], least damped first; those of a delay are at -infinity."""
+    """Returns the closed-loop poles in s [rad/s], least damped first. Poles of a delay are at -infinity."""
     z = np.linalg.eigvals(loop.closed_loop(gains)).astype(complex)
     with np.errstate(divide="ignore", invalid="ignore"):
         s = np.log(z) / sampling.period
@@ -156,7 +161,7 @@ def test_pole_placement_gives_desired_damping(ratio, ticks, viscous):
 
 
 def test_pole_placement_without_lags_is_inaccurate():
-    # Shows that the test above can fail: the textbook gains kp = M w^2, kd = 2 z M w exceed its tolerance.
+    # The previous test can fail: the gains kp = M w^2, kd = 2 z M w, which ignore the lags, exceed its tolerance.
     sampling, M, z = Sampling(ticks=3), 0.2, 0.8
     slowest = poles(SampledLoop(M, sampling), single(M * FAR_BELOW**2, 2 * z * M * FAR_BELOW), sampling)
     polynomial = np.real(np.poly(slowest[np.abs(slowest) > 1e-6][:2]))
@@ -171,22 +176,24 @@ def test_margins_match_stability_limits():
     for factor, stable in ((0.99 * margins.gain, True), (1.01 * margins.gain, False)):
         assert SampledLoop(M, sampling).is_stable(single(factor * kp, factor * kd, factor * ki)) == stable
     # A delay T changes the phase by w T, so the phase margin corresponds to a time.
-    spare = margins.phase / margins.crossover / sampling.period
-    for ticks, stable in ((int(spare), True), (int(spare) + 1, False)):
-        later = Sampling(sampling.period, sampling.ticks + ticks, sampling.cut_off)
-        assert SampledLoop(M, later).is_stable(single(kp, kd, ki)) == stable
+    delay_margin = margins.phase / margins.crossover / sampling.period
+    for ticks, stable in ((int(delay_margin), True), (int(delay_margin) + 1, False)):
+        delayed = Sampling(sampling.period, sampling.ticks + ticks, sampling.cut_off)
+        assert SampledLoop(M, delayed).is_stable(single(kp, kd, ki)) == stable
 
 
 def test_only_dominant_joint_is_slowed_down():
     arm = load_arm("mtml")
     sampling, design = sampling_of(arm), design_arm(arm)
-    alone = [design_joint(fact, sampling) for fact in design.facts]
-    slowed = [joint.limited_by == "other joints" for joint in design.joints]
-    assert any(slowed) and not all(slowed)
-    assert [a == b for a, b in zip(alone, design.joints, strict=True)] == [not slow for slow in slowed]
+    alone = [design_joint(joint, sampling) for joint in design.properties]
+    is_slower = [joint.limited_by == "other joints" for joint in design.joints]
+    assert any(is_slower) and not all(is_slower)
+    assert [a == b for a, b in zip(alone, design.joints, strict=True)] == [not slower for slower in is_slower]
     # Separate designs are unstable together. The common design is stable, also at other poses.
-    harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
-    loops = [SampledLoop(0.8 * M, harder) for M in mass_matrices(arm, arm.sample_poses(20, np.random.default_rng(9)))]
+    more_delay = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
+    loops = [
+        SampledLoop(0.8 * M, more_delay) for M in mass_matrices(arm, arm.sample_poses(20, np.random.default_rng(9)))
+    ]
     together = Gains(*([getattr(joint, name) for joint in alone] for name in ("kp", "kd", "ki")))
     assert not all(loop.is_stable(together) for loop in loops)
     assert all(loop.is_stable(design.gains) for loop in loops)
@@ -219,23 +226,26 @@ def test_uncoupled_joints_match_single_joints():
 
 def test_design_keeps_margins_and_reports_limitation():
     sampling = Sampling()
-    fact = JointFacts((0.05, 0.2), dry_friction=0.1, viscous=0.0, gravity=0.5, count=3e-5, band=1e-3, effort_limit=2.0)
-    design = design_joint(fact, sampling)
+    joint = JointProperties(
+        (0.05, 0.2), dry_friction=0.1, viscous=0.0, gravity=0.5, count=3e-5, band=1e-3, effort_limit=2.0
+    )
+    design = design_joint(joint, sampling)
     assert design.limited_by == "phase margin"
     assert min(margins.phase for margins in design.margins) == pytest.approx(PHASE_MARGIN, abs=0.02)
     assert min(margins.gain for margins in design.margins) > GAIN_MARGIN
-    # The integrator moves a sticking joint after a quarter of a second, unless Ki is at its upper bound.
+    # The integral term moves a sticking joint within 0.25 s, unless Ki is at its upper bound.
     assert design.ki <= (0.1 + 0.2 * 0.5) / (1e-3 * 0.25) + 1e-9
-    coarse = dataclasses.replace(fact, count=1e-3, dry_friction=0.0)
-    design = design_joint(coarse, sampling)
+    coarse_encoder = dataclasses.replace(joint, count=1e-3, dry_friction=0.0)
+    design = design_joint(coarse_encoder, sampling)
     assert design.limited_by == "encoder count"
     assert (
-        coarse.count * (design.kp + design.kd * (1 - sampling.decay) / sampling.period) <= SHAKE * coarse.effort_limit
+        coarse_encoder.count * (design.kp + design.kd * (1 - sampling.decay) / sampling.period)
+        <= MAX_COUNT_EFFORT * coarse_encoder.effort_limit
     )
-    with pytest.raises(ControllerError, match="limited by: encoder count"):
-        design_joint(dataclasses.replace(coarse, count=1.0), sampling)
-    later = design_joint(fact, Sampling(ticks=4))
-    assert later.frequency < 0.8 * design_joint(fact, sampling).frequency
+    with pytest.raises(ControllerError, match=r"limited by encoder count"):
+        design_joint(dataclasses.replace(coarse_encoder, count=1.0), sampling)
+    delayed = design_joint(joint, Sampling(ticks=4))
+    assert delayed.frequency < 0.8 * design_joint(joint, sampling).frequency
 
 
 def test_mass_matrix_includes_linkage_and_rotors():
@@ -266,7 +276,7 @@ def test_measures_of_known_step():
     q[:, 3] = goal[3] * (1 + 0.1 * np.sin(50 * t)) - goal[3] * (t == 0)
     effort = np.zeros((len(t), n))
     effort[:, 4] = 0.1 * arm.effort_limits[4] * np.sin(50 * t)
-    effort[t < DURATION - REST, 5] = arm.effort_limits[5]  # nonzero effort during the motion, zero at the end
+    effort[t < DURATION - REST_TIME, 5] = arm.effort_limits[5]  # nonzero effort during the motion, zero at the end
     measured = measure_step(arm, Response(t, q, q, effort, goal))
     assert measured.settling[0] == pytest.approx(np.log(goal[0] / band(arm)[0]) / w, abs=2e-3)
     assert measured.overshoot[0] == 0.0
@@ -314,7 +324,7 @@ def test_scenario_reads_gains_file(tmp_path):
     assert load_scenario(str(scenario)).controller.gains == gains
 
 
-def test_holding_uses_gains_of_file(tmp_path):
+def test_mode_hold_uses_gains_of_file(tmp_path):
     arm, error = load_arm("mtml"), 0.01
     n, sender_commands = arm.num_joints, []
     status = lcmt_dvrk_status()
@@ -334,52 +344,52 @@ def test_holding_uses_gains_of_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("kp: [1]\nkd: [1]\n", "ki is missing"),
         (
             "kp: [1]\nkd: [1]\nkI: [1]\n",
-            'key "kI" is unknown; did you mean "ki"\\? allowed in a file of gains: kp, kd, ki',
+            'key "kI" is unknown; did you mean "ki"\\? allowed in a gains file: kp, kd, ki',
         ),
         ("kp: fast\n", 'kp is "fast"; allowed: a list of numbers'),
         ("kp: [1, fast]\n", r'kp\[1\] is "fast"; allowed: a number'),
         ("kp: [1, 0]\nkd: [1, 1]\nki: [0, 0]\n", r"kp\[1\] is 0; allowed: 1e-05\.\."),
         ("kp: [1]\nkd: [-0.1]\nki: [0]\n", r"kd\[0\] is -0\.1; allowed: 0 or "),
         ("kp: [1]\nkd: [1]\nki: [-3]\n", r"ki\[0\] is -3; allowed: 0 or "),
-        ("- 1\n", "must be keys and values, not .*; allowed in a file of gains: kp, kd, ki"),
+        ("- 1\n", "must have keys and values, not .*; allowed in a gains file: kp, kd, ki"),
     ],
 )
-def test_rejects_invalid_gains_files(tmp_path, text, said):
+def test_rejects_invalid_gains_files(tmp_path, text, message):
     path = tmp_path / "gains.yaml"
     path.write_text(text)
-    with pytest.raises(ControllerError, match=said):
+    with pytest.raises(ControllerError, match=message):
         load_gains(path)
 
 
-def refused(capsys, *arguments):
+def error_line(capsys, *arguments):
     """Returns the single line that the command prints before it exits with code 2."""
     assert main(arguments) == 2
     return refusal(capsys.readouterr().err)
 
 
 def test_commands_reject_invalid_options(tmp_path, capsys):
-    assert 'unknown arm "mtm"' in refused(capsys, "tune", "--arm", "mtm")
-    assert 'Invalid value "guess" for --method' in refused(capsys, "tune", "--arm", "psm", "--method", "guess")
-    assert "its folder does not exist" in refused(
+    assert 'unknown arm "mtm"' in error_line(capsys, "tune", "--arm", "mtm")
+    assert 'Invalid value "guess" for --method' in error_line(capsys, "tune", "--arm", "psm", "--method", "guess")
+    assert "its folder does not exist" in error_line(
         capsys, "tune", "--arm", "psm", "--output", str(tmp_path / "no" / "g")
     )
-    assert "no such file" in refused(capsys, "simulate", "--arm", "mtml", "--set", "controller.gains=none.yaml")
+    assert "no such file" in error_line(capsys, "simulate", "--arm", "mtml", "--set", "controller.gains=none.yaml")
     few = tmp_path / "few.yaml"
     save_gains(Gains([1.0], [1.0], [1.0]), few, "of one joint")
-    assert "gains.kp has 1 number; allowed: 7" in refused(
+    assert "gains.kp has 1 number; allowed: 7" in error_line(
         capsys, "simulate", "--arm", "mtml", "--set", f"controller.gains={few}"
     )
-    assert "for --mode hold" in refused(capsys, "run", "--arm", "mtml", "--gains", str(few))
+    assert "requires --mode hold" in error_line(capsys, "run", "--arm", "mtml", "--gains", str(few))
 
 
 @pytest.mark.slow
 def test_psm_insertion_ultimate_gain_matches_analytic():
-    """Simulates viscous friction and delay only. Drake's time stepping adds no lag to that of the ticks."""
+    """Simulates viscous friction and delay only. Drake's time stepping adds no delay."""
     b, arm = 2.0, load_arm("psm")
     effects = ArmEffects(
         friction=[DriveEffect("actuator.insertion", "viscous", coefficient=b)], delay=DelayEffect(measurement=1)
@@ -403,7 +413,7 @@ def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
     assert tuning.found == {"model": tuning.design.gains}
     console = Console(record=True, width=120, file=io.StringIO())
     print_tuning(console, tuning, verbose=True)
-    said = console.export_text()
-    assert all(name in said for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
+    printed = console.export_text()
+    assert all(name in printed for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
     plot_steps(tmp_path / "steps.png", tuning.comparison)
     assert (tmp_path / "steps.png").stat().st_size > 10_000

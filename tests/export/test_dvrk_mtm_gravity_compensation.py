@@ -1,4 +1,4 @@
-"""The dVRK controller's gravity-compensation file: ours against its formula, written here a second time."""
+"""Compares the dVRK's gravity-compensation file for an MTM with the model, by an independent evaluation."""
 
 import dataclasses
 import json
@@ -29,12 +29,12 @@ from dvrk_drake.reports.figures.export import plot_compensation
 
 pytestmark = pytest.mark.slow
 
-#: Gravity [m/s^2] of an arm whose tilted by 2.3 degrees.
+#: Gravity vector [m/s^2] of an arm whose base is tilted by 2.3 degrees.
 TILTED = [0.01, -0.39, -9.80]
 
 
 def dvrk_controller(path, q, qd):
-    """tau (7) as the dVRK computes it from the file's text: one pose, plain numbers, nothing of ours."""
+    """Returns the torque (7,) that the dVRK computes from the file for one pose, without code of this package."""
     content = json.loads(Path(path).read_text())
     assert content["version"] == "2.0"
     gc = content["GC_controller"]
@@ -99,7 +99,7 @@ def dvrk_controller(path, q, qd):
 
 
 def balanced(name="mtml"):
-    """A model the file can hold: the last link's centre of mass on its axis; its parameters are not the SDF's."""
+    """Returns a model that the file can represent. The centre of mass of the last link is on its axis."""
     model = IdentifiedModel.from_arm(load_arm(name))
     generator = np.random.default_rng(3)
     for p in model.base_parameters:
@@ -108,7 +108,7 @@ def balanced(name="mtml"):
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr"])
-def test_the_controller_computes_the_models_torque_from_the_file(name, tmp_path):
+def test_file_gives_the_torque_of_the_model(name, tmp_path):
     model = balanced(name)
     model.effects = [
         DriveEffect("joint.outer_yaw", "offset", 0.0, 0.03),
@@ -122,12 +122,12 @@ def test_the_controller_computes_the_models_torque_from_the_file(name, tmp_path)
     compensation_from_model(model).save(path, arm.name, "test")
     q = arm.sample_poses(300, np.random.default_rng(11))
     expected = model.holding_torque(q)
-    assert np.ptp(expected, axis=0)[1:6].min() > 0.01  # there is something to compare
+    assert np.ptp(expected, axis=0)[1:6].min() > 0.01  # The torques are large enough for a comparison.
     actual = np.array([dvrk_controller(path, pose, np.zeros(7)) for pose in q])
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-10)
 
 
-def test_a_files_torque_is_the_controllers_with_clip(tmp_path):
+def test_torque_of_a_file_equals_that_of_the_controller(tmp_path):
     generator = np.random.default_rng(4)
     file = GravityCompensationFile(
         positive=generator.normal(0, 0.1, 40),
@@ -142,13 +142,13 @@ def test_a_files_torque_is_the_controllers_with_clip(tmp_path):
     file.save(path, "MTML", "test")
     file = GravityCompensationFile.load(path)
     q, v = generator.uniform(-1, 1, (300, 7)), generator.uniform(-0.6, 0.6, (300, 7))
-    v[:100] *= 0.03  # many inside the dead band
+    v[:100] *= 0.03  # Many speeds are inside the dead band.
     expected = np.array([dvrk_controller(path, *row) for row in zip(q, v, strict=True)])
     np.testing.assert_allclose(controller_torque(file, q, v), expected, rtol=0, atol=1e-12)
-    assert np.abs(unclipped_torque(file, q, v) - expected).max() > 0.1  # the clip acts
+    assert np.abs(unclipped_torque(file, q, v) - expected).max() > 0.1  # Some torques are clipped.
 
 
-def test_friction_is_half_of_what_separates_the_two_directions(tmp_path):
+def test_friction_is_half_the_difference_of_the_directions(tmp_path):
     coulomb = (0.05, 0.06, 0.04, 0.02, 0.01, 0.005, 0.0)
     file = compensation_from_model(balanced(), CompensationOptions(coulomb=coulomb, friction_ratio=(1.0,) * 7))
     path = tmp_path / "gc.json"
@@ -159,7 +159,7 @@ def test_friction_is_half_of_what_separates_the_two_directions(tmp_path):
     np.testing.assert_allclose(rest - down, coulomb, atol=1e-12)
 
 
-def test_friction_of_a_motion_model_is_that_of_a_single_joint():
+def test_friction_of_a_model_is_that_of_single_joints():
     model = balanced()
     with pytest.raises(ModelError, match="no dynamics"):
         dry_friction(model)
@@ -168,41 +168,41 @@ def test_friction_of_a_motion_model_is_that_of_a_single_joint():
             DriveEffect("actuator.outer_yaw", "coulomb", 0.1, 0.05),
             DriveEffect("actuator.outer_yaw", "presliding", 0.01, 0.02),
             DriveEffect("actuator.outer_yaw", "viscous", 0.0, 9.0),
-            DriveEffect("actuator.wrist_platform", "coulomb", 0.1, 0.01),  # turned by joints 3 and 4
+            DriveEffect("actuator.wrist_platform", "coulomb", 0.1, 0.01),  # Joints 3 and 4 move this actuator.
         ]
     )
     np.testing.assert_allclose(dry_friction(model), [0.07, 0, 0.006697, 0.01, 0, 0, 0], rtol=0, atol=1e-12)
 
 
-def test_limits_hold_what_is_needed_and_what_the_motors_have():
+def test_torque_limits_are_the_torque_range_plus_ten_percent():
     model = balanced()
     arm = model.arm
     file = compensation_from_model(model)
     tau = model.holding_torque(arm.sample_poses(100000, np.random.default_rng(12)))
     assert np.all((tau >= file.torque_lower) & (tau <= file.torque_upper))
     assert np.all(np.abs([file.torque_lower, file.torque_upper]) <= arm.effort_limits)
-    # A tenth on both sides; the extremes of two samples differ by a few hundredths.
+    # The margin is 10 % at both ends, and the ranges of the two samples differ by a few percent.
     assert np.all(np.ptp([file.torque_lower, file.torque_upper], axis=0) <= 1.25 * np.ptp(tau, axis=0) + 1e-9)
     for p in model.base_parameters:
-        p.value *= 8  # more than the motors can hold
+        p.value *= 8  # The torque exceeds the effort limits.
     file = compensation_from_model(model)
     assert file.torque_upper[1] == arm.effort_limits[1]
 
 
-def test_what_the_file_cannot_hold_is_refused_and_named():
+def test_rejects_a_model_that_the_file_cannot_represent():
     eccentric = IdentifiedModel.from_arm(load_arm("mtml"))
     with pytest.raises(ModelError, match=r"wrist_roll 0\.0021 N m\..*gravity 0\.00.*--gc-tolerance 0\.00"):
         compensation_from_model(eccentric)
-    with pytest.raises(ModelError, match=r"masses are estimates of the SDF.*dvrk-drake identify") as refusal:
+    with pytest.raises(ModelError, match=r"estimated masses of the SDF.*dvrk-drake identify") as refusal:
         compensation_from_model(eccentric)
     assert "tilted" not in str(refusal.value) and "feedforward_scale" not in str(refusal.value)
-    # The line names a tolerance that is enough.
+    # The tolerance in the message is sufficient.
     compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
     spring = balanced()
     spring.effects = [DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.05)]
-    with pytest.raises(ModelError, match=r"up to wrist_pitch 0\.0\d+ N m\. Of that: effects 0\.0\d+ \(it supports"):
+    with pytest.raises(ModelError, match=r"wrist_pitch 0\.0\d+ N m\. Errors by cause: effects 0\.0\d+ N m \("):
         compensation_from_model(spring)
-    # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.
+    # A polynomial of order 4 approximates 0.05 sin(q) over +-2.44 rad with an error of a few percent.
     compensation_from_model(spring, CompensationOptions(tolerance=0.05 * 0.08))
     for change in ({"feedforward_scale": 0.5}, {"gravity": TILTED}):
         model = balanced()
@@ -211,9 +211,9 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         else:
             model.arm = model.arm.with_gravity(change["gravity"])
             model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
-        with pytest.raises(ModelError, match="cannot hold"):
+        with pytest.raises(ModelError, match="cannot represent"):
             compensation_from_model(model)
-    with pytest.raises(ModelError, match="one of an MTM"):
+    with pytest.raises(ModelError, match="is not an MTM"):
         compensation_from_model(IdentifiedModel.from_arm(load_arm("psm")))
     with pytest.raises(ModelError, match="dead_band must be 7 numbers"):
         compensation_from_model(balanced(), CompensationOptions(dead_band=(0.1,)))
@@ -223,14 +223,14 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
 
 @pytest.mark.parametrize("tolerance", ["nan", "inf", "-1"])
 @pytest.mark.parametrize(("arm", "option"), [("mtml", "--dvrk-gc"), ("psm", "--dvrk-kinematic-gc")])
-def test_a_tolerance_that_is_no_number_accepts_nothing(arm, option, tolerance, tmp_path, capsys):
+def test_rejects_an_invalid_tolerance(arm, option, tolerance, tmp_path, capsys):
     path = tmp_path / "gc.json"
     assert main(["export", "--arm", arm, option, str(path), f"--gc-tolerance={tolerance}"]) == 2
-    assert f"--gc-tolerance is {tolerance}; allowed: a number of N m from 0" in capsys.readouterr().err
+    assert f"--gc-tolerance is {tolerance}; allowed: a finite number of 0 or more [N m, N]" in capsys.readouterr().err
     assert not path.exists()
 
 
-def test_a_tilted_base_is_refused_or_approximated(tmp_path, capsys):
+def test_tilted_base_is_rejected_or_approximated(tmp_path, capsys):
     model = balanced()
     model.arm = model.arm.with_gravity(TILTED)
     model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
@@ -239,31 +239,34 @@ def test_a_tilted_base_is_refused_or_approximated(tmp_path, capsys):
     assert main(["export", "--model", str(given), "--dvrk-gc", str(out)]) == 2
     error = refusal(capsys.readouterr().err)
     assert "tilted by 2.3 deg" in error and not out.exists()
-    # The line names the option that accepts it, and the file is then as close as the line says.
+    # With the option in the message, the error of the file is the error in the message.
     tolerance = error.split("--gc-tolerance ")[1]
     assert main(["export", "--model", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0
     printed = capsys.readouterr().out
     q = model.arm.sample_poses(300, np.random.default_rng(5))
     controller = np.array([dvrk_controller(out, pose, np.zeros(7)) for pose in q])
-    off = np.abs(controller - model.holding_torque(q)).max(axis=0)
+    error_of_file = np.abs(controller - model.holding_torque(q)).max(axis=0)
     stated = largest_differences(GravityCompensationFile.load(out), model)
-    assert np.all(off <= 1.1 * stated + 1e-9) and off.max() < 1.1 * float(tolerance)
+    assert np.all(error_of_file <= 1.1 * stated + 1e-9) and error_of_file.max() < 1.1 * float(tolerance)
     assert all(f"{x:.1e}" in printed for x in stated)
-    # Without a polynomial the outer yaw, which an upright arm leaves alone, would be off by all that the tilt adds.
+    # The polynomial reduces the error of the outer yaw, whose gravity torque is due to the tilt only.
     assert stated[0] < 0.6 * np.abs(model.holding_torque(q)[:, 0]).max()
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda gc: gc.pop("sat_vec_vec"), "lacks sat_vec_vec"),
+        (lambda gc: gc.pop("sat_vec_vec"), "keys missing in GC_controller: sat_vec_vec"),
         (lambda gc: gc["gc_dynamic_params_pos"].pop(), "gc_dynamic_params_pos must be 40 finite numbers"),
         (lambda gc: gc["db_vel_vec"].__setitem__(0, "x"), "db_vel_vec must be 7 finite numbers"),
-        (lambda gc: gc["db_vel_vec"].__setitem__(0, 5.0), "below sat_vec_vec"),
-        (lambda gc: gc["safe_lower_torque_limit"].__setitem__(1, 9.0), "must not exceed"),
+        (lambda gc: gc["db_vel_vec"].__setitem__(0, 5.0), "db_vel_vec[0] (5) must be below sat_vec_vec[0]"),
+        (
+            lambda gc: gc["safe_lower_torque_limit"].__setitem__(1, 9.0),
+            "torque_limit[1] (9) must not exceed",
+        ),
     ],
 )
-def test_a_broken_file_is_one_line(change, message, tmp_path, capsys):
+def test_invalid_file_is_rejected_in_one_line(change, message, tmp_path, capsys):
     path = tmp_path / "gc.json"
     compensation_from_model(balanced()).save(path, "MTML", "test")
     content = json.loads(path.read_text())
@@ -274,18 +277,18 @@ def test_a_broken_file_is_one_line(change, message, tmp_path, capsys):
     assert message in error and str(path) in error
 
 
-def test_comparison_finds_runaway_clip_and_wrong_sign(tmp_path):
+def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path):
     model = balanced()
     file = compensation_from_model(model)
     clean = compare_compensation(file, model)
     assert all(j.clipped == j.opposed == j.runaway == 0 for j in clean.joints)
     assert max(j.rms_outside for j in clean.joints) < 1e-12
 
-    spoilt = dataclasses.replace(file)
-    for which in (spoilt.positive, spoilt.negative):
+    altered = dataclasses.replace(file)
+    for which in (altered.positive, altered.negative):
         which[10 + 5 + 4] = 20.0  # 20 q2^4 N m: 33 N m at the upper limit
-    spoilt.torque_upper[2] = np.median(clean.model_torque[:, 2])
-    found = compare_compensation(spoilt, model)
+    altered.torque_upper[2] = np.median(clean.model_torque[:, 2])
+    found = compare_compensation(altered, model)
     assert found.joints[1].runaway > 0.3 and found.joints[1].polynomial == pytest.approx(20 * 1.13446**4, rel=0.01)
     assert found.joints[2].clipped == pytest.approx(0.5, abs=0.01)
     mirrored = dataclasses.replace(
@@ -302,7 +305,7 @@ def test_comparison_finds_runaway_clip_and_wrong_sign(tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_command_line(tmp_path, capsys):
+def test_export_and_compare_commands(tmp_path, capsys):
     model, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     balanced().save(model)
     assert main(["export", "--model", str(model), "--dvrk-gc", str(out), "--coulomb", *["0.01"] * 7]) == 0
@@ -315,9 +318,9 @@ def test_command_line(tmp_path, capsys):
     assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out)]) == 2
     error = refusal(capsys.readouterr().err)
     assert not out.exists()
-    # What the line tells to type is accepted.
-    asked = error.split("repeat the command with ")[1].split()
-    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out), *asked]) == 0 and out.exists()
+    # The command with the option in the message is accepted.
+    options = error.split("repeat the command with ")[1].split()
+    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out), *options]) == 0 and out.exists()
     capsys.readouterr()
     assert main(["export", "--model", str(model)]) == 2
     assert "--dvrk-gc" in capsys.readouterr().err

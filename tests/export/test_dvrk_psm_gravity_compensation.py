@@ -1,4 +1,4 @@
-"""The dVRK controller's gravity file of a PSM: evaluated in another way, it is our gravity torque."""
+"""Compares the dVRK's gravity-compensation file for a PSM with the model, by an independent evaluation."""
 
 import json
 import os
@@ -19,18 +19,18 @@ pytestmark = pytest.mark.slow
 
 
 def dvrk_controller(path, q, gravity):
-    """[yaw, pitch, insertion]: Newton-Euler from the last link to the first of the file's chain, standing still."""
+    """Returns the torques of yaw, pitch and insertion by the recursive Newton-Euler algorithm for the chain at rest."""
     joints = json.loads(path.read_text())["DH"]["joints"]
     positions = [q[0], 0, q[1], -q[1], q[1], q[2] / 2, q[2] / 2]
     poses = []
     for joint, position in zip(joints, positions, strict=True):
-        slide = joint["type"] == "prismatic"
-        turn = RigidTransform(RollPitchYaw(0, 0, joint["theta"] + (0 if slide else position)), np.zeros(3))
+        prismatic = joint["type"] == "prismatic"
+        turn = RigidTransform(RollPitchYaw(0, 0, joint["theta"] + (0 if prismatic else position)), np.zeros(3))
         poses.append(
             RigidTransform(RollPitchYaw(joint["alpha"], 0, 0), np.zeros(3))
             @ RigidTransform(np.array([joint["A"], 0, 0]))
             @ turn
-            @ RigidTransform(np.array([0, 0, joint["D"] + (position if slide else 0)]))
+            @ RigidTransform(np.array([0, 0, joint["D"] + (position if prismatic else 0)]))
         )
     down = [poses[0].rotation().inverse() @ np.asarray(gravity)]
     for X in poses[1:]:
@@ -40,7 +40,7 @@ def dvrk_controller(path, q, gravity):
         joint = joints[i]
         weight = -joint["mass"] * down[i]
         center = np.array([joint["cx"], joint["cy"], joint["cz"]])
-        if i < 6:  # what holds link i + 1, in link i
+        if i < 6:  # Wrench on link i + 1, expressed in link i.
             X = poses[i + 1]
             force, torque = X.rotation() @ force, X.rotation() @ torque
             torque = torque + np.cross(X.translation(), force)
@@ -50,7 +50,7 @@ def dvrk_controller(path, q, gravity):
     return np.array([t[0], t[2] - t[3] + t[4], t[6]])
 
 
-def other_psm():
+def perturbed_psm():
     model = IdentifiedModel.from_arm(load_arm("psm"))
     generator = np.random.default_rng(7)
     for p in model.base_parameters:
@@ -59,8 +59,8 @@ def other_psm():
 
 
 @pytest.mark.parametrize("gravity", [None, [0.0, -4.0, -9.0]])
-def test_the_controller_computes_the_models_torque_from_the_file(gravity, tmp_path):
-    model = other_psm()
+def test_file_gives_the_torque_of_the_model(gravity, tmp_path):
+    model = perturbed_psm()
     if gravity is not None:
         model.arm = model.arm.with_gravity(gravity)
         model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
@@ -77,55 +77,53 @@ def test_the_controller_computes_the_models_torque_from_the_file(gravity, tmp_pa
     assert np.all(file.mass >= 0) and np.abs(file.center).max() < 1.0
 
 
-def test_the_chain_is_the_arm(tmp_path):
-    """Its points are those of the linkage, and its last frame the dVRK's frame 3."""
+def test_chain_has_the_dimensions_of_the_arm(tmp_path):
+    """The chain has the dimensions of the linkage, and its last frame is frame 3 of the dVRK."""
     path = tmp_path / "psm.json"
-    kinematic_compensation(other_psm()).save(path)
+    kinematic_compensation(perturbed_psm()).save(path)
     joints = json.loads(path.read_text())["DH"]["joints"]
     assert [j["type"] for j in joints] == ["revolute"] * 5 + ["prismatic"] * 2
-    # AO, AB, BE and the distance of E from the shaft (psm.sdf says where they are from).
+    # Distances AO, AB, BE and the distance of E from the shaft, see psm.sdf.
     np.testing.assert_allclose([joints[i]["A"] for i in (2, 3, 4, 5)], [0.516, 0.15, 0.516, 0.042998], atol=1e-6)
     assert joints[6]["D"] == pytest.approx(0.143705 - 0.4318, abs=1e-9)
 
 
-def test_what_the_file_cannot_hold_is_refused():
-    model = other_psm()
+def test_rejects_a_model_that_the_file_cannot_represent():
+    model = perturbed_psm()
     model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
-    with pytest.raises(
-        ModelError, match=r"off by up to pitch 0\.1 .*: joint.pitch offset 0\.1\. .*--gc-tolerance 0\.1"
-    ):
+    with pytest.raises(ModelError, match=r"errors are pitch 0\.1 .*: joint.pitch offset 0\.1\. .*--gc-tolerance 0\.1"):
         kinematic_compensation(model)
-    heavy = other_psm()
+    heavy = perturbed_psm()
     (net,) = (p for p in heavy.base_parameters if "- m_counterweight" in p.name and p.name.startswith("(m3"))
     net.value = -0.2
-    with pytest.raises(ModelError, match=r"outweighs what the insertion carries by 0\.2 kg"):
+    with pytest.raises(ModelError, match=r"net mass on the insertion joint is -0\.2 kg"):
         kinematic_compensation(heavy)
-    with pytest.raises(ModelError, match="one of a PSM"):
+    with pytest.raises(ModelError, match="is not a PSM"):
         kinematic_compensation(IdentifiedModel.from_arm(load_arm("mtml")))
 
 
-def test_command_line(tmp_path, capsys):
+def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):
     out = tmp_path / "psm.json"
     assert main(["export", "--arm", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
     assert "pitch" in capsys.readouterr().out and out.is_file()
     assert main(["export", "--arm", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
-    assert "is one of a PSM" in refusal(capsys.readouterr().err)
+    assert "is not a PSM" in refusal(capsys.readouterr().err)
 
 
-def test_an_export_that_is_refused_leaves_no_other_file(tmp_path, monkeypatch, capsys):
+def test_rejected_export_writes_no_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    model = other_psm()
+    model = perturbed_psm()
     model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
     model.save("model.yaml")
     arguments = ["export", "--model", "model.yaml", "--sdf", "model.sdf", "--dvrk-kinematic-gc", "gc.json"]
     assert main([*arguments, "--gc-tolerance", "1e-9"]) == 2
-    assert "cannot hold this model" in capsys.readouterr().err
+    assert "cannot represent this model" in capsys.readouterr().err
     assert os.listdir() == ["model.yaml"]
     assert main([*arguments, "--gc-tolerance", "10"]) == 0
     assert {"model.sdf", "gc.json"} < set(os.listdir())
 
 
-def test_an_sdf_without_the_links_of_a_psm_is_refused(monkeypatch):
+def test_rejects_an_sdf_without_the_links_of_a_psm(monkeypatch):
     bodies = {0: ("turret_link",), 2: ("back_crank_link",)}
     monkeypatch.setattr("dvrk_drake.export.dvrk_psm_gravity_compensation._BODIES", bodies)
     with pytest.raises(ModelError, match="the SDF has no link turret_link"):

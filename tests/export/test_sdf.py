@@ -1,4 +1,4 @@
-"""SDF written from inertial parameters: any reader gets the same arm, and the same equations of motion."""
+"""Tests that exported SDF and URDF files have the given inertial parameters and equations of motion."""
 
 import dataclasses
 import re
@@ -28,7 +28,7 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 
 def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:
-    """Other bodies: each pseudo-inertia stretched by a random linear map, which keeps it positive definite."""
+    """Returns consistent links that differ from the SDF, by a random linear map of each pseudo-inertia."""
     generator = np.random.default_rng(seed)
     links = []
     for link in link_inertias(arm):
@@ -38,7 +38,7 @@ def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:
 
 
 def inverse_dynamics(plant: MultibodyPlant, arm: Arm, motion) -> np.ndarray:
-    """tau (m, n) of Drake itself, projected through the linkage."""
+    """Returns Drake's inverse dynamics (m, n), projected through the linkage."""
     context = plant.CreateDefaultContext()
     index = tree_selector(plant, arm)
     tau = []
@@ -60,14 +60,14 @@ def motion_of(arm: Arm, count: int = 50):
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_the_written_arm_moves_by_the_parameters_it_was_given(name, tmp_path):
+def test_sdf_has_the_given_inertial_parameters(name, tmp_path):
     arm, path = load_arm(name), tmp_path / "identified.sdf"
     links = perturbed(arm)
     write_sdf(arm, links, path, "a test")
-    written = dataclasses.replace(arm, sdf=(str(path),))
+    exported = dataclasses.replace(arm, sdf=(str(path),))
     motion = motion_of(arm)
-    actual = inverse_dynamics(make_arm_plant(written), written, motion)
-    # The same from our own regressor, which never saw the file.
+    actual = inverse_dynamics(make_arm_plant(exported), exported, motion)
+    # Compute the expected torque from the regressor of the original arm.
     regressor = DynamicRegressor(arm)
     parameters = regressor.values.copy()
     by_name = {link.link: link.parameters for link in links}
@@ -77,13 +77,13 @@ def test_the_written_arm_moves_by_the_parameters_it_was_given(name, tmp_path):
     scale = np.abs(expected).max(axis=0)
     assert np.abs((actual - expected) / scale).max() < 1e-12
     assert np.abs((expected - regressor.torque(*motion, regressor.values)) / scale).max() > 0.05
-    for before, after in zip(links, link_inertias(written), strict=True):
+    for before, after in zip(links, link_inertias(exported), strict=True):
         assert before.link == after.link
         np.testing.assert_allclose(after.parameters, before.parameters, rtol=0, atol=1e-13)
 
 
 def parse(path):
-    """A plant and scene graph of one model file, by a parser without packages and lets nothing pass."""
+    """Returns plant, scene graph and model instance of a file, parsed strictly and without packages."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
     plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
@@ -96,7 +96,7 @@ def parse(path):
 
 
 @pytest.mark.parametrize("name", ["mtmr", "psm"])
-def test_a_bare_parser_loads_it_from_anywhere_with_its_meshes(name, tmp_path):
+def test_parser_without_packages_loads_model_and_meshes(name, tmp_path):
     arm = load_arm(name)
     (tmp_path / "first").mkdir()
     write_sdf(arm, perturbed(arm), tmp_path / "first" / "arm.sdf", "a test")
@@ -120,13 +120,13 @@ def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
     links = perturbed(arm)
     write_urdf(arm, links, path, "a test")
     write_sdf(arm, links, tmp_path / "arm.sdf", "a test")
-    written = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),))
-    sdf_plant, (urdf_plant, scene_graph, _) = make_arm_plant(written), parse(path)
+    exported = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),))
+    sdf_plant, (urdf_plant, scene_graph, _) = make_arm_plant(exported), parse(path)
     motion = motion_of(arm)
     expected = inverse_dynamics(sdf_plant, arm, motion)
     actual = inverse_dynamics(urdf_plant, arm, motion)
     assert np.abs((actual - expected) / np.abs(expected).max(axis=0)).max() < 1e-12
-    # The linkage is coupled, and limits, motors, frames and shapes are there.
+    # Constraints, actuators, limits and frames are equal.
     assert urdf_plant.num_constraints() == sdf_plant.num_constraints() > 0
     assert urdf_plant.num_actuators() == sdf_plant.num_actuators() == arm.num_joints
     contexts = [plant.CreateDefaultContext() for plant in (sdf_plant, urdf_plant)]
@@ -148,24 +148,24 @@ def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
         ]
         np.testing.assert_allclose(poses[1], poses[0], rtol=0, atol=1e-12)
     inspector = scene_graph.model_inspector()
-    assert len(inspector.GetCollisionCandidates()) == 0  # the arm's links are filtered as in the SDF
+    assert len(inspector.GetCollisionCandidates()) == 0  # Collisions between links are filtered as in the SDF.
 
 
-def test_what_urdf_cannot_say_is_refused(tmp_path):
+def test_rejects_an_sdf_that_urdf_does_not_support(tmp_path):
     sdf = tmp_path / "arm.sdf"
     arm = load_arm("mtml")
     write_sdf(arm, [], sdf, "a test")
     text = sdf.read_text()
     for old, new, message in (
         ("<axis>", "<pose>0 0 1 0 0 0</pose><axis>", "joint outer_yaw has a <pose>"),
-        ("<cylinder>", "<plane/><cylinder>", "URDF has no shape like plane"),
+        ("<cylinder>", "<plane/><cylinder>", "URDF does not support the shape plane"),
     ):
         sdf.write_text(text.replace(old, new, 1))
         with pytest.raises(ModelError, match=message):
             to_urdf(compose_sdf([str(sdf)]), arm)
 
 
-def test_only_what_changed_is_written_anew(tmp_path):
+def test_only_changed_inertias_are_rewritten(tmp_path):
     arm = load_arm("mtml")
     links = link_inertias(arm)
     assert changed_links(arm, links) == [] and sdf_difference(arm, links) == ""
@@ -180,22 +180,22 @@ def test_only_what_changed_is_written_anew(tmp_path):
     assert all(re.match(r"[-+] +</?(mass|inertia|i[xyz]{2})>", line) for line in changed) and len(changed) <= 18
 
 
-def test_meshes_that_cannot_be_copied_are_one_line_and_no_model(tmp_path, capsys):
+def test_no_model_is_written_if_meshes_cannot_be_copied(tmp_path, capsys):
     (tmp_path / "arm_meshes").write_text("in the way")
     assert main(["export", "--arm", "mtml", "--sdf", str(tmp_path / "arm.sdf")]) == 2
     assert "arm_meshes" in capsys.readouterr().err and not (tmp_path / "arm.sdf").exists()
     write_sdf(load_arm("mtml"), [], tmp_path / "other.sdf", "a test")
     (tmp_path / "other_meshes" / "mtm" / "base_link.gltf").unlink()
     incomplete = dataclasses.replace(load_arm("mtml"), sdf=(str(tmp_path / "other.sdf"),))
-    with pytest.raises(ArmError, match=r"base_link.gltf: no such mesh"):
+    with pytest.raises(ArmError, match=r"base_link.gltf: the mesh file does not exist"):
         write_sdf(incomplete, [], tmp_path / "again.sdf", "a test")
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
-    """The recipe of docs/export.md."""
+def test_an_arm_file_can_refer_to_the_exported_sdf(name, tmp_path, capsys):
+    """Follows the instructions of docs/export.md."""
     arm = load_arm(name)
-    # What `export --sdf` writes of a static model.
+    # `export --sdf` writes these links for a static model.
     links = nearest_links(arm, 1.1 * derive_gravity(arm).base_values)
     write_sdf(arm, links, tmp_path / "identified.sdf", "a test")
     text = (MODELS_FOLDER / "arms" / f"{name}.yaml").read_text()
@@ -207,31 +207,31 @@ def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
     (tmp_path / "arm.yaml").write_text(text)
     own = load_arm(str(tmp_path / "arm.yaml"))
     assert main(["export", "--arm", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
-    assert "The SDF states the inertias of the arm's own SDF." in capsys.readouterr().out
+    assert "The SDF has the same inertias as the SDF of the arm." in capsys.readouterr().out
     assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
     np.testing.assert_allclose(own.transmission.matrix, arm.transmission.matrix, rtol=0, atol=1e-12)
     np.testing.assert_allclose(derive_gravity(own).base_values, 1.1 * derive_gravity(arm).base_values, atol=1e-12)
 
 
-def test_rotor_inertia_is_what_it_adds_to_the_mass_matrix(tmp_path):
+def test_rotor_inertia_is_added_to_the_mass_matrix(tmp_path):
     arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
-    rotors = {"outer_yaw": 0.011, "wrist_platform": 0.003}  # the second has none in the SDF
+    rotors = {"outer_yaw": 0.011, "wrist_platform": 0.003}  # wrist_platform has no rotor in the SDF.
     write_sdf(arm, [], path, "a test", rotors)
-    written = dataclasses.replace(arm, sdf=(str(path),))
+    exported = dataclasses.replace(arm, sdf=(str(path),))
     M_before, M_after = (
-        DynamicRegressor(a).mass_matrix(np.zeros((1, 7)), DynamicRegressor(a).values)[0] for a in (arm, written)
+        DynamicRegressor(a).mass_matrix(np.zeros((1, 7)), DynamicRegressor(a).values)[0] for a in (arm, exported)
     )
     expected = np.zeros((7, 7))
     expected[0, 0], expected[3, 3] = 0.011 - 1e-6 * 63.41**2, 0.003
     np.testing.assert_allclose(M_after - M_before, expected, rtol=0, atol=1e-12)
 
 
-def test_what_no_body_has_is_refused(tmp_path):
+def test_rejects_invalid_inertias_and_unknown_links(tmp_path):
     arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
     link = link_inertias(arm)[0]
     for parameters, message in (
-        (link.parameters * np.r_[-1, np.ones(9)], "no body has this inertia"),
-        (link.parameters * np.r_[1, np.ones(3), 0.01, np.ones(5)], "no body has this inertia"),
+        (link.parameters * np.r_[-1, np.ones(9)], "not physically consistent"),
+        (link.parameters * np.r_[1, np.ones(3), 0.01, np.ones(5)], "not physically consistent"),
     ):
         with pytest.raises(ModelError, match=message):
             write_sdf(arm, [LinkInertia(link.link, parameters)], path, "a test")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
-from dvrk_drake.dynamics.physical_consistency import BoundingBox, bounding_boxes, reached_bounds, room_in_box
+from dvrk_drake.dynamics.physical_consistency import BoundingBox, bounding_boxes, box_margins, reached_bounds
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.arm_schema import BoundingShapes, BoxCorners
@@ -20,15 +20,15 @@ def test_links_of_the_sdf_fit_their_boxes(name):
     boxes = bounding_boxes(arm)
     assert list(boxes) == [link.link for link in link_inertias(arm)]
     for link in link_inertias(arm):
-        assert np.all(room_in_box(link.parameters, boxes[link.link]) > 0.05), link.link
+        assert np.all(box_margins(link.parameters, boxes[link.link]) > 0.05), link.link
 
 
 def test_box_encloses_collision_shapes_with_margin_of_its_file():
     boxes = bounding_boxes(load_arm("psm"))
-    # One box each in the SDF: 0.028 x 0.536 x 0.02 m about (0, 0.258, 0) in psm.sdf.
+    # The collision shape in psm.sdf is a box of 0.028 x 0.536 x 0.02 m about (0, 0.258, 0).
     np.testing.assert_allclose(boxes["bottom_bar_link"].lower, [-0.054, -0.05, -0.05], atol=1e-9)
     np.testing.assert_allclose(boxes["bottom_bar_link"].upper, [0.054, 0.566, 0.05], atol=1e-9)
-    # A shaft of radius 4.2 mm in the instrument's, whose margin is 1 cm.
+    # The shaft of the instrument has a radius of 4.2 mm, and the margin of the instrument is 1 cm.
     assert boxes["roll_link"].half_width[0] == pytest.approx(0.0142, abs=2e-4)
 
 
@@ -39,14 +39,14 @@ def point_mass(mass, p):
 
 
 def test_margin_of_a_point_depends_on_distance_from_centre():
-    """Checks the margin 1 - (d / w)^2 along each axis. Bodies inside the box have a positive one."""
+    """Checks that the margin is 1 - (d / w)^2 along each axis. It is positive for bodies inside the box."""
     box = BoundingBox(np.array([-0.1, 0.0, 0.2]), np.array([0.3, 0.2, 0.3]))
     p = np.array([0.2, 0.1, 0.32])
     expected = 1 - ((p - box.center) / box.half_width) ** 2
-    np.testing.assert_allclose(room_in_box(point_mass(0.7, p), box), expected, atol=1e-12)
+    np.testing.assert_allclose(box_margins(point_mass(0.7, p), box), expected, atol=1e-12)
     inside = np.random.default_rng(0).uniform(box.lower, box.upper, (20, 3))
     body = sum(point_mass(0.05, point) for point in inside)
-    assert np.all(room_in_box(body, box) >= 0)
+    assert np.all(box_margins(body, box) >= 0)
 
 
 def test_active_bounds_are_named():
@@ -64,12 +64,12 @@ def with_shapes(arm, shapes):
 
 def test_links_without_bounds_are_refused():
     arm = load_arm("mtmr")
-    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*give it a box"):
+    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*Give it a box"):
         bounding_boxes(with_shapes(arm, BoundingShapes()))
     box = BoxCorners([0, 0, 0], [1, -1, 1])
     with pytest.raises(ArmError, match="lower and upper of crank_link must be three numbers each"):
         shapes = dataclasses.replace(arm.identification.bounding_shapes[0], boxes={"crank_link": box})
         bounding_boxes(with_shapes(arm, shapes))
-    with pytest.raises(ArmError, match="boxes names elbow, no link of"):
+    with pytest.raises(ArmError, match=r"boxes: .* has no link elbow"):
         shapes = dataclasses.replace(arm.identification.bounding_shapes[0], boxes={"elbow": box})
         bounding_boxes(with_shapes(arm, shapes))

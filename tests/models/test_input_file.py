@@ -1,4 +1,4 @@
-"""Tests input files that are missing, too large, too deeply nested or unreadable: each reader fails with one line."""
+"""Tests that each reader refuses missing, too large, deeply nested and unreadable files with a message of one line."""
 
 import math
 import os
@@ -63,7 +63,7 @@ def test_non_files_are_refused_in_one_line(name, kind, tmp_path):
     NO_FILES[kind](path)
     with pytest.raises(DvrkDrakeError) as refusal:
         READERS[name](path)
-    assert name in str(refusal.value) or kind == "device"  # the name by which an arm is loaded
+    assert name in str(refusal.value) or kind == "device"
     assert "\n" not in str(refusal.value)
     assert not os.path.exists(f"{path}.out")
 
@@ -117,7 +117,7 @@ def test_aliases_of_aliases_are_refused():
 
 
 def own_arm(folder, change):
-    """Writes the files of an MTM whose SDF is changed everywhere by `change` (regular expression, new text)."""
+    """Writes the files of an MTM. `change` (regular expression, new text) is applied to all matches in the SDF."""
     mechanism = (MODELS_FOLDER / "mechanisms/mtm.yaml").read_text()
     url = next(line.split()[1] for line in mechanism.splitlines() if line.startswith("sdf:"))
     (folder / "mechanism.yaml").write_text(mechanism.replace(url, "own.sdf"))
@@ -133,21 +133,24 @@ def own_arm(folder, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("effort>", "ef>"), r"joint \S+ of its SDF needs a positive <axis><limit><effort>"),
+        (("effort>", "ef>"), r"joint \S+ of the SDF needs a positive <axis><limit><effort>"),
         (("<mass>", "<mass>nan "), r"link \S+: <mass> is 'nan .*'; allowed: a finite number"),
         (("<ixx>", "<ixx>inf"), r"link \S+: <ixx> is 'inf.*'; allowed: a finite number"),
         (('multiplier="', 'multiplier="x'), r"joint \S+: multiplier is 'x.*'; allowed: a finite number"),
-        (("</model>", "<model name='a'/></model>"), r"own\.sdf: must hold one <model> in <sdf>, with no <model> or"),
+        (("</model>", "<model name='a'/></model>"), r"own\.sdf: <sdf> must contain exactly one <model>"),
         (('type="revolute"', 'type="ball"'), r"own\.yaml: joint \S+ of the SDF has type 'ball'; allowed: revolute"),
         (("<mass>", "<mass>-"), r"link \S+: <mass> is -\S+; allowed: 1e-06\.\.200 kg"),
         (("<inertial>.*?</inertial>", ""), r"link \S+ of the SDF needs a positive <inertial><mass>"),
-        (('multiplier="[^"]*"', 'multiplier="0"'), r"joint \S+ of the SDF follows another with the multiplier 0"),
-        (('"dh_2"', '"dh_x"'), r"own\.sdf: has a frame dh_7, but no dh_2"),
+        (('multiplier="[^"]*"', 'multiplier="0"'), r"joint \S+ of the SDF has a mimic multiplier of 0"),
+        (('"dh_2"', '"dh_x"'), r"own\.sdf: frame dh_2 is missing"),
         (
             (r'<joint name="\w+" type="revolute">(?:(?!</joint>).)*mimic.*?</joint>', ""),
-            r"own\.sdf: no joint holds \w+",
+            r"own\.sdf: no joint connects \w+",
         ),
-        (("<child>upper_arm_link", "<child>no_link"), r"own\.yaml: .*own\.sdf: Drake refuses this model: .*no_link"),
+        (
+            ("<child>upper_arm_link", "<child>no_link"),
+            r"own\.yaml: .*own\.sdf: Drake cannot load this model: .*no_link",
+        ),
         (("base_link", "bottom_link"), r"own\.yaml: the SDF has no link base_link"),
     ],
 )
@@ -249,7 +252,7 @@ def test_block_size_does_not_change_the_rows(block, end, tmp_path, monkeypatch):
         np.testing.assert_array_equal(getattr(read, name), getattr(original, name))
     np.testing.assert_array_equal(read.lines, np.arange(2, 11))
     path.write_bytes(path.read_bytes() + "0,\u00e4".encode()[:-1])
-    with pytest.raises(RecordingError, match=f"not a CSV text file in UTF-8: .* at byte {path.stat().st_size - 1}"):
+    with pytest.raises(RecordingError, match=f"is not a UTF-8 text file: .* at byte {path.stat().st_size - 1}"):
         read_recording(path)
 
 
@@ -257,8 +260,8 @@ def test_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypat
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
     monkeypatch.setattr(recording, "MAX_COUNT", 3)
-    with pytest.raises(RecordingError, match=r":5: has more than 3 rows; cut the recording into parts"):
+    with pytest.raises(RecordingError, match=r", line 5: the file has more than 3 rows\. Split"):
         read_recording(path)
     path.write_text(f"{HEADER}\n" + "1" * 3_000_000)
-    with pytest.raises(RecordingError, match="has a line of more than 1048576 characters"):
+    with pytest.raises(RecordingError, match="a line has more than 1048576 characters"):
         read_recording(path)

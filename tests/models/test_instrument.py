@@ -83,5 +83,5 @@ def test_invalid_limits_or_limits_in_millimetres_are_refused(folder, limits, mes
 
 def test_missing_instrument_file_is_named(folder):
     (folder / "bad.yaml").write_text((folder / "arm.yaml").read_text().replace("probe.yaml", "gone.yaml"))
-    with pytest.raises(ArmError, match=r"bad\.yaml: instrument .*gone\.yaml: no such file"):
+    with pytest.raises(ArmError, match=r"bad\.yaml: instrument .*gone\.yaml does not exist"):
         load_arm(str(folder / "bad.yaml"))

@@ -19,9 +19,9 @@ def test_committed_python_equals_output_of_lcm_gen(tmp_path):
         pytest.skip(f"no {LCM_GEN}: the lcm wheel ships it")
     sources = sorted(str(path) for path in FOLDER.glob("*.lcm"))
     subprocess.run([LCM_GEN, "-p", "--ppath", tmp_path, *sources], check=True, timeout=TIMEOUT)
-    made = {path.name: path.read_text() for path in (tmp_path / "dvrk_drake" / "lcmtypes").glob("*.py")}
-    assert len(made) == 3
-    assert made == {path.name: path.read_text() for path in FOLDER.glob("*.py")}
+    generated = {path.name: path.read_text() for path in (tmp_path / "dvrk_drake" / "lcmtypes").glob("*.py")}
+    assert len(generated) == 3
+    assert generated == {path.name: path.read_text() for path in FOLDER.glob("*.py")}
 
 
 @pytest.mark.parametrize("type_", [lcmt_dvrk_command, lcmt_dvrk_status])

@@ -1,4 +1,4 @@
-"""Tests keys of messages: accepted key files, signatures, and rejected messages."""
+"""Tests message keys: key files, signatures, and rejected messages."""
 
 import hashlib
 import os
@@ -30,7 +30,7 @@ def test_signed_message_is_verified_and_decoded(message):
     assert key.verify(signed) and not key.verify(data)
     back = type(message).decode(signed)
     assert (back.utime, back.arm_name, back.mac_size) == (12345, "MTML", 16)
-    # Independent computation, as in a bridge in another language.
+    # Independent computation of the code, as in a bridge in another language.
     assert back.mac == hashlib.blake2b(data[:-1], key=KEY, digest_size=16).digest()
     assert back.encode() == signed
 
@@ -50,7 +50,7 @@ def test_any_other_byte_length_or_key_is_not_authentic():
 
 
 @pytest.mark.parametrize("size", [16, 32, 64])
-def test_a_key_is_the_content_of_its_file(tmp_path, size):
+def test_key_is_the_content_of_its_file(tmp_path, size):
     content = os.urandom(size)
     signed = MessageKey.load(write(tmp_path / "a.key", content)).sign(Command().encode())
     assert MessageKey(content).verify(signed)
@@ -59,16 +59,20 @@ def test_a_key_is_the_content_of_its_file(tmp_path, size):
 @pytest.mark.parametrize(
     ("content", "mode", "message"),
     [
-        (KEY, 0o640, r"a\.key: other users may access this key \(mode 0640\); run: chmod 600 .*a\.key"),
-        (KEY, 0o604, r"a\.key: other users may access this key \(mode 0604\)"),
-        (KEY, 0o602, r"a\.key: other users may access this key \(mode 0602\)"),
-        (KEY[:15], 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 15; make one: dvrk-drake key --output FILE"),
-        (b"", 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 0"),
-        (bytes(65), 0o600, r"a\.key: not a key of 16 to 64 bytes, it has more"),
+        (KEY, 0o640, r"a\.key: other users have access to this key \(mode 0640\)\. Run: chmod 600 .*a\.key"),
+        (KEY, 0o604, r"a\.key: other users have access to this key \(mode 0604\)"),
+        (KEY, 0o602, r"a\.key: other users have access to this key \(mode 0602\)"),
+        (
+            KEY[:15],
+            0o600,
+            r"a\.key: the key has 15 bytes; allowed: 16 to 64\. Create a key with: dvrk-drake key --output FILE",
+        ),
+        (b"", 0o600, r"a\.key: the key has 0 bytes"),
+        (bytes(65), 0o600, r"a\.key: the key has more than 64 bytes"),
         (None, 0o600, r"a\.key: no such file"),
     ],
 )
-def test_bad_keys_are_refused_in_one_line(tmp_path, content, mode, message, capsys):
+def test_invalid_keys_are_refused_in_one_line(tmp_path, content, mode, message, capsys):
     path = tmp_path / "a.key"
     if content is not None:
         write(path, content, mode)
@@ -102,7 +106,7 @@ def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
     assert len(content) == 32 and content != second.read_bytes()
     MessageKey.load(first)
     assert main(["key", "--output", str(first)]) == 2
-    assert "a.key: exists already, and a key is not overwritten; name another file" in capsys.readouterr().err
+    assert "a.key already exists, and a key is never overwritten" in capsys.readouterr().err
     assert first.read_bytes() == content
     with pytest.raises(KeyFileError, match="cannot be written: No such file or directory"):
         create_key_file(tmp_path / "no" / "a.key")

@@ -27,7 +27,7 @@ from dvrk_drake.recordings.recording import read_recording
 
 #: Signs of the joint angles and torques of an arm that is mirrored in the plane x = 0.
 MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
-#: Column of the controller's file for the lateral wrist brackets: my5 - mz4.
+#: Index of the parameter my5 - mz4 of the lateral wrist brackets in the gravity compensation file.
 P6 = 5
 
 
@@ -81,7 +81,7 @@ def test_mirrored_file_of_a_right_arm_predicts_left_arms(shared_data):
     for serial in ("MTML-22723", "MTML-34863"):
         left = GravityCompensationFile.load(folder / f"gc-{serial}.json")
         q = np.random.default_rng(0).uniform(*left.sweep, (2000, 7))
-        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # reachable range of both files' sweeps with the parallelogram
+        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # range that the sweeps of both files can reach with the parallelogram
         tau = controller_torque(left, q)
         as_it_is = np.sqrt(np.mean((controller_torque(right, q) - tau) ** 2, axis=0))
         mirrored = np.sqrt(np.mean((MIRROR * controller_torque(right, MIRROR * q) - tau) ** 2, axis=0))
@@ -99,7 +99,7 @@ def test_compare_gc_refuses_a_file_of_another_arm(tmp_path, capsys):
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 2
     error = refusal(capsys.readouterr().err)
     assert error.startswith(f"dvrk-drake: error: {path}: the file is of MTML") and "model is of MTMR" in error
-    # A file with a wrong name is compared; its parameters show that the name is wrong.
+    # A file with a wrong name is compared. The comparison shows that the name is wrong.
     file.save(path, "MTMR", "test")
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 0
     (warning,) = messages(capsys.readouterr().err)
@@ -157,9 +157,9 @@ def test_mirroring_twice_is_identity_and_mirrors_shapes():
 
 def test_links_that_cannot_be_mirrored_are_named():
     root = ElementTree.fromstring('<sdf><model><link name="a"><visual><pose>1 2 3</pose></visual></link></model></sdf>')
-    with pytest.raises(ArmError, match=r'x\.sdf: has no link "b" to mirror; its links: a'):
+    with pytest.raises(ArmError, match=r'x\.sdf has no link "b" of mirrored_links; allowed: a'):
         mirror_links(root, ["b"], "x.sdf")
-    with pytest.raises(ArmError, match=r"x\.sdf: link a: to be mirrored, a <pose> must be x y z roll pitch yaw"):
+    with pytest.raises(ArmError, match=r"x\.sdf: link a: <pose> of a mirrored link must be x y z roll pitch yaw"):
         mirror_links(root, ["a"], "x.sdf")
 
 
@@ -171,6 +171,6 @@ def test_an_exported_left_arm_is_not_mirrored_again(tmp_path):
         content = (MODELS_FOLDER / f"{part}.yaml").read_text()
         assert content.count(text) == 1
         (tmp_path / f"{part.split('/')[1]}.yaml").write_text(content.replace(text, new))
-    left, own = load_arm("mtml"), load_arm(str(tmp_path / "mtml.yaml"))
+    left, exported = load_arm("mtml"), load_arm(str(tmp_path / "mtml.yaml"))
     for q in left.sample_poses(3, np.random.default_rng(0)):
-        np.testing.assert_allclose(torque(own, q), torque(left, q), atol=1e-12)
+        np.testing.assert_allclose(torque(exported, q), torque(left, q), atol=1e-12)

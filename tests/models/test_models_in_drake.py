@@ -1,4 +1,4 @@
-"""Tests the model files with Drake's own parser against the arms that `load_arm` composes."""
+"""Compares models read by the parser of Drake with the arms of `load_arm`."""
 
 import re
 import runpy
@@ -40,7 +40,7 @@ def plain_plant(name: str) -> MultibodyPlant:
 
 
 def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions of the plant at the arm's pose, and the index of each of the arm's tree joints."""
+    """Returns the positions of the plant at pose q (n,), and the index of each tree joint of the arm."""
     index = np.array([plant.GetJointByName(joint).position_start() for joint in arm.tree_joint_names])
     q_plant = np.zeros(plant.num_positions())
     q_plant[index] = arm.linkage.position(q)
@@ -50,18 +50,18 @@ def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarra
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
 def test_drake_parser_and_load_arm_give_the_same_arm(name):
     arm = load_arm(name)
-    ours, plain = make_arm_plant(arm), plain_plant(name)
-    assert plain.num_positions() == ours.num_positions() == len(arm.tree_joint_names)
-    ours_context, context = ours.CreateDefaultContext(), plain.CreateDefaultContext()
+    composed, plain = make_arm_plant(arm), plain_plant(name)
+    assert plain.num_positions() == composed.num_positions() == len(arm.tree_joint_names)
+    composed_context, context = composed.CreateDefaultContext(), plain.CreateDefaultContext()
     for q in arm.sample_poses(10, np.random.default_rng(0)):
-        set_arm_positions(ours, ours_context, arm, q)
+        set_arm_positions(composed, composed_context, arm, q)
         q_plant, index = positions(plain, arm, q)
         plain.SetPositions(context, q_plant)
         gravity = -arm.linkage.pull_back_effort(plain.CalcGravityGeneralizedForces(context)[index])
-        np.testing.assert_allclose(gravity, holding_torque(ours, ours_context, arm), atol=1e-12)
-        order = positions(ours, arm, q)[1]
+        np.testing.assert_allclose(gravity, holding_torque(composed, composed_context, arm), atol=1e-12)
+        order = positions(composed, arm, q)[1]
         mass = plain.CalcMassMatrix(context)[np.ix_(index, index)]
-        np.testing.assert_allclose(mass, ours.CalcMassMatrix(ours_context)[np.ix_(order, order)], atol=1e-12)
+        np.testing.assert_allclose(mass, composed.CalcMassMatrix(composed_context)[np.ix_(order, order)], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
@@ -110,7 +110,7 @@ def test_mtm_files_equal_the_output_of_the_tool(name):
     assert (MODELS_FOLDER / "sdf" / f"{name}.sdf").read_text() == tool["master_sdf"](load_arm(name))
 
 
-def test_the_page_about_drake_runs(capsys):
+def test_code_of_the_page_about_drake_runs(capsys):
     page = (ROOT / "docs/models_in_drake.md").read_text()
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(code, {})

@@ -1,4 +1,4 @@
-"""Tests the MTM's SDF against the dVRK's DH table, the paper's Table I, and mechanics."""
+"""Tests the SDF of the MTM: DH table of the dVRK, Table I of the paper, linkage and inertias."""
 
 import numpy as np
 import pytest
@@ -65,12 +65,12 @@ def test_forward_kinematics_equals_both_published_tables(arm, plant, prefix):
             np.testing.assert_allclose(X.GetAsMatrix4(), X_0, rtol=0, atol=1e-12)
 
 
-def test_paper_base_is_the_dvrk_base_turned_by_a_quarter(plant):
+def test_paper_base_is_rotated_by_90_degrees(plant):
     X = plant.GetFrameByName("dh_0").CalcPose(plant.CreateDefaultContext(), plant.GetFrameByName("paper_0"))
     assert X.IsNearlyEqualTo(RigidTransform(RotationMatrix.MakeZRotation(PI / 2)), 1e-12)
 
 
-def test_parallelogram_stays_closed_over_the_joint_box(arm, plant):
+def test_parallelogram_is_closed_within_the_limits(arm, plant):
     context = plant.CreateDefaultContext()
     corners = np.array(np.meshgrid(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True))).reshape(3, -1).T
     box = np.random.default_rng(2).uniform(arm.position_lower, arm.position_upper, (200, 7))
@@ -112,7 +112,7 @@ def test_inertias_are_consistent_and_centres_of_mass_off_joints(plant):
 
 
 def test_motor_4_couples_elbow_and_platform(arm, plant):
-    """Checks that the inertia of rotor 4, which turns with 0.6697 q3 + q4, enters G' M G as J_4' I J_4."""
+    """Checks that rotor 4, which rotates by 0.6697 q3 + q4, adds J_4' I J_4 to the mass matrix G' M G."""
     context = plant.CreateDefaultContext()
     G = np.zeros((plant.num_velocities(), 7))
     G[tree_selector(plant, arm)] = arm.linkage.matrix
@@ -147,9 +147,9 @@ def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
 
 
 def test_pinned_loop_has_the_same_holding_torque(arm, plant):
-    """Compares the variant without loop mimics: statics by the null space of its numerical constraint Jacobian."""
+    """Computes the statics of the variant with a pin from the null space of its numerical constraint Jacobian."""
     loop_plant = make_arm_plant(arm, closure="ball")
-    assert loop_plant.num_constraints() == plant.num_constraints()  # two mimics fewer; one pin and one length more
+    assert loop_plant.num_constraints() == plant.num_constraints()  # two mimics are replaced by a pin and a distance
     (loop,) = arm.loop_closures
     A, B = (loop_plant.GetFrameByName(name) for name in (loop.frame_a, loop.frame_b))
     context, loop_context = plant.CreateDefaultContext(), loop_plant.CreateDefaultContext()
@@ -173,7 +173,7 @@ def test_pinned_loop_has_the_same_holding_torque(arm, plant):
         tau_g = loop_plant.CalcGravityGeneralizedForces(loop_context)
         independent = select[:7]
         dependent = [i for i in range(len(q_full)) if i not in independent and i != motor]
-        # J_d qd_d = -J_i qd_i defines how crank and coupler follow.
+        # J_d qd_d = -J_i qd_i defines the velocities of crank and coupler.
         follow = -np.linalg.pinv(jacobian[:, dependent]) @ jacobian[:, independent]
         tau = -(tau_g[independent] + follow.T @ tau_g[dependent])
         set_arm_positions(plant, context, arm, q)
@@ -200,7 +200,7 @@ def test_holding_torque_holds_the_simulated_linkage(arm, closure):
     assert np.linalg.norm(gap) < 1e-6
 
 
-def test_transmission_keeps_power(arm):
+def test_transmission_conserves_power(arm):
     generator = np.random.default_rng(5)
     qd, tau_actuator = generator.normal(size=7), generator.normal(size=7)
     tau_joint = arm.transmission.pull_back_effort(tau_actuator)
@@ -251,7 +251,7 @@ def test_arm_that_cannot_meet_its_coupled_limit_is_refused(arm):
 
     lower = arm.position_lower.copy()
     lower[1:3] = [0.7, 0.3]
-    with pytest.raises(ArmError, match=r"parallelogram: no pose inside position_limits meets -0\.33\.\.0\.68"):
+    with pytest.raises(ArmError, match=r"parallelogram: no pose within position_limits meets -0\.33\.\.0\.68"):
         dataclasses.replace(arm, position_lower=lower)
 
 
@@ -260,7 +260,7 @@ def test_sampling_fails_if_coupled_limit_is_rarely_met(arm):
 
     lower = arm.position_lower.copy()
     lower[1:3] = [0.6, 0.0799999]
-    with pytest.raises(ArmError, match="hardly any pose inside its position limits"):
+    with pytest.raises(ArmError, match="almost no pose within the position limits"):
         dataclasses.replace(arm, position_lower=lower).sample_poses(5, np.random.default_rng(0))
 
 
@@ -269,7 +269,7 @@ def test_unknown_arm_lists_the_known_ones():
         load_arm("mtm")
 
 
-def test_friction_tag_is_forbidden(tmp_path):
+def test_sdf_friction_is_refused(tmp_path):
     from dvrk_drake.models.sdf_model import compose_sdf, read_sdf_facts
 
     path = tmp_path / "a.sdf"
@@ -277,7 +277,7 @@ def test_friction_tag_is_forbidden(tmp_path):
         '<sdf version="1.9"><model name="a"><link name="base_link"/><joint name="j" type="revolute">'
         "<axis><xyz>0 0 1</xyz><dynamics><friction>1</friction></dynamics></axis></joint></model></sdf>"
     )
-    with pytest.raises(ArmError, match="joint j of the SDF has <friction>, which Drake drops silently"):
+    with pytest.raises(ArmError, match="joint j of the SDF has <friction>, which Drake ignores"):
         read_sdf_facts(compose_sdf([str(path)]))
 
 

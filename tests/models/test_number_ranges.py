@@ -50,7 +50,7 @@ OBJECTS = (Arm, GravityCompensationFile, CollectionSettings, Grip)
 
 
 def numbers_of(schema: type, path: tuple = ()):
-    """Yields (path, field, type) of each field with numbers; path: the names, [0] of a list and "x" of a table."""
+    """Yields (path, field, type) of each field with numbers. A path has names, 0 for a list and "x" for a mapping."""
     hints = get_type_hints(schema)
     for field in dataclasses.fields(schema):
         yield from numbers_in(hints[field.name], (*path, field.name), field)
@@ -155,7 +155,7 @@ def changed(owner, path, value):
     [(gain, value) for gain in ("kp", "kd", "ki") for value in (1e-9, 1e9, math.nan, math.inf, -1.0)],
 )
 @pytest.mark.parametrize("arm", ["mtml", "psm"])
-def test_absurd_gains_are_refused_in_files_and_in_python(arm, gain, value, tmp_path, capsys):
+def test_implausible_gains_are_refused_in_files_and_python(arm, gain, value, tmp_path, capsys):
     arm = load_arm(arm)
     gains = dataclasses.asdict(arm.gains)
     gains[gain][2] = value
@@ -179,7 +179,7 @@ def test_gains_are_compared_with_the_effort_limit_and_the_range():
     for share, ok in ((0.99, True), (1.01, False)):
         gains = dataclasses.replace(arm.gains, kp=(share * arm.effort_limits / least_error).tolist())
         assert (arm.gains_fault(gains) == "") == ok
-    assert "for the range and effort limit of outer_yaw" in arm.gains_fault(gains)
+    assert "for the position range and effort limit of outer_yaw" in arm.gains_fault(gains)
     with pytest.raises(ScenarioError, match=r"mtml: controller\.gains\.kp\[0\] is 1e\+06; allowed: .*outer_yaw"):
         load_scenario("mtml", [f"controller.gains={dataclasses.asdict(dataclasses.replace(gains, kp=[1e6] * 7))}"])
 
@@ -230,7 +230,12 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
         ("arm", (LIMITS, "yaw"), [1.0, 1.001], r"yaw: upper - lower is 0\.001; allowed: 0\.01\.\.25\.2 rad"),
         ("arm", (LIMITS, "insertion"), [0.1, 0.1001], r"insertion: upper - lower is 0\.0001; allowed: 0\.001\.\.2 m"),
         ("arm", ("gravity",), [0, 0, -9810], r"gravity\[2\] is -9810; allowed: -30\.\.30 m/s\^2"),
-        ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 0.0}}], r"coupled_limits\.sum has no coefficient"),
+        (
+            "mechanism",
+            (COUPLED,),
+            [{**SUM, "coefficients": {"yaw": 0.0}}],
+            r"coupled_limits\.sum: all coefficients are 0",
+        ),
         ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 1e9}}], r"coefficients\.yaw is 1e\+09; allowed: "),
         ("mechanism", (COUPLED,), [{**SUM, "lower": 1.0}], r"coupled_limits\.sum is \[1, 1\]; allowed: .* < upper"),
         ("mechanism", (COUPLED,), [{**SUM, "lower": 0.999}], r"coupled_limits\.sum: upper - lower is 0\.001; all"),
@@ -239,18 +244,23 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
             "mechanism",
             (COUPLED,),
             [{**SUM, "lower": 3.0, "upper": 4.0}],
-            r"coupled_limits\.sum: no pose inside position_limits meets 3\.\.4; allowed: .* -2\.513\.\.2\.513",
+            r"coupled_limits\.sum: no pose within position_limits meets 3\.\.4; allowed: .* -2\.513\.\.2\.513",
         ),
         (
             "mechanism",
             (COUPLED,),
             [{**SUM, "upper": -0.5}, {**SUM, "name": "same", "lower": 0.5}],
-            "coupled_limits: no pose inside position_limits meets them all",
+            "coupled_limits: no pose within position_limits meets all coupled limits",
         ),
-        ("mechanism", ("transmission",), {"yaw": {"yaw": 0.0}}, r"transmission\.yaw has no coefficient other than 0"),
+        ("mechanism", ("transmission",), {"yaw": {"yaw": 0.0}}, r"transmission\.yaw: all coefficients are 0"),
         ("mechanism", ("transmission",), {"yaw": {"yaw": 1e9}}, r"transmission\.yaw\.yaw is 1e\+09; allowed: 0 or "),
-        ("instrument", ("joint_from_actuator", "roll"), {"roll": 0.0}, r"joint_from_actuator\.roll has no coeff"),
-        ("instrument", ("friction_coordinates", "finger_1"), {"jaw": 0.0}, r"friction_coordinates\.finger_1 has no c"),
+        (
+            "instrument",
+            ("joint_from_actuator", "roll"),
+            {"roll": 0.0},
+            r"joint_from_actuator\.roll: all coefficients are 0",
+        ),
+        ("instrument", ("friction_coordinates", "finger_1"), {"jaw": 0.0}, r"friction_coordinates\.finger_1: all c"),
         ("mechanism", ("effort_cut_off",), 1e6, r"effort_cut_off is 1e\+06; allowed: 0\.1\.\.1000 Hz"),
         ("mechanism", ("motion", "effort_delay"), [5.0, 0, 0], r"effort_delay\[0\] is 5; .*0\.2 s; is it in ms\?"),
         ("mechanism", ("bounding_shapes", "margin"), 40, r"bounding_shapes\.margin is 40; .* m; is it in mm\?"),
@@ -262,7 +272,7 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
         ("mechanism", ("gains", "ki"), [9.5, 9.5, 1e8], r"gains\.ki\[2\] is 1e\+08; .* effort limit of insertion"),
     ],
 )
-def test_absurd_numbers_in_the_files_of_an_arm_are_refused(file, keys, value, message, own_psm, capsys):
+def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message, own_psm, capsys):
     path = own_psm([(file, keys, value)])
     with pytest.raises(ArmError, match=message) as refused:
         load_arm(str(path))
@@ -289,7 +299,7 @@ def test_absurd_numbers_in_the_files_of_an_arm_are_refused(file, keys, value, me
         ('offset="[^"]*', 'offset="90', r"offset is 90; allowed: .*; is it in degrees or mm\?"),
     ],
 )
-def test_absurd_numbers_in_an_sdf_are_refused(element, value, message, own_psm, capsys):
+def test_implausible_numbers_in_an_sdf_are_refused(element, value, message, own_psm, capsys):
     path = own_psm(sdf=(element, value))
     with pytest.raises(ArmError, match=message):
         load_arm(str(path))
@@ -313,7 +323,7 @@ def test_pose_with_degrees_attribute_is_read(own_psm):
         ("gravity[2]", -1e300, r"allowed: -30\.\.30 m/s\^2"),
     ],
 )
-def test_absurd_numbers_in_a_model_are_refused(key, value, message, tmp_path, capsys):
+def test_implausible_numbers_in_a_model_are_refused(key, value, message, tmp_path, capsys):
     path = tmp_path / "model.yaml"
     IdentifiedModel.from_arm(load_arm("mtml")).save(path)
     content = yaml.safe_load(path.read_text())
@@ -363,14 +373,14 @@ def test_invalid_numbers_of_an_arm_made_in_python_are_refused():
     arm = load_arm("mtml")
     never = CoupledLimit("never", {"outer_yaw": 0.0}, 0.0, 1.0)
     for changes, message in (
-        ({"coupled_limits": (never,)}, r"coupled_limits\.never: coefficients are all 0"),
+        ({"coupled_limits": (never,)}, r"coupled_limits\.never: all coefficients are 0"),
         ({"coupled_limits": (dataclasses.replace(never, coefficients={"outer_yaw": math.nan}),)}, "is nan; allowed"),
         ({"effort_limits": arm.effort_limits[:6]}, "effort_limits has 6 numbers; allowed: 7, one per joint"),
         ({"gains": Gains([1.0], [1.0], [1.0])}, r"gains\.kp has 1 number; allowed: 7, one per joint"),
         ({"effects": ArmEffects(stretch={"outer_yaw": Cable()})}, r"effects\.stretch\.outer_yaw\.stiffness is 0; all"),
         ({"effects": ArmEffects(friction=[FrictionEffect(coefficient=math.nan)])}, r"coefficient is nan; allowed: "),
-        ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing has no coefficient"),
-        ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be three numbers of a size up to 30"),
+        ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing: all coefficients are 0"),
+        ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be a vector of three numbers with a length up to 30"),
     ):
         with pytest.raises(ArmError, match=message):
             dataclasses.replace(arm, **changes)

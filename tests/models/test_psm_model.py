@@ -1,4 +1,4 @@
-"""Tests the PSM's SDF against the dVRK's DH table, and its linkage with a fixed remote centre of motion."""
+"""Tests the SDF of the PSM: DH table of the dVRK, linkage and remote centre of motion."""
 
 import numpy as np
 import pytest
@@ -44,13 +44,13 @@ def box(arm):
     return poses
 
 
-def test_joints_and_limits_are_the_dvrks(arm):
+def test_joints_and_limits_equal_those_of_the_dvrk(arm):
     assert arm.joint_names == ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
     np.testing.assert_allclose(arm.position_lower[:3], [-1.588, -0.925025, 0.0], atol=1e-9)
     np.testing.assert_allclose(arm.effort_limits, [3.316, 3.316, 9.878, 0.33, 0.25, 0.20, 0.16], atol=1e-9)
 
 
-def test_forward_kinematics_equals_the_dvrks_table(arm, plant, box):
+def test_forward_kinematics_equals_the_dvrk_dh_table(arm, plant, box):
     context = plant.CreateDefaultContext()
     for q in box:
         set_arm_positions(plant, context, arm, q)
@@ -120,7 +120,7 @@ def test_inertias_are_physically_consistent(plant):
             assert np.linalg.norm(body.default_com()) > 1e-4 or body.name() == "counterweight_link"
 
 
-def test_disc_coupling_is_the_dvrks_and_keeps_power(arm):
+def test_disc_coupling_equals_the_dvrk_and_conserves_power(arm):
     M = np.array([[-1.5632, 0, 0, 0], [0, 1.0186, 0, 0], [0, -0.8306, 0.6089, 0.6089], [0, 0, -1.2177, 1.2177]])
     disc = np.array([0.1, -0.2, 0.3, 0.5])
     q = np.concatenate([[0.1, 0.2, 0.05], M @ disc])

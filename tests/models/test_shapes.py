@@ -25,7 +25,7 @@ MESHES = sorted((SDF / "meshes").glob("*/*.gltf"))
 
 
 def vertices(mesh):
-    """Returns the vertices (n, 3) [m] in the link's frame, Z up."""
+    """Returns the vertices (n, 3) [m] of a mesh in the link frame, Z up."""
     document = json.loads(mesh.read_text())
     data = b64decode(document["buffers"][0]["uri"].partition(",")[2])
     parts = []
@@ -43,7 +43,7 @@ def plant():
 
 @pytest.fixture(scope="module")
 def psm_vertices():
-    """Returns a mapping from each link of the PSM or its instrument to all its drawn vertices."""
+    """Returns a mapping from each link of the PSM and its instrument to the vertices (n, 3) of its meshes [m]."""
     found = {}
     for link in compose_sdf(load_arm("psm").sdf).iter("link"):
         meshes = [Path(str(uri.text).replace("package://dvrk_drake", str(MODELS_FOLDER))) for uri in link.iter("uri")]
@@ -93,7 +93,7 @@ def test_both_links_of_a_pin_are_drawn_around_it(plant, psm_vertices):
             assert (drawn.max(axis=0) > 0).all()
             assert (
                 np.linalg.norm(np.cross(drawn, axis), axis=1).min() < 0.03
-            )  # bolt circle of the largest bearing: 26 mm
+            )  # 26 mm: bolt circle of the largest bearing
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_links_on_shafts_and_slides_touch_at_both_ends(plant, psm_vertices, pare
     context = plant.CreateDefaultContext()
     arm = load_arm("psm")
     for insertion in (arm.position_lower[2], arm.position_upper[2]):
-        set_arm_positions(plant, context, arm, [0, 0, insertion, 0, 0, 0, 0])  # so all links are parallel
+        set_arm_positions(plant, context, arm, [0, 0, insertion, 0, 0, 0, 0])  # all links are parallel
         drawn = [
             psm_vertices[name] + plant.GetBodyByName(name).EvalPoseInWorld(context).translation()
             for name in (parent, child)
@@ -147,7 +147,7 @@ NEIGHBOURS = (
 
 
 def test_links_do_not_collide_within_the_joint_limits():
-    """Checks collision shapes without the arm's collision filters. Drake excludes pairs of links that share a joint."""
+    """Checks collisions without the collision filters of the arm. Drake ignores pairs of links that share a joint."""
     arm = load_arm("psm")
     root = compose_sdf(arm.sdf, arm.mirrored_links)
     (model,) = root.findall("model")
@@ -163,19 +163,19 @@ def test_links_do_not_collide_within_the_joint_limits():
     plant.Finalize()
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
-    inspector, met = scene_graph.model_inspector(), set()
+    inspector, contacts = scene_graph.model_inspector(), set()
     for q in np.vstack([box_corners(arm), np.random.default_rng(0).uniform(*limits(arm), (200, 7))]):
         set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
         query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
         for pair in query.ComputePointPairPenetration():
             frames = [inspector.GetFrameId(geometry) for geometry in (pair.id_A, pair.id_B)]
-            met.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
-    assert met <= set(map(frozenset, NEIGHBOURS))
-    assert frozenset({"top_bar_link", "end_link"}) in met
+            contacts.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
+    assert contacts <= set(map(frozenset, NEIGHBOURS))
+    assert frozenset({"top_bar_link", "end_link"}) in contacts
 
 
 def limits(arm):
-    """Returns lower and upper limits. The jaw starts closed, because below that its fingers press on each other."""
+    """Returns the lower and upper limits (7,). For the jaw, the lower limit is the closed jaw."""
     return np.append(arm.position_lower[:6], 0.0), arm.position_upper
 
 

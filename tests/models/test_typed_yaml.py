@@ -1,4 +1,4 @@
-"""Tests settings files: errors name the key, its value and the accepted values at any depth."""
+"""Tests YAML files. Errors name the key, its value and the accepted values at any depth."""
 
 from dataclasses import dataclass, field
 
@@ -31,16 +31,20 @@ def test_the_files_themselves_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        ("arm", ("name:", "nam:"), 'key "nam" is unknown; did you mean "name"? allowed in an arm\'s file: name, mech'),
+        ("arm", ("name:", "nam:"), 'key "nam" is unknown; did you mean "name"? allowed in an arm file: name, mech'),
         ("arm", ("name: PSM", "name: PSM\neffort_limit: abc"), 'key "effort_limit" is unknown; '),
-        ("arm", ("name: PSM", "name: [PSM]"), "name is ['PSM']; allowed: a text"),
+        ("arm", ("name: PSM", "name: [PSM]"), "name is ['PSM']; allowed: a string"),
         ("arm", ("name: PSM", "name: PSM\ngravity: 9.81"), "gravity is 9.81; allowed: a list of numbers, e.g. [9.81]"),
         ("arm", ("yaw: [", "yaw: [low, "), 'position_limits.yaw[0] is "low"; allowed: a number'),
-        ("arm", ("name: PSM", "name: PSM\ncoupled_limits: []"), "coupled_limits is []; allowed: a table of names with"),
+        (
+            "arm",
+            ("name: PSM", "name: PSM\ncoupled_limits: []"),
+            "coupled_limits is []; allowed: a mapping from names to",
+        ),
         (
             "mechanism",
             ("joints:", "jonts:"),
-            'key "jonts" is unknown; did you mean "joints"? allowed in an arm\'s mech',
+            'key "jonts" is unknown; did you mean "joints"? allowed in a mechanism file',
         ),
         (
             "mechanism",
@@ -61,7 +65,7 @@ def test_the_files_themselves_are_read(tmp_path):
         (
             "arm",
             ("position_limits:", "position_limits: 3\nmirrored_links:"),
-            "position_limits is 3; allowed: a table of",
+            "position_limits is 3; allowed: a mapping from",
         ),
         ("instrument", ("sdf:", "sdf: [\n"), "instrument.yaml:"),
     ],
@@ -106,7 +110,7 @@ class Outer:
     ],
 )
 def test_accepts_the_same_content_as_drake(line):
-    """Checks that the same content is accepted as by Drake, except that numbers must be finite."""
+    """Checks that the schema accepts the same content as Drake, except for numbers that are not finite."""
     try:
         expected = yaml_load_typed(schema=Outer, data=line)
     except Exception:
@@ -125,7 +129,7 @@ def test_text_in_place_of_a_list_is_refused():
 
 def test_duplicate_key_is_refused():
     for text, line in (("a: 1\nb: 2\na: 3\n", 3), ("b:\n  c: {d: 1, d: 2}\n", 2)):
-        with pytest.raises(ArmError, match=rf'own.yaml: not YAML: line {line}: key "[ad]" is there twice'):
+        with pytest.raises(ArmError, match=rf'own.yaml: invalid YAML: line {line}: duplicate key "[ad]"'):
             parse_yaml(text, "own.yaml", ArmError)
     assert parse_yaml("a: &x {c: 1}\nb: {<<: *x, c: 2}\n", "own.yaml", ArmError)["b"] == {"c": 2}
 
@@ -134,11 +138,11 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_bytes(b"name: \xff")
     for where, message in (
-        (path, "not a text file in UTF-8"),
+        (path, "is not a UTF-8 text file"),
         (tmp_path, "is not a file but a folder"),
         (tmp_path / "x", "no such file"),
     ):
-        with pytest.raises(ArmError, match=f"{where}: {message}"):
+        with pytest.raises(ArmError, match=f"{where}:? {message}"):
             load_typed_yaml(Outer, where, ArmError, "a test")
 
 
@@ -153,13 +157,13 @@ def test_keys_of_earlier_versions_are_read_with_a_warning(tmp_path):
     assert scenario.controller.compensated_effects == ["cables"]
     assert scenario.effects[0].coefficient == 0.1
     assert [str(warning.message).partition(": ")[2] for warning in warned] == [
-        'key "real_arm" is now "simulated_effects"',
-        'key "knows" is now "compensated_effects"',  # an earlier key
-        'key "value" is now "coefficient"',
+        'key "real_arm" was renamed to "simulated_effects"',
+        'key "knows" was renamed to "compensated_effects"',  # an earlier key
+        'key "value" was renamed to "coefficient"',
     ]
 
 
-def test_an_earlier_key_beside_its_new_one_is_refused(tmp_path):
+def test_earlier_and_new_key_together_are_refused(tmp_path):
     (tmp_path / "scenario.yaml").write_text("arm: mtml\nreal_arm: [stops]\nsimulated_effects: [stops]\n")
     with pytest.raises(ScenarioError, match='key "real_arm" is unknown'):
         load_scenario(str(tmp_path / "scenario.yaml"), [])

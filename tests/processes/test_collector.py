@@ -1,10 +1,10 @@
-"""Collecting poses without a network: friction cancels, and whatever happens on the way ends well."""
+"""Pose collection without a network: cancellation of friction, interruptions and errors."""
 
 import threading
 
 import numpy as np
 import pytest
-from sticky_arm import PERIOD, Disk, GuardedArm, lead, make_collector, make_quick, near_poses, random_poses
+from sticky_arm import PERIOD, Disk, GuardedArm, make_collector, make_quick, near_poses, random_poses, run_collector
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -21,7 +21,7 @@ def collect_with_friction(path, both_sides):
     poses = 0.5 * random_poses(arm, 1) + [0, 0.2, 0, 0, 0, 0, 0]
     lines = []
     collector, controller, sticky = make_collector(path, poses, FRICTION, both_sides, report=lines.append)
-    lead(collector, controller, sticky, 60.0)
+    run_collector(collector, controller, sticky, 60.0)
     collector.close()
     assert collector.finished and collector.problem is None and not collector.unsettled
     assert collector.done.all()
@@ -31,7 +31,7 @@ def collect_with_friction(path, both_sides):
     return recording, (recording.tau - sticky.model.holding_torque(recording.q)) / FRICTION
 
 
-def test_both_sides_cancel_dry_friction_and_one_does_not(tmp_path):
+def test_only_approach_from_both_sides_cancels_friction(tmp_path):
     _, error = collect_with_friction(tmp_path / "both.csv", True)
     _, one_sided = collect_with_friction(tmp_path / "one.csv", False)
     assert np.abs(error).max() < 0.01
@@ -41,15 +41,15 @@ def test_both_sides_cancel_dry_friction_and_one_does_not(tmp_path):
     np.testing.assert_allclose(friction, FRICTION, rtol=0.01, atol=0)
 
 
-def test_a_stop_on_the_way_brakes_and_the_rest_is_done_next_time(tmp_path):
-    asked = []
-    collector, controller, sticky = make_quick(tmp_path, stopped=lambda: bool(asked))
+def test_stop_brakes_and_next_run_resumes(tmp_path):
+    stop_requested = []
+    collector, controller, sticky = make_quick(tmp_path, stopped=lambda: bool(stop_requested))
     moves = lambda: collector.done.any() and np.abs(sticky.v).max() > 0.03  # noqa: E731
-    lead(collector, controller, sticky, 10.0, moves)
+    run_collector(collector, controller, sticky, 10.0, moves)
     assert moves() and not collector.finished
-    asked.append(True)
+    stop_requested.append(True)
     stopped_at = sticky.ticks
-    lead(collector, controller, sticky, 1.0)
+    run_collector(collector, controller, sticky, 1.0)
     collector.close()
     assert collector.finished and collector.problem is None
     assert PERIOD * (sticky.ticks - stopped_at) < 0.35
@@ -59,108 +59,108 @@ def test_a_stop_on_the_way_brakes_and_the_rest_is_done_next_time(tmp_path):
 
     collector, controller, sticky = make_quick(tmp_path)
     assert collector.done.tolist() == [True, False, False]
-    lead(collector, controller, sticky, 20.0)
+    run_collector(collector, controller, sticky, 20.0)
     collector.close()
     assert collector.done.all()
     assert (tmp_path / "o.csv").read_bytes().startswith(first)
     np.testing.assert_allclose(read_recording(tmp_path / "o.csv").q, near_poses(), atol=2e-3)
 
 
-def test_a_stop_before_the_arm_obeys_ends_at_once(tmp_path):
+def test_stop_before_start_ends_immediately(tmp_path):
     collector, controller, sticky = make_quick(tmp_path, stopped=lambda: True)
-    lead(collector, controller, sticky, 0.1)
+    run_collector(collector, controller, sticky, 0.1)
     assert collector.finished and collector.problem is None and sticky.ticks <= 2
     assert not (tmp_path / "o.csv").exists()
 
 
-def test_it_ends_when_the_arm_takes_over(tmp_path):
+def test_ends_when_arm_takes_over(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
-    lead(collector, controller, sticky, 10.0, collector.done.any)
+    run_collector(collector, controller, sticky, 10.0, collector.done.any)
     sticky.off = True
-    lead(collector, controller, sticky, 0.1)
+    run_collector(collector, controller, sticky, 0.1)
     collector.close()
     assert collector.finished and "MTML took over and holds: its " in str(collector.problem)
     assert len(read_recording(tmp_path / "o.csv")) == 1
 
 
-def test_it_ends_when_the_arm_never_obeys(tmp_path):
+def test_ends_when_arm_applies_no_efforts(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
     sticky.off = True
-    lead(collector, controller, sticky, 12.0)
-    assert collector.finished and "did not let efforts act within 10 s" in str(collector.problem)
+    run_collector(collector, controller, sticky, 12.0)
+    assert collector.finished and "did not apply efforts within 10 s" in str(collector.problem)
 
 
-def test_it_ends_when_something_is_in_the_way(tmp_path):
+def test_ends_when_arm_is_blocked(tmp_path):
     collector, controller, sticky = make_collector(
         tmp_path / "o.csv", near_poses() + np.outer([0, 1, 0], [0.3, 0.3, 0, 0, 0, 0, 0]), np.zeros(7), False
     )
-    lead(collector, controller, sticky, 10.0, collector.done.any)
+    run_collector(collector, controller, sticky, 10.0, collector.done.any)
     sticky.friction = np.array([1e3] + [0.0] * 6)  # outer yaw is held
-    lead(collector, controller, sticky, 5.0)
+    run_collector(collector, controller, sticky, 5.0)
     collector.close()
     assert collector.finished and "does not follow: outer_yaw is at" in str(collector.problem)
     assert collector.done.tolist() == [True, False, False]
 
 
-def test_a_pose_without_rest_is_left_out_and_named(tmp_path):
+def test_pose_without_rest_is_skipped_and_reported(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
-    lead(collector, controller, sticky, 10.0, lambda: collector.describe().endswith("settling at pose 2"))
+    run_collector(collector, controller, sticky, 10.0, lambda: collector.describe().endswith("settling at pose 2"))
     status = sticky.status
     shaken = lambda: [q + 0.01 * np.sin(60 * PERIOD * sticky.ticks) for q in sticky.q]  # noqa: E731
 
     def shaking():
-        said = status()
+        changed = status()
         if "pose 2" in collector.describe():
-            said.position = shaken()
-        return said
+            changed.position = shaken()
+        return changed
 
     sticky.status = shaking
-    lead(collector, controller, sticky, 20.0)
+    run_collector(collector, controller, sticky, 20.0)
     collector.close()
     assert collector.finished and collector.problem is None
     assert collector.unsettled == [2]
     assert collector.done.tolist() == [True, False, True]
 
 
-def test_an_encoder_that_alternates_between_two_counts_rests(tmp_path):
-    """A count of an MTM's wrist is 3 to 6 mrad; while no joint moves, a reading may alternate."""
+def test_rest_is_detected_with_alternating_encoder_count(tmp_path):
+    """At rest, a reading may alternate between two encoder counts. A count of an MTM's wrist is 3 to 6 mrad."""
     collector, controller, sticky = make_quick(tmp_path)
     counts = load_arm("mtml").encoder_counts()
     assert counts.max() > 5e-3
     status = sticky.status
 
     def alternating():
-        said = status()
-        said.position = list(sticky.q + (sticky.ticks // 7 % 2) * counts)
-        return said
+        changed = status()
+        changed.position = list(sticky.q + (sticky.ticks // 7 % 2) * counts)
+        return changed
 
     sticky.status = alternating
-    lead(collector, controller, sticky, 40.0)
+    run_collector(collector, controller, sticky, 40.0)
     collector.close()
     assert collector.finished and collector.problem is None and not collector.unsettled
     assert collector.done.all()
 
 
-def test_a_file_that_cannot_be_written_ends_it(tmp_path):
+def test_ends_when_file_cannot_be_written(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
     (tmp_path / "o.csv").mkdir()
-    lead(collector, controller, sticky, 10.0)
+    run_collector(collector, controller, sticky, 10.0)
     collector.close()
     assert collector.finished and isinstance(collector.problem, RecordingError)
     assert not collector.done.any()
 
 
-def test_an_arm_is_held_at_its_pose_while_the_disk_is_slow(tmp_path):
+def test_arm_is_held_while_disk_is_slow(tmp_path):
     disk = Disk(slow=True)
     collector, controller, sticky = make_quick(tmp_path, writer=disk)
-    lead(collector, controller, sticky, 10.0, lambda: disk.waiting)
-    lead(collector, controller, sticky, 12.0)  # longer than the arm may take to settle
+    run_collector(collector, controller, sticky, 10.0, lambda: disk.waiting)
+    run_collector(collector, controller, sticky, 12.0)  # longer than the arm may take to settle
     assert collector.problem is None and not collector.finished and not collector.done.any()
     assert collector.describe() == "0 of 3 poses, writing pose 1"
     np.testing.assert_allclose(sticky.q, near_poses()[0], atol=2e-3)
     disk.finish()
     disk.slow = False
-    lead(collector, controller, sticky, 10.0)
+    run_collector(collector, controller, sticky, 10.0)
     collector.close()
     assert collector.problem is None and collector.done.all()
 
@@ -170,39 +170,39 @@ def test_rows_are_written_by_another_thread(tmp_path):
     collector, controller, sticky = make_quick(tmp_path, writer=None)
     written_by, append = [], collector._output.append
     collector._output.append = lambda *row: (append(*row), written_by.append(threading.get_ident()))
-    lead(collector, controller, sticky, np.inf, collector.done.any)
+    run_collector(collector, controller, sticky, np.inf, collector.done.any)
     collector.close()
     assert threading.get_ident() not in written_by and len(written_by) == 1
     assert len(read_recording(tmp_path / "o.csv")) == 1
 
 
 @pytest.mark.parametrize("seconds", [0.5, 61.0])
-def test_a_speed_that_is_not_allowed(seconds):
+def test_rejects_speed_out_of_range(seconds):
     with pytest.raises(CollectionError, match=r"allowed: 1..60 s"):
         CollectionSettings(seconds)
 
 
-def test_an_arm_whose_computer_is_slow_is_not_hurried(tmp_path):
-    """A simulated arm that takes four times as long as its clock says: the way goes by the arm's clock."""
+def test_trajectory_follows_clock_of_slow_arm(tmp_path):
+    """The arm's clock runs four times slower than the computer's clock. The trajectory follows the arm's clock."""
     poses = random_poses(load_arm("mtml"), 3, seed=4)
     collector, controller, sticky = make_collector(tmp_path / "o.csv", poses, np.zeros(7), both_sides=False)
     while not collector.finished and sticky.ticks < 20_000:
         status, time = sticky.status(), 4 * PERIOD * sticky.ticks
-        sticky.step(controller.answer(status, time, collector.lead(status, time)))
+        sticky.step(controller.answer(status, time, collector.update(status, time)))
     collector.close()
     assert collector.problem is None
     assert collector.done.all()
 
 
-def lead_until_obeyed(tmp_path):
-    """A collector that leads an arm behind a guard, until it has measured a pose; with an old refusal in the status."""
+def collect_until_first_pose(tmp_path):
+    """Returns collector, controller and guarded arm after the first pose, with an old refusal in the status."""
     made = make_collector(tmp_path / "o.csv", near_poses(), np.zeros(7), both_sides=False, arm_type=GuardedArm)
     collector, controller, arm = made
     bad = controller.answer(arm.status(), 0.0)
     bad.effort = [np.nan] * 7
     arm.step(bad)
     assert arm.guard.refusal_code == Status.REFUSAL_NOT_FINITE
-    lead(collector, controller, arm, 10.0, collector.done.any)
+    run_collector(collector, controller, arm, 10.0, collector.done.any)
     assert collector.done.any() and arm.guard.state == Status.STATE_EFFORT
     return made
 
@@ -215,50 +215,50 @@ def problem_after(made, pause):
         if collector.finished:
             break
         status, time = arm.status(), start + PERIOD * tick
-        arm.step(controller.answer(status, time, collector.lead(status, time)))
+        arm.step(controller.answer(status, time, collector.update(status, time)))
     collector.close()
     assert collector.finished
     return str(collector.problem)
 
 
-def test_a_pause_of_this_computer_is_named_as_the_cause(tmp_path):
-    made = lead_until_obeyed(tmp_path)
+def test_pause_of_this_computer_is_reported(tmp_path):
+    made = collect_until_first_pose(tmp_path)
     for _ in range(80):
         made[2].step()
     problem = problem_after(made, 0.0)
     assert made[2].guard.counts.expired == 1
-    assert "too slow" in problem and "81 ms between two of them" in problem and "answers per second" in problem
+    assert "too slow" in problem and "longest interval 81 ms" in problem and "answers per second" in problem
     assert "refusal" not in problem
 
 
-def test_a_pause_of_the_arms_computer_is_not_a_clock_jump(tmp_path):
-    """The arm's clock stood still meanwhile, so that the guard refuses a jump of the sender's clock."""
-    made = lead_until_obeyed(tmp_path)
+def test_pause_of_arm_computer_is_reported(tmp_path):
+    """The arm's clock stands still during the pause, so the guard refuses a jump of the sender's clock."""
+    made = collect_until_first_pose(tmp_path)
     problem = problem_after(made, 0.08)
     assert made[2].guard.refusal_code == Status.REFUSAL_CLOCK_JUMP
-    assert "too slow" in problem and "81 ms between two of them" in problem and "jump" not in problem
+    assert "too slow" in problem and "longest interval 81 ms" in problem and "jump" not in problem
 
 
-def test_a_refusal_without_a_pause_is_named(tmp_path):
-    made = lead_until_obeyed(tmp_path)
+def test_refusal_without_pause_is_reported(tmp_path):
+    made = collect_until_first_pose(tmp_path)
     collector, controller, arm = made
     while not collector.finished:
         status, time = arm.status(), PERIOD * arm.ticks
-        command = controller.answer(status, time, collector.lead(status, time))
+        command = controller.answer(status, time, collector.update(status, time))
         command.utime -= 10**6
         arm.step(command)
     problem = problem_after(made, 0.0)
-    assert "the last refusal is: after a jump of the sender's clock" in problem
+    assert "last refused command: jump of the sender's clock" in problem
 
 
-def test_a_refusal_of_an_earlier_time_is_not_named():
+def test_earlier_refusal_is_not_reported():
     before, status = Status(), Status()
     for of in (before, status):
         of.num_refused, of.refusal_code = 3, Status.REFUSAL_OTHER_SENDER
     status.guard_state = Status.STATE_HOLD
     assert takeover_reason(status, before, AnswerTimes()) == "its state is hold"
     status.num_refused += 1
-    assert takeover_reason(status, before, AnswerTimes()) == "the last refusal is: from a second sender"
+    assert takeover_reason(status, before, AnswerTimes()) == "last refused command: sent by a second sender"
     status.num_refused, status.num_ignored, status.ignored_code = 3, 1, Status.REFUSAL_NOT_AUTHENTIC
     problem = takeover_reason(status, before, AnswerTimes())
-    assert problem == "messages that it ignores: not signed with the arm's key (--key)"
+    assert problem == "the arm ignores messages: not signed with the arm's key (--key)"

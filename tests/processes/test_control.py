@@ -1,4 +1,4 @@
-"""Controlling, resetting and releasing an arm behind a guard, on a simulated clock and without a network."""
+"""Control, reset and release of a guarded arm, with a simulated clock and without a network."""
 
 import itertools
 from types import SimpleNamespace
@@ -21,7 +21,7 @@ from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
 
 class GuardedArm:
-    """Replaces an ArmLink: an arm that does not move, and its guard. A status comes every simulated millisecond."""
+    """Link to an arm that does not move, and to its guard. A status arrives every simulated millisecond."""
 
     def __init__(self):
         self.arm, self.lost, self.utime = ARM, 0, 10**9
@@ -55,7 +55,7 @@ def controller():
 
 
 def after(count, action):
-    """Does it when it is called for that time."""
+    """Returns a function that calls `action` at its call number `count`."""
     calls = []
 
     def step():
@@ -66,35 +66,35 @@ def after(count, action):
     return step
 
 
-def test_a_fault_is_reported_and_cleared():
-    link, said = GuardedArm(), []
+def test_fault_is_reported_and_cleared():
+    link, output = GuardedArm(), []
     link.guard.report_fault("the amplifier is hot")
     with pytest.raises(ControllerError, match=r"has a fault: the amplifier is hot\. Look at the arm, then start again"):
         first_status(link)
     assert not link.commands  # a fault is cleared on request only
-    reset_fault(link, lambda text: said.append((text, len(link.commands))))
-    assert said == [("MTML has a fault, which is reset now: the amplifier is hot", 0)]
+    reset_fault(link, lambda text: output.append((text, len(link.commands))))
+    assert output == [("MTML has a fault, which is reset now: the amplifier is hot", 0)]
     assert (link.guard.state, link.guard.fault_code) == (Status.STATE_HOLD, Status.FAULT_NONE)
     assert {command.control_mode for command in link.commands} == {Command.HOLD}
-    # Another sender is no second one any more, with the longest memory that a guard may have.
+    # A new sender is accepted, even with the longest expiry that a guard may have.
     assert link.utime - link.commands[-1].status_utime > 10**6
     status, period = first_status(link)
     assert status.fault_code == Status.FAULT_NONE
     assert period == pytest.approx(1e-3)
 
 
-def test_a_lasting_fault_is_an_error():
+def test_lasting_fault_is_an_error():
     link = GuardedArm()
     link.before_step = lambda: link.guard.report_fault("the amplifier is hot")
-    with pytest.raises(ControllerError, match="has a fault that stays: the amplifier is hot"):
+    with pytest.raises(ControllerError, match="still has a fault after the reset: the amplifier is hot"):
         reset_fault(link, lambda text: None)
     link = GuardedArm()
     reset_fault(link, pytest.fail)
     assert not link.commands
 
 
-def stop_for(link, seconds):
-    """The controller is stopped for so long, while the arm goes on."""
+def pause_controller(link, seconds):
+    """Advances the clock as if the controller was stopped for `seconds`."""
     link.utime += round(1e6 * seconds)
 
 
@@ -102,29 +102,31 @@ LOOK = r"Look at the arm, then start again with --reset"
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])
-def test_a_stopped_controller_ends_and_an_operator_resumes(controller, seconds):
-    link, said = GuardedArm(), []
+def test_stopped_controller_ends_and_operator_resumes(controller, seconds):
+    link, output = GuardedArm(), []
     end = link.now() + 2.0
-    link.before_step = after(500, lambda: stop_for(link, seconds))
+    link.before_step = after(500, lambda: pause_controller(link, seconds))
     if seconds < 0.05:
         control(link, controller, lambda: link.now() > end, lambda status: None)
         return
-    why = rf"MTML took over and holds: the last command expired: .* ms old by the arm's clock.*; .*too slow.*\. {LOOK}"
-    with pytest.raises(ControllerError, match=why):
+    reason = (
+        rf"MTML took over and holds: the last command expired: .* ms old by the arm's clock.*; .*too slow.*\. {LOOK}"
+    )
+    with pytest.raises(ControllerError, match=reason):
         control(link, controller, lambda: link.now() > end, lambda status: None)
     assert link.guard.state == Status.STATE_HOLD and link.now() < end
     sent = len(link.commands)
     with pytest.raises(ControllerError, match=rf"MTML took over and holds: the last command expired: .*\. {LOOK}"):
         first_status(link)
     assert len(link.commands) == sent
-    reset_fault(link, said.append)
-    (line,) = said
+    reset_fault(link, output.append)
+    (line,) = output
     assert line.startswith("MTML took over and waits for an operator, who resumes now: the last command expired: ")
     first_status(link)
     assert link.guard.hold_reason == ""
 
 
-def test_an_arm_that_does_not_resume_is_an_error():
+def test_arm_that_does_not_resume_is_an_error():
     link = GuardedArm()
 
     def take_over():
@@ -136,7 +138,7 @@ def test_an_arm_that_does_not_resume_is_an_error():
         reset_fault(link, lambda text: None)
 
 
-def test_an_arm_that_takes_over_during_the_release_is_an_error(controller):
+def test_takeover_during_release_is_an_error(controller):
     link = GuardedArm()
     end = link.now() + 0.5
     link.before_step = lambda: link.now() > end and link.guard._take_over("its period is 20 ms")
@@ -144,19 +146,19 @@ def test_an_arm_that_takes_over_during_the_release_is_an_error(controller):
         control(link, controller, lambda: link.now() > end, lambda status: None)
 
 
-def test_an_arm_that_tells_nothing_new():
+def test_rejects_constant_status():
     link = GuardedArm()
     status = link.next_status(1.0)
     link.next_status = lambda seconds: status
-    with pytest.raises(ControllerError, match="tells nothing new"):
+    with pytest.raises(ControllerError, match="utime or sequence of its status does not increase"):
         first_status(link)
 
 
 @pytest.mark.parametrize(
     ("measured", "reported", "refused"), [(1, 1, False), (5, 5, False), (10, 10, True), (10, 1, True)]
 )
-def test_an_arm_that_is_measured_too_seldom_is_refused(measured, reported, refused):
-    """A dVRK's 100 Hz, at which the pose hold of `run --mode hold` swings by 0.9 rad; its bridge may tell at 1 kHz."""
+def test_rejects_slow_measurements(measured, reported, refused):
+    """Rejects a period above 5 ms. At the 100 Hz of a dVRK, `run --mode hold` oscillates with 0.9 rad."""
     link, count = GuardedArm(), itertools.count()
     good = link.next_status(1.0)
 
@@ -168,23 +170,23 @@ def test_an_arm_that_is_measured_too_seldom_is_refused(measured, reported, refus
 
     link.next_status = next_status
     if refused:
-        with pytest.raises(ControllerError, match="MTML is measured at 100 Hz; control needs 200 Hz"):
+        with pytest.raises(ControllerError, match="MTML is measured at 100 Hz; control needs at least 200 Hz"):
             first_status(link)
     else:
         assert first_status(link)[1] == pytest.approx(1e-3 * reported)
 
 
 @pytest.mark.parametrize("name", ["position", "velocity", "effort_measured"])
-def test_an_arm_that_does_not_know_its_state_is_not_controlled(name):
+def test_rejects_measurements_that_are_not_finite(name):
     link = GuardedArm()
     status = link.next_status(1.0)
     setattr(status, name, [float("nan")] * N)
     link.next_status = lambda seconds: status
-    with pytest.raises(ControllerError, match="does not know its state"):
+    with pytest.raises(ControllerError, match="a measured position, velocity or effort is not finite"):
         first_status(link)
 
 
-def test_the_release_of_an_arm_that_faults_does_not_wait(controller):
+def test_fault_during_release_ends_immediately(controller):
     link = GuardedArm()
     # The first status is that of the beginning.
     link.before_step = after(2, lambda: link.guard.report_fault("the amplifier is hot"))
@@ -194,7 +196,7 @@ def test_the_release_of_an_arm_that_faults_does_not_wait(controller):
     assert link.now() - began < 0.01
 
 
-def test_control_acts_tells_how_it_goes_and_releases(controller):
+def test_control_applies_efforts_reports_and_releases(controller):
     link, reports = GuardedArm(), []
     end = link.now() + 1.5
     control(link, controller, lambda: link.now() > end, reports.append)
@@ -203,27 +205,27 @@ def test_control_acts_tells_how_it_goes_and_releases(controller):
     assert link.guard.state == Status.STATE_HOLD and link.commands[-1].control_mode == Command.HOLD
 
 
-def test_what_was_refused_since_the_last_report_is_in_words():
+def test_live_status_describes_new_refusals():
     first, status = Status(), Status()
     first.num_refused, status.num_refused, status.refusal_code = 3, 5, Status.REFUSAL_START_FAR
     status.num_expired = 1
     maker = LiveStatusMaker(7, first)
     live = maker.make(status, 0.2, 0)
     assert live.problem == (
-        "refused: starting too far from the present efforts or pose, no command for so long that the arm took over"
+        "refused: start too far from the present efforts or pose, the last command expired and the arm took over"
     )
     assert str(live).endswith(live.problem)
     assert not maker.make(status, 0.4, 0).problem
 
 
-def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsys):
-    def control(link, controller, stopped, tell):
+def test_run_prints_each_change_once(controller, monkeypatch, capsys):
+    def control(link, controller, stopped, report):
         for state, pace, problem in [
             ("hold", "1 Hz", ""),
             ("hold", "2 Hz", ""),
             ("hold", "3 Hz", "refused: stale"),
         ] * 2:
-            tell(LiveStatus(state, pace, problem))
+            report(LiveStatus(state, pace, problem))
 
     monkeypatch.setattr(
         "dvrk_drake.cli.lcm.ready_controller",
@@ -232,20 +234,20 @@ def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsy
     monkeypatch.setattr("dvrk_drake.processes.control.control", control)
     monkeypatch.setattr("dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: None)
     assert main(["run", "--arm", "mtml", "--reset"]) == 0
-    said = capsys.readouterr()
-    assert said.out.splitlines()[1:-1] == ["hold; 1 Hz", "hold; 3 Hz; refused: stale"] * 2
-    assert not said.err
+    output = capsys.readouterr()
+    assert output.out.splitlines()[1:-1] == ["hold; 1 Hz", "hold; 3 Hz; refused: stale"] * 2
+    assert not output.err
 
 
-def test_friction_needs_a_bound_on_the_gravity_error(tmp_path, capsys):
+def test_friction_requires_holding_error(tmp_path, capsys):
     path = str(tmp_path / "model.yaml")
     IdentifiedModel.from_arm(ARM).save(path)
     assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
     said = capsys.readouterr().err
-    assert "--friction-ratio needs a --model from identify of poses at rest" in said and said.count("\n") == 1
+    assert "--friction-ratio requires a --model identified from static poses" in said and said.count("\n") == 1
 
 
-def test_rate_and_round_trip_of_the_report():
+def test_live_status_has_rate_and_round_trip():
     maker, status = LiveStatusMaker(7, Status()), Status()
     assert maker.make(status, 0.1, 0).pace == "0 Hz, no command accepted yet, 0 statuses lost"
     maker = LiveStatusMaker(7, Status())
@@ -256,7 +258,7 @@ def test_rate_and_round_trip_of_the_report():
     assert maker.make(status, 0.2, 4).pace == "1000 Hz, round trip 2.00 ms, 4 statuses lost"
 
 
-def test_every_refusal_has_words():
+def test_every_refusal_has_a_description():
     codes = [value for name, value in vars(Status).items() if name.startswith("REFUSAL_")]
     words = [describe_refusal(code) for code in codes]
     assert len(set(words)) == len(codes) == max(codes) + 1
@@ -266,7 +268,7 @@ def test_every_refusal_has_words():
 
 
 def status_bytes(sequence, session=SESSION, **fields):
-    """A status as it goes over the wire; a millisecond from one sequence number to the next."""
+    """Returns an encoded status. The time advances by one millisecond per sequence number."""
     status = Status()
     status.arm_name, status.num_joints, status.sequence, status.session_id = ARM.name, N, sequence, session
     status.utime = 10**15 + 1000 * sequence
@@ -279,31 +281,31 @@ def status_bytes(sequence, session=SESSION, **fields):
 
 
 class Linked:
-    """An ArmLink on a network within this process, with a clock that the test sets."""
+    """ArmLink on a network within this process, with a clock that the test sets."""
 
     def __init__(self, **arguments):
         self.time, self.link = 0.0, ArmLink(ARM, "memq://", **arguments)
         self.link.now = lambda: self.time
 
-    def hear(self, *messages):
-        """The status that is taken of those, or None."""
+    def receive(self, *messages):
+        """Returns the status that the link accepts from the messages, or None."""
         for message in messages:
             self.link._lcm.publish(status_channel(ARM), message)
         try:
             return self.link.next_status(0.05)
         except ControllerError as error:
-            self.said = str(error)
+            self.output = str(error)
             return None
 
 
 @pytest.mark.parametrize("replays", [False, True])
-def test_statuses_of_the_past_are_not_heard_as_the_present(replays):
-    """Played from a log on the arm's own network: once they let a compensated arm move by 8 rad."""
+def test_old_statuses_are_ignored(replays):
+    """Regression: statuses played from a log on the arm's network made a compensated arm move by 8 rad."""
     linked = Linked(replays=replays)
-    assert linked.hear(*map(status_bytes, (100, 3, 101, 4))).sequence == (4 if replays else 101)
+    assert linked.receive(*map(status_bytes, (100, 3, 101, 4))).sequence == (4 if replays else 101)
     assert linked.link.lost == 0
-    assert (linked.hear(status_bytes(4)) is not None) == replays
-    assert (linked.hear(status_bytes(1, SESSION + 1)) is not None) == replays
+    assert (linked.receive(status_bytes(4)) is not None) == replays
+    assert (linked.receive(status_bytes(1, SESSION + 1)) is not None) == replays
 
 
 FOREIGN = {
@@ -320,76 +322,76 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("foreign", FOREIGN)
-def test_a_foreign_status_is_reported_if_the_arm_is_silent(foreign):
-    message, said = FOREIGN[foreign]
+def test_foreign_statuses_are_reported_if_arm_is_silent(foreign):
+    message, output = FOREIGN[foreign]
     linked = Linked()
-    assert linked.hear(status_bytes(100), message, status_bytes(101)).sequence == 101
-    assert linked.hear(message) is None
-    assert "no status of MTML for 0.05 s on DVRK_STATUS_MTML; ignored: " + said in linked.said
-    assert linked.hear(message, status_bytes(102)).sequence == 102
+    assert linked.receive(status_bytes(100), message, status_bytes(101)).sequence == 101
+    assert linked.receive(message) is None
+    assert "no status of MTML for 0.05 s on DVRK_STATUS_MTML; ignored: " + output in linked.output
+    assert linked.receive(message, status_bytes(102)).sequence == 102
     assert linked.link.lost == 0
-    assert linked.hear() is None and linked.said.endswith("DVRK_STATUS_MTML")
+    assert linked.receive() is None and linked.output.endswith("DVRK_STATUS_MTML")
 
 
-def test_the_checked_session_is_controlled():
+def test_only_the_checked_session_is_used():
     first = Status.decode(status_bytes(1))
     linked = Linked(before=first)
-    assert linked.hear(status_bytes(1, SESSION + 1)) is None and "MTML was restarted" in linked.said
-    assert linked.hear(status_bytes(2)).sequence == 2
+    assert linked.receive(status_bytes(1, SESSION + 1)) is None and "MTML was restarted" in linked.output
+    assert linked.receive(status_bytes(2)).sequence == 2
 
 
-def test_a_pause_of_the_controller_is_no_jump_of_the_arm():
+def test_pause_of_controller_is_no_status_jump():
     linked = Linked()
-    linked.hear(status_bytes(100))
-    # Two seconds later: some statuses waited in the queue, the others were lost.
+    linked.receive(status_bytes(100))
+    # Two seconds later, some statuses are in the queue and all others were lost.
     linked.time += 2.0
     waited = [status_bytes(sequence) for sequence in (*range(101, 180), 2099, 2100)]
-    assert linked.hear(*waited).sequence == 2100
+    assert linked.receive(*waited).sequence == 2100
     assert linked.link.lost == 2098 - 179
-    # What the arm cannot have sent yet is a jump.
-    assert linked.hear(status_bytes(2100 + 101)) is None
-    assert linked.hear(status_bytes(2100 + 100)).sequence == 2200
+    # A status that the arm cannot have sent yet is a jump.
+    assert linked.receive(status_bytes(2100 + 101)) is None
+    assert linked.receive(status_bytes(2100 + 100)).sequence == 2200
 
 
-def test_with_a_key_statuses_must_be_signed_and_commands_are():
+def test_key_verifies_statuses_and_signs_commands():
     key, sent = MessageKey(bytes(32)), []
     linked = Linked(key=key)
     signed = key.sign(status_bytes(100))
     corrupted = [signed[:k] + bytes([signed[k] ^ 1]) + signed[k + 1 :] for k in range(32, len(signed))]
     for message in (status_bytes(100), MessageKey(bytes([1] * 32)).sign(status_bytes(100)), *corrupted):
-        assert linked.link._filter.take(message, 0.0) is None
-    assert linked.hear(status_bytes(101)) is None
-    assert linked.said.endswith("both sides need the same key (--key)")
-    assert linked.hear(signed).sequence == 100
+        assert linked.link._filter.accept(message, 0.0) is None
+    assert linked.receive(status_bytes(101)) is None
+    assert linked.output.endswith("both sides need the same key (--key)")
+    assert linked.receive(signed).sequence == 100
     linked.link._lcm.subscribe("DVRK_COMMAND_MTML", lambda channel, data: sent.append(data))
     linked.link.send(Command())
-    linked.hear()
+    linked.receive()
     assert key.verify(sent[0]) and sent[0][:-17] == Command().encode()[:-1]
-    # An arm without a key reads signed messages all the same.
-    assert Linked().hear(signed).sequence == 100
+    # A link without a key accepts signed messages.
+    assert Linked().receive(signed).sequence == 100
 
 
 @pytest.mark.parametrize("mode", ["spoofed", "restarted"])
 def test_control_ignores_spoofed_statuses_until_a_restart(controller, mode):
-    """The first 500 statuses alone, then each between copies of it with other sessions, sequences and times."""
+    """After 500 statuses, each status is surrounded by copies with other sessions, sequences and times."""
     arm, linked = GuardedArm(), Linked()
-    taken = []
+    accepted = []
 
     def next_status(seconds):
-        if len(taken) >= 500 and mode == "restarted":
+        if len(accepted) >= 500 and mode == "restarted":
             return ArmLink.next_status(linked.link, 0.05) if linked.link._filter.ignored else restart()
         status = arm.next_status(seconds)
         linked.time = 1e-6 * arm.utime
         messages = [status.encode()]
-        if len(taken) >= 500:
+        if len(accepted) >= 500:
             fields = {"session_id": 5, "sequence": 2**62, "utime": 2**62}
-            messages += [copy_of(status, **{name: value}) for name, value in fields.items()]
+            messages += [changed_copy(status, **{name: value}) for name, value in fields.items()]
             messages[1:1] = [messages[0][: k * 40] for k in range(6)]
-        taken.append(linked.hear(*messages[1:], messages[0]))
-        return taken[-1]
+        accepted.append(linked.receive(*messages[1:], messages[0]))
+        return accepted[-1]
 
     def restart():
-        message = copy_of(arm.status, session_id=5, sequence=1)
+        message = changed_copy(arm.status, session_id=5, sequence=1)
         linked.link._lcm.publish(status_channel(ARM), message)
         return ArmLink.next_status(linked.link, 0.05)
 
@@ -398,32 +400,32 @@ def test_control_ignores_spoofed_statuses_until_a_restart(controller, mode):
         with pytest.raises(ControllerError, match="MTML was restarted: look at it, then start again"):
             control(runner, controller, lambda: False, lambda status: None)
         return
-    control(runner, controller, lambda: len(taken) > 800, lambda status: None)
-    assert [status.sequence for status in taken] == list(range(1, len(taken) + 1))
-    assert {status.guard_state for status in taken[400:800]} == {Status.STATE_EFFORT}
+    control(runner, controller, lambda: len(accepted) > 800, lambda status: None)
+    assert [status.sequence for status in accepted] == list(range(1, len(accepted) + 1))
+    assert {status.guard_state for status in accepted[400:800]} == {Status.STATE_EFFORT}
 
 
-def copy_of(status, **fields):
-    """A status with other fields, as it goes over the wire."""
+def changed_copy(status, **fields):
+    """Returns an encoded copy of a status with changed fields."""
     other = Status.decode(status.encode())
     for name, value in fields.items():
         setattr(other, name, value)
     return other.encode()
 
 
-def test_control_ends_if_no_command_acts(controller, monkeypatch):
+def test_control_ends_if_no_command_is_applied(controller, monkeypatch):
     monkeypatch.setattr("dvrk_drake.processes.control._TIMEOUT", 0.3)
     link = GuardedArm()
     link.status.effort_measured = list(2 * LIMIT)  # more than commands may use
-    with pytest.raises(ControllerError, match=r"lets no command act for 0.3 s; the last refusal is: "):
+    with pytest.raises(ControllerError, match=r"applied no command for 0.3 s: last refused command: "):
         control(link, controller, lambda: False, lambda status: None)
 
 
-def test_an_arm_that_compensates_gravity_itself_gets_no_command(controller):
+def test_rejects_arm_with_own_gravity_compensation(controller):
     link = GuardedArm()
     link.status.gravity_compensation = True
-    with pytest.raises(ControllerError, match=r"adds gravity compensation of its own.*switch it off"):
+    with pytest.raises(ControllerError, match=r"adds its own gravity compensation.*Switch it off"):
         first_status(link)
-    with pytest.raises(ControllerError, match=r"adds gravity compensation of its own.*switch it off"):
+    with pytest.raises(ControllerError, match=r"adds its own gravity compensation.*Switch it off"):
         control(link, controller, lambda: False, lambda status: None)
     assert link.commands == []

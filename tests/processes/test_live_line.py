@@ -1,4 +1,4 @@
-"""The live line: written over and over on a terminal, and nowhere else."""
+"""Live line: updated in place on a terminal, not written to other streams."""
 
 import io
 
@@ -10,7 +10,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_gets_the_line_four_times_a_second(monkeypatch):
+def test_line_is_updated_four_times_per_second(monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
     terminal, now = Terminal(), [0.0]
     line = LiveLine(terminal, clock=lambda: now[0])
@@ -22,7 +22,7 @@ def test_a_terminal_gets_the_line_four_times_a_second(monkeypatch):
     assert shown == ["", *(f"row {k} of a line that is too long"[:19] for k in (0, 250, 500, 750, 1000)), ""]
 
 
-def test_a_file_gets_nothing():
+def test_line_is_not_written_to_a_file():
     stream = io.StringIO()
     line = LiveLine(stream)
     line.show(lambda: 1 / 0)

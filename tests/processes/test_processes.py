@@ -1,4 +1,4 @@
-"""Pace, network and start of the processes, without a network of their own."""
+"""Pace, network and start of the processes."""
 
 import os
 import subprocess
@@ -31,31 +31,31 @@ class Clock:
 
 def test_pace_keeps_its_period_and_catches_up():
     clock = Clock()
-    beat = pace.Pace(1e-3, lambda: clock.now, clock.sleep)
-    begun = []
+    pacer = pace.Pace(1e-3, lambda: clock.now, clock.sleep)
+    tick_times = []
     for k in range(1000):
-        beat.wait()
-        begun.append(clock.now - 100.0)
+        pacer.wait()
+        tick_times.append(clock.now - 100.0)
         clock.now += 0.0105 if k == 500 else 0.0003  # one tick takes ten periods
-    assert np.abs(np.array(begun[:501]) - 1e-3 * np.arange(501)).max() < 1e-9
-    assert np.abs(np.array(begun[-400:]) - 1e-3 * np.arange(600, 1000)).max() < 1e-9
-    assert 9 <= beat.late <= 15
+    assert np.abs(np.array(tick_times[:501]) - 1e-3 * np.arange(501)).max() < 1e-9
+    assert np.abs(np.array(tick_times[-400:]) - 1e-3 * np.arange(600, 1000)).max() < 1e-9
+    assert 9 <= pacer.late <= 15
 
 
-def test_pace_far_behind_goes_on_from_now():
+def test_pace_continues_from_now_after_long_delay():
     clock = Clock()
-    beat = pace.Pace(1e-3, lambda: clock.now, clock.sleep)
-    beat.wait()
+    pacer = pace.Pace(1e-3, lambda: clock.now, clock.sleep)
+    pacer.wait()
     clock.now += 10.0
-    begun = []
+    tick_times = []
     for _ in range(5):
-        beat.wait()
-        begun.append(clock.now - 110.0)
-    np.testing.assert_allclose(begun, 1e-3 * np.arange(5), atol=1e-9)
-    assert beat.late == 1
+        pacer.wait()
+        tick_times.append(clock.now - 110.0)
+    np.testing.assert_allclose(tick_times, 1e-3 * np.arange(5), atol=1e-9)
+    assert pacer.late == 1
 
 
-def test_what_is_not_permitted_for_realtime_is_a_warning(monkeypatch):
+def test_missing_realtime_permissions_are_warnings(monkeypatch):
     def refuse(*arguments):
         raise PermissionError(1, "Operation not permitted")
 
@@ -67,7 +67,7 @@ def test_what_is_not_permitted_for_realtime_is_a_warning(monkeypatch):
     assert "memlock" in memory and "/dev/cpu_dma_latency" in cores
 
 
-def test_realtime_is_real_time_and_locks_memory():
+def test_realtime_sets_scheduler_and_locks_memory():
     code = (
         "import os; from dvrk_drake.processes.pace import make_realtime; "
         "print(len(make_realtime()), os.sched_getscheduler(0) == os.SCHED_FIFO, "
@@ -80,13 +80,13 @@ def test_realtime_is_real_time_and_locks_memory():
 
 
 @pytest.mark.parametrize("url", ["bogus://", "udpm://nonsense"])
-def test_a_network_that_does_not_work_is_an_error(url):
+def test_unusable_network_is_an_error(url):
     with pytest.raises(DvrkDrakeError, match=f'LCM network "{url}" cannot be used'):
         open_lcm(url)
 
 
 class LossyLcm(lcm.LCM):
-    """Loses the first two messages that any instance publishes."""
+    """Network that loses the first two messages that any instance publishes."""
 
     lost = 0
 
@@ -97,13 +97,13 @@ class LossyLcm(lcm.LCM):
             super().publish(channel, data)
 
 
-def test_a_network_that_loses_a_message_can_be_used(monkeypatch):
+def test_network_with_lost_messages_is_usable(monkeypatch):
     monkeypatch.setattr("dvrk_drake.processes.lcm_network.lcm.LCM", LossyLcm)
     assert open_lcm("memq://").get_lcm_url() == "memq://"
     assert LossyLcm.lost == 2
 
 
-def test_a_network_without_a_route_is_an_error():
+def test_network_without_route_is_an_error():
     code = "from dvrk_drake.processes.lcm_network import open_lcm; open_lcm()"
     try:
         done = subprocess.run(
@@ -121,7 +121,7 @@ def test_a_network_without_a_route_is_an_error():
     assert 'DvrkDrakeError: LCM network "udpm://239.255.76.67:7667' in done.stderr
 
 
-def test_start_pose():
+def test_start_pose_is_inside_limits():
     for name in ("mtml", "mtmr", "psm"):
         arm = load_arm(name)
         assert not arm.limit_violations(start_pose(arm), tolerance=-0.01)
@@ -143,16 +143,16 @@ def test_driver_file(tmp_path):
         with pytest.raises(StationError, match=r"driver\.yaml: "):
             load_driver(path)
     for text, message in (
-        ("guard: 3", "guard is 3; allowed: a table with the keys expiry, "),
+        ("guard: 3", "guard is 3; allowed: a mapping with the keys expiry, "),
         ("gard: {}", 'key "gard" is unknown; did you mean "guard"\\? allowed in .*: lcm_url, '),
         (
             "control_modes: [off]",
-            r"control_modes\[0\] is False; allowed: a text; quote a word, e\.g\. \"off\": YAML reads off and no "
+            r"control_modes\[0\] is False; allowed: a string; quote a word, e\.g\. \"off\": YAML reads off and no "
             "without quotes as false",
         ),
         ("control_modes: off", r"control_modes is False; .* quote a word, e\.g\. \[\"off\"\]: YAML reads off"),
         ("lcm_url: yes", r"lcm_url is True; .*\"on\": YAML reads on and yes without quotes as true"),
-        ("control_modes: effort", r"control_modes is \"effort\"; allowed: a list of texts, e\.g\. \[effort\]"),
+        ("control_modes: effort", r"control_modes is \"effort\"; allowed: a list of strings, e\.g\. \[effort\]"),
     ):
         path.write_text(text)
         with pytest.raises(StationError, match=rf"driver\.yaml: .*{message}"):
@@ -171,25 +171,25 @@ def test_driver_file(tmp_path):
         (["run", "--arm", "nobody"], 'unknown arm "nobody"'),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capfd):
+def test_invalid_input_prints_one_line_and_exits_with_2(arguments, message, capfd):
     assert main(arguments) == 2
     (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("dvrk-drake")]
     assert message in line
 
 
-def test_a_model_of_another_arm_is_refused(tmp_path, capfd):
+def test_rejects_model_of_another_arm(tmp_path, capfd):
     path = tmp_path / "model.yaml"
     IdentifiedModel.from_arm(load_arm("mtmr")).save(path)
     assert main(["run", "--arm", "mtml", "--model", str(path)]) == 2
-    assert "model.yaml: is of MTMR, not of MTML" in capfd.readouterr().err
+    assert "model.yaml: the model is of MTMR, not of MTML" in capfd.readouterr().err
 
 
-def test_why_an_arm_took_over():
+def test_takeover_reason():
     before, status = lcmt_dvrk_status(), lcmt_dvrk_status()
     status.guard_state = lcmt_dvrk_status.STATE_OFF
     assert takeover_reason(status, before, AnswerTimes()) == "its state is off"
     status.num_expired = 3
-    assert takeover_reason(status, before, AnswerTimes()) == "commands came too late for it (use --realtime)"
+    assert takeover_reason(status, before, AnswerTimes()) == "commands arrived too late (use --realtime)"
     status.num_expired, status.num_refused = 0, 1
     status.refusal_code = lcmt_dvrk_status.REFUSAL_START_FAR
-    assert "starting too far" in takeover_reason(status, before, AnswerTimes())
+    assert "start too far" in takeover_reason(status, before, AnswerTimes())

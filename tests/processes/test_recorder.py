@@ -1,4 +1,4 @@
-"""Rows that a recorder writes from the messages of an arm, by a clock that the test sets."""
+"""Rows that a recorder writes from the messages of an arm, with a clock that the test sets."""
 
 from types import SimpleNamespace
 
@@ -15,7 +15,7 @@ KEY = MessageKey(bytes(range(32)))
 
 @pytest.fixture(params=[".csv", ".log"])
 def recorder(request, tmp_path, monkeypatch):
-    """Makes recorders, with `hear` for messages that arrive at a time [s]."""
+    """Returns a factory of recorders with a function `receive` for a message and its time of arrival [s]."""
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(module.time, "monotonic", lambda: clock.now)
 
@@ -23,54 +23,54 @@ def recorder(request, tmp_path, monkeypatch):
         made = Recorder(ARM, tmp_path / f"a{request.param}", "memq://", key)
         made.path = tmp_path / f"a{request.param}"
 
-        def hear(message, seconds):
+        def receive(message, seconds):
             clock.now = 100.0 + seconds
             made._receive(status_channel(ARM), message if isinstance(message, bytes) else message.encode())
 
-        made.hear = hear
+        made.receive = receive
         return made
 
     return make
 
 
-def test_of_two_arms_of_one_name_the_first_is_recorded(recorder):
+def test_first_of_two_arms_with_one_name_is_recorded(recorder):
     made = recorder()
     for k, (first, second) in enumerate(zip(statuses(50), statuses(50, session_id=5), strict=True)):
-        made.hear(first, 1e-3 * k)
-        made.hear(second, 1e-3 * k)
+        made.receive(first, 1e-3 * k)
+        made.receive(second, 1e-3 * k)
     assert len(read_recording(made.path, ARM)) == 50
     assert made.notes() == ["messages not recorded, of another session: 50"]
 
 
 @pytest.mark.parametrize("field", ["sequence", "utime", "session_id"])
-def test_a_spoofed_status_does_not_end_a_recording(recorder, field):
+def test_spoofed_status_does_not_end_recording(recorder, field):
     made = recorder()
     for k, status in enumerate(statuses(50)):
-        made.hear(status, 1e-3 * k)
+        made.receive(status, 1e-3 * k)
         if k == 20:
             (spoofed,) = statuses(1, sequence=status.sequence + 1, utime=status.utime + 500)
             setattr(spoofed, field, 2**62)
-            made.hear(spoofed, 1e-3 * k)
+            made.receive(spoofed, 1e-3 * k)
     assert len(read_recording(made.path, ARM)) == 50
     assert sum(made.foreign.values()) == 1
 
 
 @pytest.mark.parametrize(("silence", "rows"), [(0.9, 20), (1.1, 40)])
-def test_a_restarted_arm_is_recorded_after_a_second(recorder, silence, rows):
+def test_restarted_arm_is_recorded_after_one_second(recorder, silence, rows):
     made, messages = recorder(), statuses(40)
     for k, status in enumerate(messages[:20]):
-        made.hear(status, 1e-3 * k)
+        made.receive(status, 1e-3 * k)
     for k, status in enumerate(messages[20:]):
         status.session_id = 78
-        made.hear(status, 0.019 + silence + 1e-3 * k)
+        made.receive(status, 0.019 + silence + 1e-3 * k)
     assert len(read_recording(made.path, ARM)) == rows
     assert made.foreign.total() == 40 - rows
 
 
-def test_with_a_key_only_signed_statuses_are_recorded(recorder):
+def test_key_accepts_only_signed_statuses(recorder):
     made = recorder(KEY)
     for k, status in enumerate(statuses(50)):
-        made.hear(status, 1e-3 * k)
-        made.hear(KEY.sign(status.encode()), 1e-3 * k)
+        made.receive(status, 1e-3 * k)
+        made.receive(KEY.sign(status.encode()), 1e-3 * k)
     assert len(read_recording(made.path, ARM)) == 50
     assert made.notes() == ["messages not recorded, not signed with this key: 50"]

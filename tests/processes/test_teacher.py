@@ -1,4 +1,4 @@
-"""Poses shown by hand."""
+"""Poses that are taught by hand."""
 
 import os
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from dvrk_drake.recordings.pose_file import load_poses
 
 
 class Hand:
-    """Tells a teacher of an arm that obeys, wherever the test puts it."""
+    """Operator that moves the arm of a Teacher to given poses."""
 
     def __init__(self, path, at_rest=False):
         self.controller = SimpleNamespace(arm=load_arm("mtml"), ramped=True)
@@ -28,55 +28,55 @@ class Hand:
         return enter
 
     def at(self, pose, seconds, enter=False):
-        """Stays at a pose; with `enter`, presses the key at first."""
+        """Holds the arm at a pose. With `enter`, presses the key first."""
         self.enter, end = enter, self.time + seconds
         while self.time < end:
             self.time += 0.01
-            self.teacher.lead(SimpleNamespace(position=list(pose)), self.time)
+            self.teacher.update(SimpleNamespace(position=list(pose)), self.time)
 
 
-def test_enter_takes_a_pose(tmp_path):
+def test_enter_records_a_pose(tmp_path):
     path, arm = tmp_path / "p.yaml", load_arm("mtml")
     hand, poses = Hand(path), near_poses()
     hand.controller.ramped = False
     hand.at(poses[0], 0.1)
     hand.enter = True
     hand.at(poses[0], 0.1)
-    assert not path.exists()  # the arm does not obey yet
+    assert not path.exists()  # the efforts are not applied yet
     hand.controller.ramped = True
     hand.at(poses[0], 3.0)
-    assert not path.exists()  # nobody pressed Enter
+    assert not path.exists()  # Enter was not pressed
     hand.at(poses[0], 0.1, enter=True)
     np.testing.assert_array_equal(load_poses(path, arm), poses[:1])
     hand.at(poses[0] + 1e-3, 0.1, enter=True)
     hand.at([1.2, *poses[0, 1:]], 0.1, enter=True)
     hand.at(poses[1], 0.1, enter=True)
     hand.teacher.close()
-    assert hand.lines[0] == "pose 1 taken"
-    assert hand.lines[1] == "not taken: it is pose 1 again"
-    assert hand.lines[2].startswith("not taken: outer_yaw = 1.2 is outside")
-    assert hand.lines[3] == "pose 2 taken"
+    assert hand.lines[0] == "pose 1 recorded"
+    assert hand.lines[1] == "not recorded: same as pose 1"
+    assert hand.lines[2].startswith("not recorded: outer_yaw = 1.2 is outside")
+    assert hand.lines[3] == "pose 2 recorded"
     np.testing.assert_array_equal(load_poses(path, arm), poses[:2])
     again = Hand(path)
     again.at(poses[2], 0.1, enter=True)
     np.testing.assert_array_equal(load_poses(path, arm), poses)
 
 
-def test_a_rest_takes_a_pose_once(tmp_path):
+def test_rest_records_a_pose_once(tmp_path):
     path, arm = tmp_path / "p.yaml", load_arm("mtml")
     hand, poses = Hand(path, at_rest=True), near_poses()
     hand.at(poses[0], 0.9)
     hand.at(poses[1], 3.0)
-    hand.at([1.2, *poses[0, 1:]], 3.0)  # outside the limits: not taken, and nothing is said of it all the time
+    hand.at([1.2, *poses[0, 1:]], 3.0)  # outside the limits: not recorded and not reported repeatedly
     hand.at(poses[2], 0.9)
     hand.at(poses[1], 3.0)
     hand.at(poses[2], 3.0)
     hand.teacher.close()
     np.testing.assert_array_equal(load_poses(path, arm), poses[1:])
-    assert hand.lines == ["pose 1 taken", "pose 2 taken"]
+    assert hand.lines == ["pose 1 recorded", "pose 2 recorded"]
 
 
-def test_a_file_of_poses_that_cannot_be_written_is_an_error(tmp_path):
+def test_unwritable_pose_file_is_an_error(tmp_path):
     (tmp_path / "folder").mkdir()
     hand = Hand(tmp_path / "folder" / "p.yaml")
     (tmp_path / "folder").rmdir()
@@ -84,7 +84,7 @@ def test_a_file_of_poses_that_cannot_be_written_is_an_error(tmp_path):
         hand.at(near_poses()[0], 0.1, enter=True)
 
 
-def test_enter_key_never_waits():
+def test_enter_key_does_not_block():
     reading, writing = os.pipe()
     with os.fdopen(reading) as stream:
         key = EnterKey(stream)

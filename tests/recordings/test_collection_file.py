@@ -1,4 +1,4 @@
-"""Tests that the file of a collection grows by complete rows and can be continued after any interruption."""
+"""Tests that a collection file always has complete rows and can be continued after an interruption."""
 
 import signal
 import subprocess
@@ -26,7 +26,7 @@ def append_all(path, arm, poses, both_sides=True):
 
 @pytest.mark.parametrize("both_sides", [True, False])
 @pytest.mark.parametrize("name", ARMS)
-def test_a_collection_is_a_recording_and_goes_on(name, both_sides, tmp_path):
+def test_collection_is_a_recording_and_can_be_continued(name, both_sides, tmp_path):
     arm, path = load_arm(name), tmp_path / "o.csv"
     poses = random_poses(arm, 6)
     append_all(path, arm, poses[:2], both_sides)
@@ -62,18 +62,18 @@ def test_other_existing_output_is_refused_and_unchanged(tmp_path):
     poses = random_poses(arm, 3)
     append_all(path, arm, poses)
     before = path.read_bytes()
-    with pytest.raises(CollectionError, match=r"o.csv:2: was collected for a pose that is none of these"):
+    with pytest.raises(CollectionError, match=r"o.csv, line 2: the requested pose of this row is not in the pose file"):
         CollectionFile(path, arm, True).finished(poses[1:])
-    with pytest.raises(CollectionError, match=r"o.csv:2: is of MTML, not of MTMR"):
+    with pytest.raises(CollectionError, match=r"o.csv, line 2: the row is of MTML, not of MTMR"):
         CollectionFile(path, load_arm("mtmr"), True)
     with pytest.raises(CollectionError, match=r"was collected from both sides \(--both-sides\)"):
         CollectionFile(path, arm, False)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[-1] + ",1"]) + "\n")
-    with pytest.raises(RecordingError, match=r"o.csv:5: has 31 cells, the header names 30"):
+    with pytest.raises(RecordingError, match=r"o.csv, line 5: the row has 31 cells, the header has 30"):
         CollectionFile(path, arm, True)
     path.write_text("q1,tau1\n1,2\n")
-    with pytest.raises(CollectionError, match="was not collected from MTML; name another output"):
+    with pytest.raises(CollectionError, match="already exists and is not a collection of MTML"):
         CollectionFile(path, arm, True)
     path.write_bytes(before)
 
@@ -98,7 +98,7 @@ def test_written_rows_survive_kill(tmp_path):
     assert len(rows) >= last_row
 
 
-def test_a_full_disk_leaves_whole_rows(tmp_path):
+def test_full_disk_leaves_complete_rows(tmp_path):
     code = (
         "import resource, signal, sys\nfrom dvrk_drake.recordings.csv_rows import GrowingFile\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
@@ -108,5 +108,5 @@ def test_a_full_disk_leaves_whole_rows(tmp_path):
     )
     path = tmp_path / "f.csv"
     done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
-    assert "RecordingError: " in done.stderr and "cannot be written any more: no space left" in done.stderr
+    assert "RecordingError: " in done.stderr and "cannot be written: no space left" in done.stderr
     assert path.read_bytes() == 10 * (b"x" * 99 + b"\n")

@@ -40,7 +40,7 @@ def test_convert_wpi_csv_round_trip_is_exact(tmp_path):
     np.testing.assert_array_equal(np.hstack([again.q, again.qd, again.tau]), rows)
     assert notes[0] == "50 samples; the file has no time stamps, so t = row / 100 Hz"
     assert "--coordinates actuator" in notes[1]
-    assert notes[2].startswith("2 of 50 rows repeat the row before")
+    assert notes[2].startswith("2 of 50 rows repeat the previous row")
 
 
 def test_detect_format(tmp_path):
@@ -51,7 +51,9 @@ def test_detect_format(tmp_path):
     assert detect_format(write_text(tmp_path, f'\ufeff\n "tau1" ,"q1",x\n{NUMBERS}\n')) == "csv"
     binary = tmp_path / "model.pkl"
     binary.write_bytes(b"\x80\x04\x95\0\0\0")
-    assert_refused(r"model\.pkl: neither an LCM log, a MATLAB file .* nor a text file", detect_format, binary)
+    assert_refused(
+        r"model\.pkl: unknown format; allowed: LCM log, MATLAB file .*, UTF-8 text file", detect_format, binary
+    )
     assert_refused("nowhere: no such file", detect_format, tmp_path / "nowhere")
     assert_refused("is not a file", detect_format, tmp_path)
 
@@ -59,10 +61,10 @@ def test_detect_format(tmp_path):
 @pytest.mark.parametrize("content", ["", " \n"])
 def test_an_empty_file_has_no_format(tmp_path, content):
     path = write_text(tmp_path, content)
-    assert_refused(r"motion\.csv: is empty", convert, path, tmp_path / "out.csv", coordinates="joint")
+    assert_refused(r"motion\.csv is empty", convert, path, tmp_path / "out.csv", coordinates="joint")
 
 
-def test_an_explicit_format_wins_over_the_name(tmp_path):
+def test_explicit_format_overrides_the_file_name(tmp_path):
     path = write_wpi(tmp_path, wpi_rows()).rename(tmp_path / "motion.mat")
     assert len(convert(path, tmp_path / "out.csv", format="wpi-csv")) == 4
 
@@ -84,11 +86,11 @@ def test_convert_refuses_unsuitable_options_and_unknown_formats(tmp_path):
 def test_convert_does_not_overwrite_its_input(tmp_path):
     path = write_wpi(tmp_path, wpi_rows())
     before = path.read_bytes()
-    assert_refused("is the recording itself", convert, path, tmp_path / "." / "motion.csv")
+    assert_refused("is the input recording", convert, path, tmp_path / "." / "motion.csv")
     assert path.read_bytes() == before
 
 
-def test_convert_leaves_an_old_output_alone_when_it_fails(tmp_path):
+def test_failed_conversion_keeps_the_old_output(tmp_path):
     output = tmp_path / "out.csv"
     output.write_text("old")
     assert_refused("has 1 valid row", convert, write_text(tmp_path, NUMBERS), output)
@@ -97,15 +99,15 @@ def test_convert_leaves_an_old_output_alone_when_it_fails(tmp_path):
         convert(write_wpi(tmp_path, wpi_rows()), tmp_path / "no" / "out.csv")
 
 
-def test_a_real_motion_without_its_header_and_time_converts_back(shared_data, tmp_path):
+def test_real_motion_without_header_and_time_is_restored(shared_data, tmp_path):
     original = (shared_data / "trajectories" / "mtm_one.csv").read_text().splitlines()[1:]
     path = write_text(tmp_path, "\n".join(line.split(",", 1)[1] for line in original))
     notes = convert(path, tmp_path / "out.csv").notes
-    ours = read_recording(tmp_path / "out.csv", coordinates="actuator")
-    theirs = read_recording(shared_data / "trajectories" / "mtm_one.csv", coordinates="actuator")
+    converted = read_recording(tmp_path / "out.csv", coordinates="actuator")
+    expected = read_recording(shared_data / "trajectories" / "mtm_one.csv", coordinates="actuator")
     for name in ("q", "qd", "tau"):
-        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
-    np.testing.assert_allclose(ours.t, theirs.t, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(getattr(converted, name), getattr(expected, name))
+    np.testing.assert_allclose(converted.t, expected.t, rtol=0, atol=1e-12)
     assert notes[-1].startswith("795 of 5999 rows repeat")
 
 
@@ -113,15 +115,15 @@ TIMED = "t,q1,q2,q3,q4,q5,q6,q7,qd1,qd2,qd3,qd4,qd5,qd6,qd7,tau1,tau2,tau3,tau4,
 
 
 def write_timed(folder, times, header=TIMED):
-    """Writes a CSV with a header, one row for each text in `times`; all other numbers are known."""
+    """Writes a CSV with a header and one row per element of `times`. Returns its path and the other numbers."""
     rows = wpi_rows(len(times))
     lines = [",".join([str(t), *(repr(float(x)) for x in row)]) for t, row in zip(times, rows, strict=True)]
     return write_text(folder, "\n".join([header, *lines]) + "\n"), rows
 
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-def test_our_csv_keeps_time_stamps_columns_and_coordinates(tmp_path, coordinates):
-    """Checks a minute at 100 Hz: 59.98 s remains 59.98 s."""
+def test_csv_keeps_time_stamps_columns_and_coordinates(tmp_path, coordinates):
+    """Checks one minute at 100 Hz."""
     path, rows = write_timed(tmp_path, [0.01 * k for k in range(5999)])
     recording = convert(path, tmp_path / "out.csv", coordinates=coordinates)
     assert recording.coordinates == coordinates
@@ -137,7 +139,7 @@ def test_coordinates_are_required_if_undefined(tmp_path):
     path, _ = write_timed(tmp_path, [0, 0.01])
     for format in (None, "csv"):
         assert_refused(
-            r"motion\.csv: .*does not say.*--coordinates joint or --coordinates actuator",
+            r"motion\.csv: .*does not define.*--coordinates joint or --coordinates actuator",
             convert,
             path,
             tmp_path / "out.csv",
@@ -149,13 +151,15 @@ def test_coordinates_are_required_if_undefined(tmp_path):
 
 def test_a_format_that_defines_its_coordinates_keeps_them(tmp_path):
     mat, text, output = write_mat(tmp_path, a=team_array()), write_wpi(tmp_path, wpi_rows()), tmp_path / "out.csv"
-    assert_refused("team-mat is in joint coordinates, not actuator", convert, mat, output, coordinates="actuator")
-    assert_refused("wpi-csv is in actuator coordinates, not joint", convert, text, output, coordinates="joint")
+    assert_refused(
+        "team-mat file is in joint coordinates, not in actuator", convert, mat, output, coordinates="actuator"
+    )
+    assert_refused("wpi-csv file is in actuator coordinates, not in joint", convert, text, output, coordinates="joint")
     assert convert(mat, output, coordinates="joint").coordinates == "joint"
     assert convert(text, output, coordinates="actuator").coordinates == "actuator"
 
 
-def test_a_rate_is_refused_where_the_file_has_time_stamps(tmp_path):
+def test_rate_is_refused_if_the_file_has_time_stamps(tmp_path):
     path, _ = write_timed(tmp_path, [0, 0.01, 0.02])
     output = tmp_path / "out.csv"
     for options in ({"coordinates": "joint"}, {"format": "wpi-csv"}):
@@ -166,14 +170,14 @@ def test_a_rate_is_refused_where_the_file_has_time_stamps(tmp_path):
     recording = convert(path, output, coordinates="joint", rate=50.0)
     np.testing.assert_array_equal(read_recording(output).t, [0, 0.02, 0.04])
     assert "the file has no time stamps, so t = row / 50 Hz" in recording.notes[0]
-    assert_refused("rate must be a positive number", convert, path, output, coordinates="joint", rate=0.0)
+    assert_refused("rate is 0 Hz; allowed: a positive number", convert, path, output, coordinates="joint", rate=0.0)
     recording = convert(path, output, coordinates="joint")
     assert read_recording(output).t is None
     assert "no column t" in recording.notes[0]
 
 
-def test_our_csv_is_read_as_wpi_csv_with_its_times(tmp_path):
-    """Reads a file converted without --arm. For a PSM only this format defines the coordinate of the roll."""
+def test_converted_csv_is_read_as_wpi_csv_with_times(tmp_path):
+    """Reads a file converted without --arm. Only this format defines the recorded coordinate of the roll of a PSM."""
     path, rows = write_timed(tmp_path, [0, 0.011, 0.019])
     recording = convert(path, tmp_path / "out.csv", format="wpi-csv")
     assert recording.coordinates == "actuator"
@@ -188,16 +192,20 @@ def test_irregular_time_stamps_are_kept_and_counted(tmp_path):
         recording = convert(path, tmp_path / "out.csv", **options)
         np.testing.assert_array_equal(recording.t, [0, 0.01, 0.01, 0.013, 0.005, 0.02, 0.02])
         assert (
-            "t does not always increase: 2 rows repeat the t before them, 1 goes back, first at line 4; kept, but a "
-            "motion with such times is refused by identify" in recording.notes
+            "t does not increase in all rows (2 equal, 1 smaller than the previous t; first at line 4). The rows are "
+            "kept, but identify refuses a motion with such times." in recording.notes
         )
 
 
-def test_time_stamps_that_are_no_numbers(tmp_path):
+def test_invalid_time_stamps_are_refused_or_skipped(tmp_path):
     path, rows = write_timed(tmp_path, ["0", "nan", "0.02", "0.03"])
     for options in ({"coordinates": "joint"}, {"format": "wpi-csv"}):
         assert_refused(
-            r"motion\.csv:3: t( \(column 1\))? is nan; only finite", convert, path, tmp_path / "out.csv", **options
+            r"motion\.csv, line 3: t( \(column 1\))? is nan; only finite",
+            convert,
+            path,
+            tmp_path / "out.csv",
+            **options,
         )
         recording = convert(path, tmp_path / "out.csv", skip_invalid=True, **options)
         np.testing.assert_array_equal(recording.t, [0, 0.02, 0.03])
@@ -205,12 +213,12 @@ def test_time_stamps_that_are_no_numbers(tmp_path):
         assert any("1 of 4 rows skipped (empty, NaN or infinite): lines 3" in note for note in recording.notes)
 
 
-def test_positions_alone_and_columns_that_are_not_kept(tmp_path):
+def test_positions_without_efforts_and_ignored_columns(tmp_path):
     header = "time,q1,q2,q3,q4,q5,q6,q7,temperature"
     path = write_text(tmp_path, f"{header}\n0,1,2,3,4,5,6,7,40\n1,2,3,4,5,6,7,8,41\n")
     recording = convert(path, tmp_path / "out.csv", coordinates="joint")
     assert (tmp_path / "out.csv").read_text().splitlines()[0] == "q1,q2,q3,q4,q5,q6,q7"
-    assert "columns left out, which are not q, qd, tau or t: time, temperature" in recording.notes
+    assert "ignored columns: time, temperature" in recording.notes
 
 
 def test_actuator_coordinates_become_joint_coordinates_of_an_arm(tmp_path):

@@ -31,10 +31,10 @@ def assert_same_numbers(recording, expected):
     np.testing.assert_allclose(recording.t, [1e-6 * (s.utime - expected[0].utime) for s in expected], atol=1e-12)
 
 
-# The project's reader and LCM's reader agree.
+# Comparison with the reader of LCM.
 
 
-def test_reads_what_lcm_writes(tmp_path):
+def test_reads_logs_written_by_lcm(tmp_path):
     log = lcm.EventLog(str(tmp_path / "lcm.log"), "w")
     for status in statuses():
         log.write_event(status.utime + 300, "OTHER", b"noise")
@@ -44,29 +44,29 @@ def test_reads_what_lcm_writes(tmp_path):
     assert_same_numbers(recording, statuses())
     assert recording.notes == ()
     assert recording.coordinates == "joint"
-    assert recording.where(3) == f"{tmp_path}/lcm.log:7"
+    assert recording.where(3) == f"{tmp_path}/lcm.log, event 7"
     assert_same_numbers(read_recording(tmp_path / "lcm.log"), statuses())
 
 
-def test_lcm_reads_what_we_write(tmp_path):
-    path = write_log(tmp_path / "ours.log", statuses())
+def test_lcm_reads_logs_of_this_package(tmp_path):
+    path = write_log(tmp_path / "a.log", statuses())
     events = list(lcm.EventLog(str(path)))
-    ours = list(LcmLogReader(path))
-    assert [(e.eventnum, e.timestamp, e.channel, e.data) for e in events] == [tuple(e) for e in ours]
+    read_events = list(LcmLogReader(path))
+    assert [(e.eventnum, e.timestamp, e.channel, e.data) for e in events] == [tuple(e) for e in read_events]
     assert [e.data for e in events] == [s.encode() for s in statuses()]
 
 
 # Damage.
 
 
-def test_a_log_cut_anywhere_is_read_up_to_there(tmp_path):
+def test_truncated_log_is_read_up_to_its_end(tmp_path):
     whole = log_bytes(statuses(4))
     size = len(whole) // 4
     for length in range(2 * size, 4 * size):
         recording = read_recording(write_log(tmp_path / "cut.log", whole[:length]), ARM)
         assert_same_numbers(recording, statuses(4)[: length // size])
         assert len(recording.notes) == (length % size > 0)
-        assert all("as after a kill: read up to there" in note for note in recording.notes)
+        assert all("incomplete message skipped" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize(
@@ -80,19 +80,19 @@ def test_a_log_cut_anywhere_is_read_up_to_there(tmp_path):
     ],
     ids=["bytes missing", "long channel", "long data", "negative length", "no magic"],
 )
-def test_a_damaged_event_is_left_out_and_the_rest_is_read(tmp_path, begin, replaced, inserted):
+def test_damaged_event_is_skipped(tmp_path, begin, replaced, inserted):
     whole = log_bytes(statuses(10))
     at = 5 * len(whole) // 10 + begin
     recording = read_recording(write_log(tmp_path / "a.log", whole[:at], inserted, whole[at + replaced :]), ARM)
-    # An event is accepted only if another one follows. Without its magic number the previous event is lost too.
+    # An event is accepted only if another one follows. If the magic number is damaged, the previous event is lost too.
     kept = [k for k in range(10) if k != 5 and not (begin == 0 and k == 4)]
     assert_same_numbers(recording, [statuses(10)[k] for k in kept])
-    assert "are damaged and are left out" in recording.notes[0]
-    assert recording.notes[1] == f"messages lost on the way, missing in the sequence: {10 - len(kept)}"
+    assert "damaged bytes skipped" in recording.notes[0]
+    assert recording.notes[1] == f"messages lost (gaps in the sequence numbers): {10 - len(kept)}"
 
 
 def test_damaged_logs_are_read_or_refused(tmp_path):
-    """Damages logs. Changed numbers can go undetected without a checksum, but rows stay in order and of one arm."""
+    """Damages logs. Without a checksum, changed numbers are not detected, but the rows are in order and of one arm."""
     whole = log_bytes(statuses(12))
     generator, read = np.random.default_rng(3), 0
     for _ in range(300):
@@ -118,7 +118,7 @@ def test_damaged_logs_are_read_or_refused(tmp_path):
 
 
 def changed(k, **changes):
-    """Returns statuses of which the k-th is changed."""
+    """Returns statuses in which fields of the k-th status are changed."""
     result = statuses()
     for name, value in changes.items():
         setattr(result[k], name, value)
@@ -128,15 +128,18 @@ def changed(k, **changes):
 @pytest.mark.parametrize(
     ("messages", "note"),
     [
-        (changed(7, arm_name="MTMR"), "messages left out, of another arm or number of joints: 1"),
-        ([*statuses()[:7], b"garbage", *statuses()[8:]], "messages left out, no lcmt_dvrk_status, or one of another"),
-        (changed(7, utime=START + 2000), "messages left out, not later than the one before: 1"),
-        (changed(7, position=[float("nan")] * N), "messages left out, with a measurement that is not finite: 1"),
+        (changed(7, arm_name="MTMR"), "messages omitted, of another arm or number of joints: 1"),
+        (
+            [*statuses()[:7], b"garbage", *statuses()[8:]],
+            "messages omitted, not an lcmt_dvrk_status of this version: 1",
+        ),
+        (changed(7, utime=START + 2000), "messages omitted, not later than the previous one: 1"),
+        (changed(7, position=[float("nan")] * N), "messages omitted, with a measurement that is not finite: 1"),
         (
             changed(7, guard_state=Status.STATE_OFF),
-            "messages left out, with the motors off, whose efforts hold nothing: 1",
+            "messages omitted, with the motors off: 1",
         ),
-        ([*statuses()[:7], *statuses()[8:]], "messages lost on the way, missing in the sequence: 1"),
+        ([*statuses()[:7], *statuses()[8:]], "messages lost (gaps in the sequence numbers): 1"),
     ],
 )
 def test_unusable_statuses_are_omitted_and_noted(tmp_path, messages, note):
@@ -145,32 +148,35 @@ def test_unusable_statuses_are_omitted_and_noted(tmp_path, messages, note):
     assert any(n.startswith(note) for n in recording.notes), recording.notes
 
 
-def test_a_restart_is_noted_and_two_arms_of_one_name_are_refused(tmp_path):
+def test_restart_is_noted_and_duplicate_arms_are_refused(tmp_path):
     first, second = statuses(20), statuses(20, session_id=78)
     recording = read_recording(write_log(tmp_path / "restart.log", [*first[:9], *second[12:]]), ARM)
     assert_same_numbers(recording, [*first[:9], *second[12:]])
-    assert recording.notes == ("restarts of MTML in between: 1",)
+    assert recording.notes == ("restarts of MTML during the recording: 1",)
     mixed = [(first, second)[k % 2][k - k % 2] for k in range(20)]  # the second arm is slightly later
-    with pytest.raises(RecordingError, match=r"a\.log: event 2: two arms called MTML send at the same time"):
+    with pytest.raises(RecordingError, match=r"a\.log: event 2: two processes send statuses of MTML at the same time"):
         read_recording(write_log(tmp_path / "a.log", mixed), ARM)
 
 
-def test_the_arm_is_chosen_among_several(tmp_path):
+def test_arm_is_selected_from_several(tmp_path):
     other = log_bytes(statuses(5, arm_name="MTMR"), "DVRK_STATUS_MTMR")
     path = write_log(tmp_path / "both.log", other, statuses(), other)
     assert_same_numbers(read_recording(path, ARM), statuses())
     assert len(read_recording(path, load_arm("mtmr"))) == 5
-    with pytest.raises(RecordingError, match="statuses of several arms, DVRK_STATUS_MTML, DVRK_STATUS_MTMR: name one"):
+    with pytest.raises(RecordingError, match=r"statuses of several arms \(DVRK_STATUS_MTML, DVRK_STATUS_MTMR\)"):
         read_recording(path)
 
 
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ([log_bytes([b"x"] * 3, "POSE")], r"has no status of MTML \(channel DVRK_STATUS_MTML\); it has POSE \(3\)"),
-        ([log_bytes([b"x"])[:20]], "it has nothing that can be read"),
-        ([[b"x"] * 3], "none of its 3 messages on channel DVRK_STATUS_MTML can be used: .*no lcmt_dvrk_status.*: 3"),
-        ([statuses(guard_state=Status.STATE_OFF)], "none of its 20 messages .* with the motors off, .*: 20"),
+        (
+            [log_bytes([b"x"] * 3, "POSE")],
+            r"no status of MTML \(channel DVRK_STATUS_MTML\)\. Channels in the log: POSE \(3\)",
+        ),
+        ([log_bytes([b"x"])[:20]], "Channels in the log: none"),
+        ([[b"x"] * 3], "none of the 3 messages on channel DVRK_STATUS_MTML is usable: .*not an lcmt_dvrk_status.*: 3"),
+        ([statuses(guard_state=Status.STATE_OFF)], "none of the 20 messages .* with the motors off: 20"),
         ([b""], "is empty"),
     ],
 )
@@ -180,15 +186,15 @@ def test_log_without_the_arm_lists_its_arms(tmp_path, parts, message):
 
 
 def test_a_log_is_in_joint_coordinates(tmp_path):
-    with pytest.raises(RecordingError, match="an LCM log is in joint coordinates, not actuator"):
+    with pytest.raises(RecordingError, match="an LCM log is in joint coordinates, not in actuator"):
         read_recording(write_log(tmp_path / "a.log", statuses()), ARM, "actuator")
 
 
 # Commands that read a recording.
 
 
-def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
-    """Uses one status per pose, one second apart: a log of static poses."""
+def test_commands_read_logs_like_csv_files(tmp_path, capsys):
+    """Uses a log of static poses with one status per pose, at intervals of 1 s."""
     truth = IdentifiedModel.from_arm(ARM)
     messages = statuses(40)
     for k, status in enumerate(messages):
@@ -198,7 +204,7 @@ def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
     log = write_log(tmp_path / "poses.log", messages, b"\xed\xa1\xda\x01half an event")
     csv = tmp_path / "poses.csv"
     assert main(["convert", str(log), "--output", str(csv), "--arm", "mtml"]) == 0
-    assert "as after a kill" in capsys.readouterr().out
+    assert "incomplete message skipped" in capsys.readouterr().out
     assert_same_numbers(read_recording(csv, ARM), messages)
     predicted = []
     for recording in (log, csv):
@@ -210,11 +216,14 @@ def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
         predicted.append(np.loadtxt(output, delimiter=",", skiprows=1))
     np.testing.assert_allclose(*predicted, atol=1e-12)
     assert main(["identify", str(log), "--arm", "psm", "--output", str(tmp_path / "x.yaml")]) == 2
-    assert "has no status of PSM (channel DVRK_STATUS_PSM); it has DVRK_STATUS_MTML (40)" in capsys.readouterr().err
+    assert (
+        "no status of PSM (channel DVRK_STATUS_PSM). Channels in the log: DVRK_STATUS_MTML (40)"
+        in capsys.readouterr().err
+    )
 
 
 def test_log_of_a_moving_arm_is_identified_by_static_segments(tmp_path, capsys):
-    """Identifies from a log at 1 kHz with motions between poses, whose friction would falsify a model."""
+    """Identifies a model from a log at 1 kHz. Friction during the motions between poses must not affect the model."""
     generator = np.random.default_rng(5)
     recording = motion_with_pauses(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
     messages = []
@@ -224,7 +233,7 @@ def test_log_of_a_moving_arm_is_identified_by_static_segments(tmp_path, capsys):
         messages.append(status)
     log = write_log(tmp_path / "moving.log", messages)
     assert main(["identify", str(log), "--arm", "mtml", "--output", str(tmp_path / "model.yaml")]) == 0
-    assert f"16 poses at which the arm rests are taken; {len(messages)} rows" in capsys.readouterr().out
+    assert f"Static poses found in the motion: 16, in {len(messages)} rows." in capsys.readouterr().out
     fresh = ARM.sample_poses(100, generator)
     truth = IdentifiedModel.from_arm(ARM).holding_torque(fresh)
     error = IdentifiedModel.load(tmp_path / "model.yaml").holding_torque(fresh) - truth
@@ -246,19 +255,19 @@ def test_convert_refuses_options_of_other_formats(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".log"])
-def test_a_growing_file_is_whole_after_every_message(tmp_path, suffix):
+def test_file_is_complete_after_each_message(tmp_path, suffix):
     stream = StatusStream("MTML", N)
     path = tmp_path / f"a{suffix}"
     file = open_recording_file(path, ARM, stream)
     messages = changed(7, guard_state=Status.STATE_OFF)
     for k, message in enumerate(messages):
         data = message.encode()
-        file.write(data, message.utime + 500, stream.take(data))
+        file.write(data, message.utime + 500, stream.accept(data))
         assert_same_numbers(read_recording(path, ARM), [m for m in messages[: k + 1] if m.guard_state])
     file.close()
-    with pytest.raises(RecordingError, match=r"nowhere\.csv: cannot be written: "):
+    with pytest.raises(RecordingError, match=r"nowhere\.csv cannot be written: "):
         check_stream_output("/proc/self/nowhere.csv")  # a folder that is not writable
-    with pytest.raises(RecordingError, match="exists already, and a recording is not overwritten"):
+    with pytest.raises(RecordingError, match="already exists, and a recording is never overwritten"):
         open_recording_file(path, ARM, stream)
 
 
@@ -269,16 +278,16 @@ def test_unwritable_outputs_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".log"])
-def test_a_full_disk_ends_the_file_with_a_whole_row(tmp_path, suffix):
+def test_full_disk_ends_the_file_with_a_complete_row(tmp_path, suffix):
     stream = StatusStream("MTML", N)
     path = tmp_path / f"a{suffix}"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     file = open_recording_file(path, ARM, stream)
     resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
     try:
-        with pytest.raises(RecordingError, match="cannot be written any more: "):
+        with pytest.raises(RecordingError, match="cannot be written: "):
             for message in statuses(40):
-                file.write(message.encode(), message.utime, stream.take(message.encode()))
+                file.write(message.encode(), message.utime, stream.accept(message.encode()))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     file.close()

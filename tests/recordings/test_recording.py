@@ -23,7 +23,7 @@ def test_reads_columns_by_name_in_any_order_and_ignores_others(tmp_path):
     np.testing.assert_array_equal(recording.t, [2.5])
     assert recording.qd is None
     assert recording.coordinates == "joint"
-    assert recording.where(0) == f"{path}:2"
+    assert recording.where(0) == f"{path}, line 2"
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_reads_columns_by_name_in_any_order_and_ignores_others(tmp_path):
     ],
     ids=["plain", "BOM", "CRLF", "CR", "spaces", "empty columns", "quotes"],
 )
-def test_reads_what_other_programs_write(tmp_path, text):
+def test_reads_csv_variants_of_other_programs(tmp_path, text):
     recording = read_recording(write_text(tmp_path, text))
     np.testing.assert_array_equal(recording.lines, [2, 3])
     np.testing.assert_array_equal(recording.tau[1], [0.8, 0.9, 0.10, 0.11, 0.12, 0.13, 0.14])
@@ -49,62 +49,62 @@ def test_blank_lines_do_not_shift_line_numbers(tmp_path):
     path = write_text(tmp_path, f"\n{HEADER}\n\n , ,\n{ROW}\n\n{ROW}\n\n")
     np.testing.assert_array_equal(read_recording(path).lines, [5, 7])
     path = write_text(tmp_path, f"\n{HEADER}\n\n{ROW}\n\n{ROW.replace('0.1,', 'x,')}\n")
-    with pytest.raises(RecordingError, match=r"recording\.csv:6: q1 is not a number: 'x'"):
+    with pytest.raises(RecordingError, match=r"recording\.csv, line 6: q1 is not a number: 'x'"):
         read_recording(path)
 
 
 def test_missing_efforts_are_reported_when_required(tmp_path):
     path = write_text(tmp_path, ",".join(Q_NAMES) + "\n" + ",".join(["0"] * 7) + "\n")
     recording = read_recording(path)
-    with pytest.raises(RecordingError, match=r"recording\.csv: has no efforts; needs columns tau1\.\.tau7"):
+    with pytest.raises(RecordingError, match=r"recording\.csv has no efforts; needs columns tau1\.\.tau7"):
         recording.measured_effort()
-    with pytest.raises(RecordingError, match=r"^recording: has no efforts"):
+    with pytest.raises(RecordingError, match=r"^recording has no efforts"):
         replace(recording, source="").measured_effort()
 
 
-def test_the_source_of_a_row_without_a_file():
-    assert random_recording().where(2) == "recording: row 3"
-    assert random_recording(source="simulated").where(2) == "simulated: row 3"
+def test_row_without_a_file_is_named_by_its_number():
+    assert random_recording().where(2) == "recording, row 3"
+    assert random_recording(source="simulated").where(2) == "simulated, row 3"
 
 
 WANTED = r"needs (a header with )?q1\.\.q7 and tau1\.\.tau7 \(t and qd1\.\.qd7 optional\)"
 MULTI_LINE = '"a\nb"'
 ERRORS = {
-    "empty": ("", r"recording\.csv: is empty; " + WANTED),
-    "blank": ("\n\n  \n", r"recording\.csv: is empty; " + WANTED),
-    "header only": (HEADER + "\n", r"recording\.csv: has a header but no rows"),
-    "no header": (f"{ROW}\n{ROW}\n", r":1: has no header; .*q1\.\.q7 .*dvrk-drake convert"),
-    "missing q": (f"{HEADER.replace('q3', 'p3')}\n{ROW}", r":1: missing column q3; " + WANTED),
+    "empty": ("", r"recording\.csv is empty; " + WANTED),
+    "blank": ("\n\n  \n", r"recording\.csv is empty; " + WANTED),
+    "header only": (HEADER + "\n", r"recording\.csv has a header but no rows"),
+    "no header": (f"{ROW}\n{ROW}\n", r", line 1: the header is missing\. .*q1\.\.q7 .*dvrk-drake convert"),
+    "missing q": (f"{HEADER.replace('q3', 'p3')}\n{ROW}", r", line 1: missing column q3; " + WANTED),
     "missing taus": (
         f"{HEADER.replace('tau4', 'x').replace('tau6', 'y')}\n{ROW}",
-        r":1: missing columns tau4, tau6; " + WANTED,
+        r", line 1: missing columns tau4, tau6; " + WANTED,
     ),
-    "some qd": (f"{HEADER},qd1,qd2\n{ROW},0,0", r":1: missing columns qd3, qd4, qd5, qd6, qd7; "),
-    "other names": ("a,b\n1,2\n", r":1: missing columns q1, q2, q3, q4, q5, q6, q7; "),
-    "duplicate": (f"{HEADER},q2\n{ROW},0", r":1: column q2 is named twice"),
-    "q8": (f"{HEADER},q8\n{ROW},0", r":1: has q8, but the arm has 7 joints"),
-    "tau8": (f"{HEADER},tau8\n{ROW},0", r":1: has tau8, but the arm has 7 joints"),
-    "NaN": (f"{HEADER}\n{ROW}\n{ROW.replace('0.11', 'NaN')}\n", r":3: tau4 is NaN; only finite numbers"),
-    "inf": (f"{HEADER}\n{ROW.replace('0.11', '-inf')}\n", r":2: tau4 is -inf; only finite numbers"),
-    "overflow": (f"{HEADER}\n{ROW.replace('0.11', '1e999')}\n", r":2: tau4 is 1e999; only finite numbers"),
-    "text": (f"{HEADER}\n{ROW.replace('0.11', 'off')}\n", r":2: tau4 is not a number: 'off'"),
-    "underscore": (f"{HEADER}\n{ROW.replace('0.11', '1_1')}\n", r":2: tau4 is not a number: '1_1'"),
-    "empty cell": (f"{HEADER}\n{ROW.replace('0.11', '')}\n", r":2: tau4 is empty"),
-    "line break": (f"{HEADER}\n{ROW.replace('0.11', MULTI_LINE)}\n", r":3: tau4 is not a number: 'a\\nb'"),
-    "time": (f"t,{HEADER}\nnow,{ROW}\n", r":2: t is not a number: 'now'"),
-    "too few": (f"{HEADER}\n{ROW}\n{ROW[:-5]}\n", r":3: has 13 cells, the header names 14 columns"),
-    "too many": (f"{HEADER}\n{ROW},\n", r":2: has 15 cells, the header names 14 columns"),
+    "some qd": (f"{HEADER},qd1,qd2\n{ROW},0,0", r", line 1: missing columns qd3, qd4, qd5, qd6, qd7; "),
+    "other names": ("a,b\n1,2\n", r", line 1: missing columns q1, q2, q3, q4, q5, q6, q7; "),
+    "duplicate": (f"{HEADER},q2\n{ROW},0", r", line 1: column q2 occurs twice"),
+    "q8": (f"{HEADER},q8\n{ROW},0", r", line 1: unexpected column q8; the arm has 7 joints"),
+    "tau8": (f"{HEADER},tau8\n{ROW},0", r", line 1: unexpected column tau8; the arm has 7 joints"),
+    "NaN": (f"{HEADER}\n{ROW}\n{ROW.replace('0.11', 'NaN')}\n", r", line 3: tau4 is NaN; only finite numbers"),
+    "inf": (f"{HEADER}\n{ROW.replace('0.11', '-inf')}\n", r", line 2: tau4 is -inf; only finite numbers"),
+    "overflow": (f"{HEADER}\n{ROW.replace('0.11', '1e999')}\n", r", line 2: tau4 is 1e999; only finite numbers"),
+    "text": (f"{HEADER}\n{ROW.replace('0.11', 'off')}\n", r", line 2: tau4 is not a number: 'off'"),
+    "underscore": (f"{HEADER}\n{ROW.replace('0.11', '1_1')}\n", r", line 2: tau4 is not a number: '1_1'"),
+    "empty cell": (f"{HEADER}\n{ROW.replace('0.11', '')}\n", r", line 2: tau4 is empty"),
+    "line break": (f"{HEADER}\n{ROW.replace('0.11', MULTI_LINE)}\n", r", line 3: tau4 is not a number: 'a\\nb'"),
+    "time": (f"t,{HEADER}\nnow,{ROW}\n", r", line 2: t is not a number: 'now'"),
+    "too few": (f"{HEADER}\n{ROW}\n{ROW[:-5]}\n", r", line 3: the row has 13 cells, the header has 14"),
+    "too many": (f"{HEADER}\n{ROW},\n", r", line 2: the row has 15 cells, the header has 14"),
     "semicolons": (
         f"{HEADER}\n{ROW}".replace(",", ";"),
-        r":1: no comma in the first row; cells must be separated by",
+        r", line 1: the first row has no comma\. Separate cells by commas",
     ),
-    "tabs": (f"{HEADER}\n{ROW}".replace(",", "\t"), r":1: no comma in the first row"),
-    "open quote": (f'{HEADER}\n"{ROW}\n{ROW}\n', r":3: not CSV: unexpected end of data"),
+    "tabs": (f"{HEADER}\n{ROW}".replace(",", "\t"), r", line 1: the first row has no comma"),
+    "open quote": (f'{HEADER}\n"{ROW}\n{ROW}\n', r", line 3: invalid CSV: unexpected end of data"),
     "UTF-16": (
         f"{HEADER}\n{ROW}\n".encode("utf-16"),
-        r"recording\.csv: not a CSV text file in UTF-8: .* at byte 0",
+        r"recording\.csv is not a UTF-8 text file: .* at byte 0",
     ),
-    "binary": (bytes(range(256)), r"recording\.csv: not a CSV text file in UTF-8: .* at byte 128"),
+    "binary": (bytes(range(256)), r"recording\.csv is not a UTF-8 text file: .* at byte 128"),
 }
 
 
@@ -117,12 +117,12 @@ def test_errors_name_file_line_and_column_in_one_line(tmp_path, case):
     assert str(caught.value).startswith(str(tmp_path))
 
 
-def test_six_joints(tmp_path):
+def test_recording_with_six_joints(tmp_path):
     path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
     assert read_recording(path, arm=six_joint_arm()).q.shape == (1, 6)
     with pytest.raises(RecordingError, match="missing column q7"):
         read_recording(path)
-    with pytest.raises(RecordingError, match="has q7, but the arm has 6 joints; of PSM these are yaw, pitch"):
+    with pytest.raises(RecordingError, match="unexpected column q7; the arm has 6 joints; joints of PSM: yaw, pitch"):
         read_recording(write_text(tmp_path, f"{HEADER}\n{ROW}"), arm=six_joint_arm())
 
 
@@ -133,7 +133,7 @@ def test_non_files_are_refused(tmp_path):
         read_recording(tmp_path)
 
 
-def test_a_file_that_may_not_be_read():
+def test_file_without_read_permission_is_refused():
     with public_folder() as folder:
         path = write_text(folder, HEADER)
         path.chmod(0)
@@ -145,6 +145,6 @@ def test_a_file_that_may_not_be_read():
         run_unprivileged(check)
 
 
-def test_unknown_coordinates(tmp_path):
+def test_unknown_coordinates_are_refused(tmp_path):
     with pytest.raises(RecordingError, match='unknown coordinates "motor"; allowed: joint, actuator'):
         read_recording(tmp_path / "any.csv", coordinates="motor")

@@ -19,7 +19,7 @@ def test_wpi_csv_columns_time_and_coordinates(tmp_path):
     np.testing.assert_array_equal(recording.tau, rows[:, 14:])
     np.testing.assert_array_equal(recording.t, [0, 0.005, 0.010, 0.015])
     assert recording.coordinates == "actuator"
-    assert recording.where(3) == f"{path}:4"
+    assert recording.where(3) == f"{path}, line 4"
     np.testing.assert_array_equal(read_wpi_csv(path, rate=10).t, [0, 0.1, 0.2, 0.3])
 
 
@@ -32,32 +32,32 @@ def test_wpi_csv_with_crlf_bom_blank_lines_and_spaces(tmp_path):
 
 
 WPI_ERRORS = {
-    "empty": ("", r"motion\.csv: is empty; needs 21 numbers a row"),
-    "blank": ("\n \n,,\n", r"motion\.csv: is empty"),
+    "empty": ("", r"motion\.csv is empty; needs 21 numbers per row"),
+    "blank": ("\n \n,,\n", r"motion\.csv is empty"),
     "header": (
         ",".join(f"q{i}" for i in range(21)) + f"\n{NUMBERS}\n",
-        r":1: has a header, which wpi-csv has not .*needs no conv",
+        r", line 1: unexpected header; .*needs no conv",
     ),
-    "title": ("my motion\n" + NUMBERS, r":1: no comma in the first row"),
+    "title": ("my motion\n" + NUMBERS, r", line 1: the first row has no comma"),
     "one number": (
         "1\n2\n",
-        r":1: has 1 cells; wpi-csv has 21 numbers a row: q1\.\.q7, qd1\.\.qd7, tau1\.\.tau7",
+        r", line 1: the row has 1 cells, wpi-csv files have 21 numbers per row: q1\.\.q7, qd1\.\.qd7, tau1\.\.tau7",
     ),
-    "planned motion": ("1,2,3,4,5,6,7,500\n" * 3, ":1: has 8 cells; wpi-csv has 21"),
-    "ragged": (f"{NUMBERS}\n{NUMBERS}\n{NUMBERS},\n", ":3: has 22 cells"),
-    "text": (f"{NUMBERS}\n{NUMBERS[:-1]}abc\n", r":2: tau7 \(column 21\) is not a number: 'abc'"),
-    "text first": ("x" + NUMBERS + "\n", r":1: q1 \(column 1\) is not a number: 'x1'"),
-    "empty cell": (f"{NUMBERS}\n{NUMBERS[:-1]}\n", r":2: tau7 \(column 21\) is empty"),
-    "underscore": (f"{NUMBERS}_0\n", r":1: tau7 \(column 21\) is not a number: '1_0'"),
-    "nan": (f"{NUMBERS}\n{NUMBERS}\nnan{NUMBERS[1:]}\n", r":3: q1 \(column 1\) is nan; only finite"),
-    "inf": (f"{NUMBERS[:-1]}-inf\n", r":1: tau7 \(column 21\) is -inf; only finite"),
-    "one row": (NUMBERS, r"motion\.csv: has 1 valid row; a motion needs at least 2"),
+    "planned motion": ("1,2,3,4,5,6,7,500\n" * 3, r", line 1: the row has 8 cells, wpi-csv files have 21"),
+    "ragged": (f"{NUMBERS}\n{NUMBERS}\n{NUMBERS},\n", r", line 3: the row has 22 cells"),
+    "text": (f"{NUMBERS}\n{NUMBERS[:-1]}abc\n", r", line 2: tau7 \(column 21\) is not a number: 'abc'"),
+    "text first": ("x" + NUMBERS + "\n", r", line 1: q1 \(column 1\) is not a number: 'x1'"),
+    "empty cell": (f"{NUMBERS}\n{NUMBERS[:-1]}\n", r", line 2: tau7 \(column 21\) is empty"),
+    "underscore": (f"{NUMBERS}_0\n", r", line 1: tau7 \(column 21\) is not a number: '1_0'"),
+    "nan": (f"{NUMBERS}\n{NUMBERS}\nnan{NUMBERS[1:]}\n", r", line 3: q1 \(column 1\) is nan; only finite"),
+    "inf": (f"{NUMBERS[:-1]}-inf\n", r", line 1: tau7 \(column 21\) is -inf; only finite"),
+    "one row": (NUMBERS, r"motion\.csv has 1 valid row; a motion needs at least 2"),
     "semicolons": (
         NUMBERS.replace(",", ";"),
-        ":1: no comma in the first row; cells must be separated by commas",
+        r", line 1: the first row has no comma\. Separate cells by commas",
     ),
-    "spaces": (NUMBERS.replace(",", " "), ":1: no comma in the first row"),
-    "open quote": (f'{NUMBERS}\n"{NUMBERS}\n{NUMBERS}\n', ":3: not CSV: unexpected end of data"),
+    "spaces": (NUMBERS.replace(",", " "), r", line 1: the first row has no comma"),
+    "open quote": (f'{NUMBERS}\n"{NUMBERS}\n{NUMBERS}\n', r", line 3: invalid CSV: unexpected end of data"),
 }
 
 
@@ -72,7 +72,9 @@ def test_wpi_csv_errors_name_file_line_and_column(tmp_path, case):
 
 @pytest.mark.parametrize("rate", [0, -200, np.nan, np.inf])
 def test_wpi_csv_refuses_other_rates(tmp_path, rate):
-    assert_refused("rate must be a positive number of Hz", read_wpi_csv, write_wpi(tmp_path, wpi_rows()), rate=rate)
+    assert_refused(
+        "rate is .* Hz; allowed: a positive number", read_wpi_csv, write_wpi(tmp_path, wpi_rows()), rate=rate
+    )
 
 
 def test_wpi_csv_skips_invalid_rows_and_keeps_times(tmp_path):

@@ -1,4 +1,4 @@
-"""Output of the commands: the answer first, then the next step, then tables of at most 80 columns."""
+"""Tests of the terminal reports: answer, next step, then tables of at most 80 columns."""
 
 import os
 import re
@@ -20,7 +20,7 @@ from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
 from dvrk_drake.experiments.study.table import Row
 from dvrk_drake.experiments.transparency import OperatorForces
-from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointFacts
+from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointProperties
 from dvrk_drake.experiments.tuning.procedure import JointProcedure, Ultimate
 from dvrk_drake.experiments.tuning.sampled_loop import Margins
 from dvrk_drake.experiments.tuning.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
@@ -45,7 +45,7 @@ pytestmark = pytest.mark.slow
 
 @cache
 def poses():
-    """A static model, and errors of it on other poses, where one joint's effort is wrong."""
+    """Returns a static identification, and its validation on poses with wrong efforts of one joint."""
     arm, recordings, generator = dvrk.load_arm("mtml"), [], np.random.default_rng(0)
     for _ in range(2):
         q = arm.sample_poses(40, generator)
@@ -60,7 +60,7 @@ def poses():
 
 @cache
 def motions():
-    """Two recordings of a motion, without and with a payload, and the model of the first."""
+    """Returns two recordings of a motion, without and with a payload, and the identification of the first."""
     _, reference, loaded = two_days("psm", "end_link", 0.2, [0.02, 0.02, 0.39], 0)
     return reference, loaded, dvrk.identify(reference, dvrk.load_arm("psm"))
 
@@ -134,9 +134,9 @@ def tuned(console, verbose):
     }
     compared = Comparison(arm, dict.fromkeys(names, arm.gains), CONDITIONS, q, measures, {})
     procedure = JointProcedure(1.2, 0.3, 0.5, Ultimate(1234.5, 0.123, 1.01, False), 1.0, False, 1.234e-3)
-    facts = JointFacts((1.23e-4, 4.56e-3), 0.1, 0.1, 1.0, 1e-4, 1e-3, 3.0)
+    properties = JointProperties((1.23e-4, 4.56e-3), 0.1, 0.1, 1.0, 1e-4, 1e-3, 3.0)
     design = JointDesign(1.2, 0.3, 0.5, 123.4, (Margins(0.7, 100.0, 2.3),) * 2, "phase margin")
-    found = Tuning(arm, (procedure,) * n, ArmDesign(arm.gains, (facts,) * n, (design,) * n), compared)
+    found = Tuning(arm, (procedure,) * n, ArmDesign(arm.gains, (properties,) * n, (design,) * n), compared)
     tuning.print_tuning(console, found, verbose=verbose)
 
 
@@ -152,7 +152,7 @@ def forces(console, verbose):
 def demonstrated(console, verbose):
     identified, validation = poses()
     t, q = np.arange(3.0), np.zeros((3, 7))
-    drift = {"identified": np.full(7, 0.0123), "as drawn": np.full(7, 1.234)}
+    drift = {"identified": np.full(7, 0.0123), "nominal": np.full(7, 1.234)}
     result = DemoResult(
         identified.model.arm, identified, validation, validation, t, q, q, drift, t, q, np.full(7, 1.2e-4)
     )
@@ -160,7 +160,7 @@ def demonstrated(console, verbose):
 
 
 VERDICT = r"Verdict: (good|usable|do not use) ?[(.]"
-#: Case -> how the answer begins, and what prints it.
+#: Mapping from a case to a pattern for the start of the answer, and the function that prints it.
 CASES = {
     "identify poses": (VERDICT, lambda c, v: identification.print_identification(c, poses()[0], verbose=v)),
     "identify motion": (VERDICT, lambda c, v: identification.print_identification(c, motions()[2], verbose=v)),
@@ -233,13 +233,13 @@ def printed(case, verbose):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_answer_comes_first_and_all_fits_80_columns(case):
+def test_answer_comes_first_and_output_fits_80_columns(case):
     short, whole = printed(case, False), printed(case, True)
     for text in (short, whole):
         answer, _, rest = text.partition("\nNext: ")
         assert re.match(CASES[case][0], " ".join(answer.split())), text
         assert answer.count("\n") < 3 and rest.split("\n")[1] == ""
-        # A finding is one line, so that it can be searched for.
+        # Findings are not wrapped, so that they can be searched.
         lines = [line for line in text.splitlines() if not line.startswith(("warning: ", "note: "))]
         assert max(len(line.rstrip()) for line in lines) <= 80, text
         assert "…" not in text

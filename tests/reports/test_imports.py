@@ -1,10 +1,10 @@
-"""Commands that neither simulate nor draw start without the modules that take time to import."""
+"""Reports without simulations and plots do not import the slow modules for these."""
 
 import subprocess
 import sys
 
 
-def test_text_of_a_model_needs_neither_a_simulation_nor_a_plot():
+def test_reports_import_no_simulation_and_no_plots():
     modules = ("identification", "payload", "recording_check", "export", "model")
     statement = f"import sys; from dvrk_drake.reports import {', '.join(modules)}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", statement], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""Tables in terminals of any width: no digit is lost, and nothing is wider than it must be."""
+"""Tables show all digits in terminals of any width, and are not wider than necessary."""
 
 import pytest
 
@@ -13,14 +13,14 @@ def printed(capsys, monkeypatch, columns):
         monkeypatch.delenv("COLUMNS", raising=False)
     else:
         monkeypatch.setenv("COLUMNS", str(columns))
-    table = make_table("What is known", "", "clip [N m]", "dead band [rad/s]", "standard error", "saturation [rad/s]")
+    table = make_table("Estimates", "", "clip [N m]", "dead band [rad/s]", "standard error", "saturation [rad/s]")
     table.add_row(*CELLS)
     make_console().print(table)
     return capsys.readouterr().out.splitlines()
 
 
 @pytest.mark.parametrize("columns", [64, 80, 100, 120, None])
-def test_it_fits_and_every_number_is_whole(columns, capsys, monkeypatch):
+def test_table_fits_and_numbers_are_complete(columns, capsys, monkeypatch):
     lines = printed(capsys, monkeypatch, columns)
     assert max(map(len, lines)) <= (columns or TABLE_WIDTH)
     text = "\n".join(lines)
@@ -30,12 +30,12 @@ def test_it_fits_and_every_number_is_whole(columns, capsys, monkeypatch):
     assert "m_crank c_crank_y" in name
 
 
-def test_a_narrow_terminal_gets_all_numbers(capsys, monkeypatch):
+def test_narrow_terminal_shows_all_numbers(capsys, monkeypatch):
     text = "\n".join(printed(capsys, monkeypatch, 30))
     assert all(cell in text for cell in CELLS[1:])
 
 
-def test_a_wide_terminal_keeps_headings_on_one_line(capsys, monkeypatch):
+def test_wide_terminal_keeps_headings_on_one_line(capsys, monkeypatch):
     title, heading, row = printed(capsys, monkeypatch, 140)
-    assert title.strip() == "What is known" and row.startswith(NAME)
+    assert title.strip() == "Estimates" and row.startswith(NAME)
     assert heading.split("  ")[-1].strip() == "saturation [rad/s]"

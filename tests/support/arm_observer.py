@@ -1,4 +1,4 @@
-"""Observes the statuses of an arm over UDP, for tests that wait for a condition."""
+"""Observes the statuses of an arm over UDP. Tests use it to wait for a condition."""
 
 import threading
 import time
@@ -28,23 +28,23 @@ class Observer:
         self.running.add(self)
 
     def end(self):
-        """Ends its threads. Those of LCM read every message of the network, in real time."""
+        """Ends the thread of the observer. The threads of LCM continue to read every message of the network."""
         self.running.remove(self)
         self.ended.set()
         self.thread.join(TIMEOUT)
 
     def listen(self, name, url):
-        # Scheduling is set per thread. LCM's reading thread, which is started here, inherits it. Processes do not,
-        # because the main thread starts them.
+        # Scheduling is set per thread. The reading thread of LCM, started here, inherits it. Processes do not inherit
+        # it, because the main thread starts them.
         make_realtime()
         network = lcm.LCM(url)
-        subscription = network.subscribe(f"DVRK_STATUS_{name.upper()}", self.hear)
+        subscription = network.subscribe(f"DVRK_STATUS_{name.upper()}", self.receive)
         subscription.set_queue_capacity(0)  # no limit
         self.listens.set()
         while not self.ended.is_set():
             network.handle_timeout(100)
 
-    def hear(self, channel, data):
+    def receive(self, channel, data):
         self.times.append(time.monotonic())
         self.received.append(Status.decode(data))
 
@@ -53,9 +53,13 @@ class Observer:
         return self.received[-1]
 
     def until(self, condition, what, since=None, process=None):
-        """Returns the index of the first status that meets the condition, from now on or since an index.
+        """Waits for a status that meets the condition, and returns its index.
 
-        `process` is the process that is expected to fulfil the condition.
+        Args:
+            condition: Function from a status to bool.
+            what: Name of the condition, for the message.
+            since: Index of the first status to examine; None for statuses received from now on.
+            process: Process that must be running until the condition is met, or None.
         """
         seen = len(self.received) if since is None else since
 
@@ -89,9 +93,9 @@ def check_clock(statuses):
     np.testing.assert_array_equal(np.diff([status.utime for status in statuses]), 1000 * steps)
 
 
-def holds(status):
+def is_holding(status):
     return status.guard_state == Status.STATE_HOLD
 
 
-def takes_efforts(status):
+def accepts_efforts(status):
     return status.guard_state == Status.STATE_EFFORT

@@ -1,4 +1,4 @@
-"""Processes of the package in a network namespace, forked from a process that has compiled everything."""
+"""Processes of the package in a network namespace, forked from a process that has compiled the controllers."""
 
 import multiprocessing
 import os
@@ -16,14 +16,14 @@ from dvrk_drake import cli
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
 #: Driver configuration with long timeouts, suitable for a busy computer.
-PATIENT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
+LONG_TIMEOUT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
 
 FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
 
 
 class Forked:
-    """Forked process of one of the package's programs, with its output in a file."""
+    """Forked process of a program of the package, with its output in a file."""
 
     def __init__(self, main, *arguments):
         descriptor, self.path = tempfile.mkstemp()
@@ -37,14 +37,14 @@ class Forked:
     def wait(self):
         """Returns the exit code."""
         self.process.join(TIMEOUT)
-        assert self.poll() is not None, f"does not end: {self.said()}"
+        assert self.poll() is not None, f"does not end: {self.output()}"
         return self.poll()
 
     def poll(self):
         """Returns the exit code, or None while the process is running."""
         return self.process.exitcode
 
-    def said(self):
+    def output(self):
         return Path(self.path).read_text()
 
     def end(self, number=signal.SIGKILL):
@@ -52,11 +52,11 @@ class Forked:
         if self.poll() is None:
             self.send_signal(number)
         self.wait()
-        return self.said()
+        return self.output()
 
 
 class CommandLine(Forked):
-    """`dvrk-drake run`, started as by a user."""
+    """Process of `dvrk-drake run`, started on the command line."""
 
     def __init__(self, name, *options):
         descriptor, self.path = tempfile.mkstemp()

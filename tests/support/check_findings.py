@@ -9,7 +9,7 @@ ARMS = "psm", "mtmr"
 
 
 def found(recording, name="psm"):
-    """Returns findings by kind."""
+    """Returns a mapping from a kind to the findings of `check` of this kind."""
     report = check_recording(recording, load_arm(name))
     kinds = {}
     for finding in report.findings:

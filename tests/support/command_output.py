@@ -1,4 +1,4 @@
-"""Output of a command on stderr, without its progress."""
+"""Selects messages in the output of a command on stderr."""
 
 import re
 
@@ -7,12 +7,12 @@ STEP = re.compile(r"\d+ of \d+: .+|[a-z][^:]*")
 
 
 def messages(errors):
-    """Returns the lines of stderr that are not progress."""
+    """Returns the lines of stderr without progress lines."""
     return [line for line in errors.splitlines() if not STEP.fullmatch(line)]
 
 
 def refusal(errors):
-    """Returns the single line on stderr of a command that was refused."""
+    """Returns the only message on stderr of a command that failed."""
     (line,) = messages(errors)
     assert line.startswith("dvrk-drake: error: "), line
     return line

@@ -1,4 +1,4 @@
-"""Simulated arm with realistic sensors whose measurements can fail, with its driver and a controller."""
+"""Simulated arm with sensor faults, with its driver and a controller."""
 
 from dataclasses import dataclass
 
@@ -21,8 +21,8 @@ PERIOD = 1e-3
 #: Initial time for which the desired pose is constant, while the guard observes the controller [s].
 _AT_REST = 0.8
 
-#: Sensor faults of one joint: (q, v, effort, q when it began, time since then, scale) -> measurement. The scale is 1
-#: for a revolute joint [rad] and 0.1 for a prismatic joint [m].
+#: Sensor faults of one joint: (q, v, effort, q at the start of the fault, time since the start, scale) -> measurement.
+#: The scale is 1 for a revolute joint [rad] and 0.1 for a prismatic joint [m].
 FAULTS = {
     "encoder stuck": lambda q, v, effort, q0, t, scale: (q0, 0.0, effort),
     "position stuck": lambda q, v, effort, q0, t, scale: (q0, v, effort),
@@ -38,7 +38,7 @@ FAULTS = {
 
 
 class FaultySensors(LeafSystem):
-    """Forwards a state (2n) and an effort (n); the measurement of one joint fails from a given time on."""
+    """Sensors that forward the state (2n) and effort (n). The measurement of one joint fails from a given time on."""
 
     def __init__(self, arm):
         super().__init__()
@@ -62,10 +62,10 @@ class FaultySensors(LeafSystem):
 
 
 def wave(arm, seconds, speed, seed=0, reach=0.35):
-    """Returns a smooth motion (2n: q, then v) of all joints about the middle of their ranges that starts at rest.
+    """Returns a smooth trajectory of the positions (n), which starts at rest in the middle of the joint ranges.
 
-    The amplitude is `reach` times half of the range, or less if the speed would exceed `speed` (a tenth of it for
-    prismatic joints). Each joint has its own frequency.
+    The amplitude is `reach` times half of the range, or less if the speed would exceed `speed` [rad/s] (`speed` / 10
+    [m/s] for prismatic joints). Each joint has its own frequency.
     """
     times = np.arange(0.0, seconds + 0.1, 0.02)
     middle, half = 0.5 * (arm.position_upper + arm.position_lower), 0.5 * (arm.position_upper - arm.position_lower)
@@ -82,12 +82,12 @@ def wave(arm, seconds, speed, seed=0, reach=0.35):
 
 @dataclass
 class Outcome:
-    """Effect of a fault of one joint on the simulated arm; revolute joints in rad, prismatic ones in m.
+    """Effect of a sensor fault of one joint on the simulated arm.
 
     Attributes:
         detected: Time from the fault to its detection [s]; inf if it was not detected.
         text: Fault text of the guard.
-        before, after: Largest movement of the joint from the fault to its detection, and after detection.
+        before, after: Largest displacement of the joint before and after the detection of the fault [rad, m].
         speed: Largest speed of any joint at least 50 ms after detection, divided by 1 rad/s or 0.1 m/s.
         effort: Largest effort of any joint after detection, as a fraction of its limit.
     """
@@ -101,13 +101,13 @@ class Outcome:
 
 
 class FaultyArm:
-    """Arm, its driver and one of four controllers, in one Diagram stepped every millisecond.
+    """Diagram of an arm, its driver and a controller, advanced in steps of 1 ms.
 
     Attributes:
-        sensors: Sensors whose measurements can be made to fail.
+        sensors: Sensors with adjustable faults.
         model: Ground-truth model.
         desired: Function from time to the desired state (2n) of the arm under "effort" and "position".
-        lead: Function from status and time to the desired state for `ArmController.answer`.
+        on_status: Function from status and time to the desired state for `ArmController.answer`.
         controller: ArmController, or None.
     """
 
@@ -143,7 +143,7 @@ class FaultyArm:
         velocity = path.MakeDerivative()
         self.desired = lambda t: np.concatenate([path.value(t), velocity.value(t)]).ravel()
         self.controller = None
-        self.lead = lambda status, time: self.desired(time) if use == "effort" else None
+        self.on_status = lambda status, time: self.desired(time) if use == "effort" else None
         if use in ("effort", "gravity", "damped"):
             self.controller = ArmController(arm, model, "hold" if use == "effort" else use, PERIOD)
         elif use == "position":
@@ -171,7 +171,7 @@ class FaultyArm:
         time = PERIOD * self.ticks
         if self.controller is not None:
             status = self.driver.GetOutputPort("lcmt_dvrk_status").Eval(self.driver.GetMyContextFromRoot(self.context))
-            self.driver.Receive(self.controller.answer(status, time, self.lead(status, time)).encode())
+            self.driver.Receive(self.controller.answer(status, time, self.on_status(status, time)).encode())
         elif self._use == "position":
             context = self._sender.GetMyMutableContextFromRoot(self.context)
             self._sender.GetInputPort("desired_state").FixValue(context, self.desired(time))

@@ -1,4 +1,4 @@
-"""Damaged files for fuzzing: changes of the structure or of the bytes of a valid file."""
+"""Creates damaged files for fuzzing, by changes of the structure or the bytes of a valid file."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ JUNK = st.one_of(
     st.floats(width=32),
     st.text(max_size=8),
 )
-#: Texts that replace a cell of a CSV or a text of an XML file.
+#: Texts that replace a cell of a CSV file or a text of an XML file.
 WORDS = st.sampled_from(
     ("", " ", "nan", "-inf", "1e999", "1_0", "0x10", "abc", '"', "'", "#", ";", "1e308", "-1e308", "1e-320", "9" * 5000)
 )
 
 
 def slots(content: object) -> list[tuple[object, object]]:
-    """Returns (container, key) of every value in nested lists and tables."""
+    """Returns (container, key) of every value in nested lists and mappings."""
     found, waiting = [], [content]
     while waiting:
         container = waiting.pop()
@@ -55,7 +55,7 @@ def slots(content: object) -> list[tuple[object, object]]:
 
 @st.composite
 def changed_content(draw: st.DrawFn, content: object) -> object:
-    """Returns the nested lists and tables of a file with one to three changes."""
+    """Returns the nested lists and mappings of a file with one to three changes."""
     content = copy.deepcopy(content)
     for _ in range(draw(st.integers(1, 3))):
         places = slots(content)
@@ -76,7 +76,7 @@ def changed_content(draw: st.DrawFn, content: object) -> object:
         elif change == "rename" and isinstance(container, dict):
             container[f"{key}{draw(st.text(max_size=3))}"] = container.pop(key)
         else:
-            container[key] = copy.deepcopy(draw(JUNK))  # a later change must not change what is drawn next
+            container[key] = copy.deepcopy(draw(JUNK))  # a later change must not modify JUNK
     return content
 
 
@@ -102,7 +102,7 @@ def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
 
 
 def fixed_damages(content: bytes) -> dict[str, bytes]:
-    """Returns a file damaged as by editors, other systems and attackers, by name."""
+    """Returns a mapping from a name to a damaged file, as caused by editors, other systems or attackers."""
     middle = content.find(b"\n", len(content) // 2) + 1
     before, after = content[:middle], content[middle:]
     aliases = [b"a%d: &a%d [%s]\n" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9) if k else b"1") for k in range(12)]
@@ -117,7 +117,7 @@ def fixed_damages(content: bytes) -> dict[str, bytes]:
         "doubled": content + content,
         "long line": before + b"7" * 3_000_000 + after,
         "nested lists": before + b"[" * 100_000,
-        "nested tables": b"{a: " * 100_000,
+        "nested mappings": b"{a: " * 100_000,
         "nested elements": before + b"<a>" * 100_000,
         "JSON lists": b'{"GC_controller": ' + b"[" * 100_000,
         "aliases": b"".join(aliases),
@@ -171,7 +171,7 @@ def changed_xml(draw: st.DrawFn, content: bytes) -> bytes:
 
 
 def damaged(kind: str, content: bytes) -> st.SearchStrategy[bytes]:
-    """Returns damaged forms of a valid file of a kind: "yaml", "json", "csv", "xml", or "binary" (bytes only)."""
+    """Returns a strategy for damaged files of a kind: "yaml", "json", "csv", "xml", or "binary" (bytes only)."""
     by_bytes = changed_bytes(content)
     if kind == "yaml":
         by_content = changed_content(yaml.safe_load(content)).map(_yaml)

@@ -1,4 +1,4 @@
-"""Command line with a formula in place of the simulation in all processes: spawned workers import this module.
+"""Command line in which a formula replaces the simulation, also in spawned workers, which import this module.
 
 python tests/support/formula_study.py study STUDY.yaml --output RESULTS.csv --workers 2
 """
@@ -14,26 +14,26 @@ import dvrk_drake.experiments.study.study as study_module
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.recordings.recording import Recording
 
-#: Environment variable with the path of a folder of tickets. If it is set, each simulation waits for a file in the
-#: folder and removes it.
+#: Environment variable with the path of a folder of tickets (files). If set, each simulation waits for a ticket and
+#: removes it.
 TICKETS = "DVRK_DRAKE_TEST_TICKETS"
 
 
-def take_ticket(folder):
+def remove_ticket(folder):
     while True:
         for ticket in Path(folder).iterdir():
             try:
                 ticket.unlink()
                 return
-            except FileNotFoundError:  # another worker took it
+            except FileNotFoundError:  # removed by another worker
                 continue
         time.sleep(0.01)
 
 
 def simulate(scenario):
-    """Returns a drift that depends on seed, start and parameter error."""
+    """Returns a simulation whose positions drift at a rate that depends on the seed and the parameter error."""
     if folder := os.environ.get(TICKETS):
-        take_ticket(folder)
+        remove_ticket(folder)
     t = np.arange(0.0, scenario.duration + 1e-9, scenario.sample_period)
     rate = (1 + scenario.controller.parameter_error) * (scenario.seed % 1000) / 5e4
     q = np.array(scenario.start) + rate * t[:, None]

@@ -1,4 +1,4 @@
-"""Test bench for a command guard: a clock, a measured state set by the test, and commands."""
+"""Test bench for a command guard. The test sets the clock, the measured state and the commands."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ LIMIT = ARM.effort_limits
 SESSION = 77
 Q = np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5])  # inside all limits
 MS = 1000
-#: For tests that switch the arm off, which a guard accepts only if it is configured to.
+#: Accepted modes for tests that switch the arm off. By default a guard refuses OFF.
 WITH_OFF = (Command.POSITION, Command.EFFORT, Command.OFF)
 
 
@@ -25,7 +25,7 @@ def modes(*allowed):
 
 
 class Weightless:
-    """Model without weight and inertia, for tests of a guard whose arm is not moved by its efforts."""
+    """Model without gravity and inertia, for an arm that does not move."""
 
     def gravity_effort(self, q):
         return np.zeros(len(q))
@@ -35,14 +35,14 @@ class Weightless:
 
 
 class Heavy(Weightless):
-    """Model whose gravity effort is a known function of the pose, up to 0.2 of each effort limit."""
+    """Model whose gravity effort is a known function of the pose, up to 0.2 times the effort limits."""
 
     def gravity_effort(self, q):
         return 0.2 * LIMIT * np.cos(q)
 
 
 class Unchecked(Plausibility):
-    """Measurement check that accepts everything: on the bench the test sets the state of the arm."""
+    """Plausibility check that accepts all measurements, because the test sets the state of the arm."""
 
     def check(self, dt, q, v, effort, commanded):
         self.gravity, self._poses = self.model.gravity_effort(q), (q, q)
@@ -50,16 +50,16 @@ class Unchecked(Plausibility):
 
 
 class Untimed(PeriodMonitor):
-    """Period check that accepts every period."""
+    """Period monitor that accepts every period."""
 
     def add(self, period):
         return ""
 
 
 class Bench:
-    """Guard of an arm at rest, with a clock; the measured state is set by the test.
+    """Guard of an arm at rest, with a clock.
 
-    Checks of measurements and of the guard's own period are off, except in tests of these checks.
+    The checks of measurements and of the guard period are disabled unless `checks` is True.
     """
 
     def __init__(self, arm=ARM, *, q=Q, model=None, checks=False, **arguments):
@@ -74,8 +74,8 @@ class Bench:
         self.q = np.array(q) if arm is ARM else 0.5 * (arm.position_lower + arm.position_upper)
         self.v, self.effort = np.zeros(arm.num_joints), 0.05 * arm.effort_limits
         self.sequence = 0
-        self.age = 0  # of the measurement [us]
-        self.follows = False  # positions, at once
+        self.age = 0  # age of the measurement [us]
+        self.follows = False  # whether the arm reaches commanded positions immediately
         self.output = self.step()
 
     def at_rest(self):

@@ -1,4 +1,4 @@
-"""Simulated arm with LCM in one process, and controllers for it."""
+"""Simulated arm with LCM in the process of the test, and controllers for the arm."""
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -24,7 +24,7 @@ SOON = DvrkDriver(guard=GuardSettings(start_time=0.05))
 
 
 class SimulatedArm:
-    """Simulated arm with LCM, and its statuses."""
+    """Simulated arm with LCM that stores its statuses."""
 
     def __init__(self, lcm, name="mtml", driver=None, modify_plant=None):
         self.arm = load_arm(name)
@@ -52,7 +52,7 @@ class SimulatedArm:
 
 
 class Controller:
-    """Holds the first received pose through the hardware station."""
+    """Controller that regulates the first received pose through the hardware station."""
 
     def __init__(self, lcm, name="mtml", driver=None):
         arm = load_arm(name)
@@ -84,7 +84,7 @@ def without_stops(plant):
             joint.set_position_limits([-np.inf], [np.inf])
 
 
-class Sending:
+class CommandSender:
     """DvrkCommandSender that answers each status, with fixed inputs."""
 
     def __init__(self, lcm, arm=ARM, **inputs):
@@ -93,11 +93,11 @@ class Sending:
         self.lcm, self.status, self.ticks = lcm, Status(), 0
         # Fixing the value at each tick would copy it each time.
         self.received = self.port("lcmt_dvrk_status").FixValue(self.context, AbstractValue.Make(self.status))
-        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.hear)
+        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.receive)
         for name, value in inputs.items():
             self.fix(name, value)
 
-    def hear(self, data):
+    def receive(self, data):
         self.status = Status.decode(data)
 
     def port(self, name):

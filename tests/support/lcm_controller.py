@@ -1,9 +1,9 @@
-"""Small controller process for tests: holds the first received pose of the arm by efforts.
+"""Controller process for tests that regulates the first received pose of the arm with effort commands.
 
     python lcm_controller.py ARM [--echo] [--clock-jump SECONDS] [--lcm-url URL]
 
-With --echo it only answers with HOLD commands. Its clock jumps by the given time at its 1000th command.
-It has real-time scheduling if that is permitted.
+With --echo, the process only answers with HOLD commands. With --clock-jump, its clock jumps by the given time at the
+1000th command. The process uses real-time scheduling if that is permitted.
 """
 
 import sys
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
     def option(name: str, default: str) -> str:
         return arguments[arguments.index(name) + 1] if name in arguments else default
 
-    make_realtime()  # before LCM's reading thread is started
+    make_realtime()  # before LCM starts its reading thread
     controller = Controller(
         arguments[0], "--echo" in arguments, float(option("--clock-jump", "0")), option("--lcm-url", "")
     )
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> None:
 
 
 def tick(arguments: list) -> None:
-    """Counts milliseconds in a loop with the period and scheduling of an arm's loop; argument: a shared number."""
+    """Counts the periods of a loop with the period and scheduling of an arm. The argument is a shared counter."""
     (ticks,) = arguments
     make_realtime()
     pace = Pace(1e-3)
@@ -70,7 +70,7 @@ def tick(arguments: list) -> None:
 
 
 def flood(arguments: list) -> None:
-    """Publishes one valid command of another sender at maximum rate; arguments: URL, a status to answer (bytes)."""
+    """Publishes one valid command of another sender at maximum rate. Arguments: URL, encoded status to answer."""
     url, data = arguments
     network, status, command = lcm.LCM(url), lcmt_dvrk_status.decode(data), lcmt_dvrk_command()
     n = status.num_joints

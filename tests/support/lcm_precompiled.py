@@ -1,4 +1,4 @@
-"""Compiles the arms' controllers when imported, once for all processes that are forked afterwards."""
+"""Compiles the controllers on import, once for all processes that are forked afterwards."""
 
 import lcm_controller  # noqa: F401
 

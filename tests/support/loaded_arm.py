@@ -1,4 +1,4 @@
-"""Simulated arm on two days, the second with a known payload: recordings with a known difference."""
+"""Recordings of a simulated arm on two days, with a known payload on the second day."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from dvrk_drake.recordings.recording import Recording
 RATE = 1000.0
 #: White noise of the efforts, as a fraction of their RMS.
 NOISE = 0.02
-#: Dry and viscous friction, each as a fraction of the RMS effort without it; both differ by 20 % (RMS) on the second
-#: day.
+#: Dry and viscous friction, each as a fraction of the RMS effort without friction. On the second day both differ by
+#: FRICTION_CHANGE (RMS).
 FRICTION, FRICTION_CHANGE = 0.15, 0.2
-#: Additional offset, spring and cable torque of the second day, each as a fraction of the RMS effort (RMS over the
-#: arms).
+#: Additional offset, spring and cable torque on the second day, each as a fraction of the RMS effort.
 DRIVE_CHANGE = 0.03
 
 
@@ -42,7 +41,7 @@ def friction(model: DynamicModel, q, v, vd) -> list[DriveEffect]:
 
 
 def other_day(model: DynamicModel, q, v, vd, generator: np.random.Generator) -> DynamicSection:
-    """Returns the section with scaled friction and additional offsets, springs and cable torques."""
+    """Returns the dynamics with scaled friction and additional offsets, springs and cable torques."""
     effort = np.sqrt(np.mean(model.effort(q, v, vd) ** 2, axis=0))
     effects = []
     for joint in model.arm.joint_names:
@@ -64,7 +63,7 @@ def other_day(model: DynamicModel, q, v, vd, generator: np.random.Generator) -> 
 
 
 def with_payload(section: DynamicSection, link: str, mass: float, place) -> DynamicSection:
-    """Returns the section with a point mass on a link."""
+    """Returns the dynamics with an additional point mass on a link."""
     added = point_mass_parameters(mass, np.asarray(place, dtype=float))
     links = [
         dataclasses.replace(own, parameters=[float(x) for x in np.array(own.parameters) + added])
@@ -78,16 +77,16 @@ def with_payload(section: DynamicSection, link: str, mass: float, place) -> Dyna
 def two_days(
     name: str, link: str, mass: float, place, seed: int, *, noise: float = NOISE
 ) -> tuple[DynamicModel, Recording, Recording]:
-    """Returns the arm of the first day, its recording, and the recording of the second day with a payload.
+    """Returns the model and the recording of the first day, and the recording of the second day with a payload.
 
-    The motions differ slightly, because the controller deviates under the payload.
+    The motions differ slightly, because the payload causes a control error.
     """
     arm, generator = load_arm(name), np.random.default_rng(seed)
     t, q, v, vd = fourier_motion(arm, np.random.default_rng(1000), 6.5, 26.0, RATE)
     bare = true_dynamics(arm, np.random.default_rng(seed), [])
     first = DynamicModel(arm, dataclasses.replace(bare.section, effects=friction(bare, q, v, vd)))
     second = DynamicModel(arm, with_payload(other_day(first, q, v, vd, generator), link, mass, place))
-    give = 1 + 0.02 * generator.normal(size=arm.num_joints)
+    deviation = 1 + 0.02 * generator.normal(size=arm.num_joints)
     center = np.mean(q, axis=0)
-    other = (t, center + give * (q - center), give * v, give * vd)
+    other = (t, center + deviation * (q - center), deviation * v, deviation * vd)
     return first, recorded(first, (t, q, v, vd), noise, generator), recorded(second, other, noise, generator)

@@ -20,7 +20,7 @@ from dvrk_drake.recordings.recording import Recording
 
 
 def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seconds: float, rate: float):
-    """Returns q, v, vd (m, n) and t (m,) of a motion within the arm's limits that repeats after `period` [s]."""
+    """Returns t (m,) and q, v, vd (m, n) of a motion within the limits that repeats after `period` [s]."""
     t = np.arange(round(seconds * rate)) / rate
     center = arm.sample_poses(400, generator, margin=0.2).mean(axis=0)
     amplitude = 0.5 * (arm.position_upper - arm.position_lower)
@@ -40,7 +40,7 @@ def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seco
 def true_dynamics(
     arm: Arm, generator: np.random.Generator, effects: list[DriveEffect], spread: float = 0.05
 ) -> DynamicModel:
-    """Returns an arm whose links are sheared and shifted by about `spread` of their size relative to the SDF."""
+    """Returns a model whose links are sheared and shifted relative to the SDF by about `spread` times their size."""
     regressor, boxes = DynamicRegressor(arm), bounding_boxes(arm)
     links = []
     for link in regressor.links:
@@ -65,21 +65,22 @@ def true_dynamics(
 def recorded(
     model: DynamicModel, motion, noise: float, generator: np.random.Generator, rate: float = 200.0
 ) -> Recording:
-    """Returns the motion, sampled at 1 kHz, as recorded at `rate`, with noise relative to each effort's RMS.
+    """Returns a recording at `rate` [Hz] of a motion that is sampled at 1 kHz.
 
-    Efforts have the delay that the arm's file states.
+    `noise` is the standard deviation of the efforts, as a fraction of their RMS. The delay of the efforts is that of
+    the arm file.
     """
     t, q, v, vd = motion
     J = model.arm.transmission
-    late = zip(model.arm.identification.effort_delay, model.effort(q, v, vd).T, strict=True)
-    tau = np.column_stack([np.interp(t - delay, t, effort) for delay, effort in late])
+    delayed = zip(model.arm.identification.effort_delay, model.effort(q, v, vd).T, strict=True)
+    tau = np.column_stack([np.interp(t - delay, t, effort) for delay, effort in delayed])
     tau = tau + noise * np.sqrt(np.mean(tau**2, axis=0)) * generator.normal(size=tau.shape)
     every = slice(None, None, round(1000 / rate))
     return Recording(q=q[every], qd=v[every], tau=J.pull_back_effort(tau)[every], t=t[every], source="simulated")
 
 
 def friction_everywhere(arm: Arm, motion, share: float = 0.2) -> list[DriveEffect]:
-    """Returns viscous, Coulomb and presliding friction at every actuator, each `share` of the SDF arm's RMS effort."""
+    """Returns viscous, Coulomb and presliding friction at every actuator, each `share` times the RMS effort."""
     _, q, v, vd = motion
     without = true_dynamics(arm, np.random.default_rng(0), [])
     effort = np.sqrt(np.mean(without.effort(q, v, vd) ** 2, axis=0))

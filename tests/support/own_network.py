@@ -1,20 +1,20 @@
 """Network namespace for tests over real UDP multicast.
 
-A test file runs itself again inside a network namespace. The tests of that run are the actual ones:
+A test file starts pytest again for itself inside a network namespace. The actual tests run there:
 
     @outside
-    def test_in_a_network_of_its_own(request):
+    def test_runs_in_a_separate_network(request):
         run_inside(request)
 
     @inside
     def test_...
 
-Tests wait for conditions, and pass on a busy computer. There are two exceptions, which run again in a new process:
+Tests wait for conditions, so they also pass on a busy computer. Two kinds of failed tests run again in a new process:
 
-- A test of a watchdog by the wall clock, marked `@watchdog`. If the computer is busy for 10 ms, the watchdog acts late,
-  and the test fails without a defect.
-- Any test that failed while the computer was stalled: a thread that sleeps 10 ms at a time was `STANDSTILL` late. The
-  time limits of the processes under test (no status for 1 s, for example) expire then.
+- Tests of a watchdog that uses the wall clock, marked `@watchdog`. If the computer is busy for 10 ms, the watchdog acts
+  late, and the test fails without a defect.
+- Tests that failed while the computer was stalled, so that a sleeping thread was delayed by `STALL_TIME`. Then time
+  limits of the processes under test expire, e.g. no status for 1 s.
 
 The last line of a run states the number of retries. A run with more than `MAX_RETRIES` fails.
 """
@@ -36,19 +36,19 @@ NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.
 #: Maximum number of retries in one run of pytest, over all files and tests.
 MAX_RETRIES = 4
 #: Delay of a sleeping thread that occurs only if the computer is stalled [s].
-STANDSTILL = 0.4
+STALL_TIME = 0.4
 #: Time limit of a run inside the namespace [s].
 MAX_RUN = 1800
 
-inside = pytest.mark.skipif(INSIDE not in os.environ, reason="runs in a network of its own, started by the test below")
-outside = pytest.mark.skipif(INSIDE in os.environ, reason="is inside already")
+inside = pytest.mark.skipif(INSIDE not in os.environ, reason="runs in a network namespace, started by the test below")
+outside = pytest.mark.skipif(INSIDE in os.environ, reason="already inside the network namespace")
 watchdog = pytest.mark.watchdog
 
 _RETRIES = pytest.StashKey[list]()
 
 
 def unshare():
-    """Returns the command that creates a network namespace and keeps root's right to real-time scheduling."""
+    """Returns the command that creates a network namespace. It keeps the permission for real-time scheduling."""
     for command in (["unshare", "-n"], ["unshare", "-rn"]):
         try:
             done = subprocess.run([*command, "sh", "-c", NETWORK], capture_output=True, timeout=60, check=False)
@@ -56,22 +56,22 @@ def unshare():
             continue
         if done.returncode == 0:
             return command
-    pytest.skip("a network of its own is not permitted here (unshare -rn, ip)")
+    pytest.skip("network namespaces are not permitted here (unshare -rn, ip)")
 
 
 def run_inside(request):
-    """Runs the test file of `request` in a network namespace; some failed tests run again (see above)."""
+    """Runs the test file of `request` in a network namespace. Some failed tests run again, see the module."""
     marks = {name: getattr(test, "pytestmark", []) for name, test in vars(request.module).items()}
-    watchdogs = {name for name, its in marks.items() if watchdog.mark in its}
+    watchdogs = {name for name, own_marks in marks.items() if watchdog.mark in own_marks}
     retries = request.config.stash.setdefault(_RETRIES, [])
-    with tempfile.TemporaryDirectory() as memory:
+    with tempfile.TemporaryDirectory() as cache_folder:
         while True:
             with _LongestDelay() as delay:
-                failed = _run(request.path, memory)
+                failed = _run(request.path, cache_folder)
             if not failed:
                 break
             steady = {name.partition("[")[0] for name in failed} - watchdogs
-            if steady and delay.seconds < STANDSTILL:
+            if steady and delay.seconds < STALL_TIME:
                 raise AssertionError(f"failed: {', '.join(failed)}")
             if len(retries) + len(failed) > MAX_RETRIES:
                 raise AssertionError(f"failed: {', '.join(failed)}, after {len(retries)} retries")
@@ -79,7 +79,7 @@ def run_inside(request):
 
 
 class _LongestDelay:
-    """Measures the longest delay of a sleeping thread during the block: `seconds`."""
+    """Context that measures the longest delay of a sleeping thread, `seconds`."""
 
     def __enter__(self):
         self.seconds, self._ended = 0.0, threading.Event()
@@ -107,12 +107,23 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(f"UDP tests: {count} of at most {MAX_RETRIES}{names}")
 
 
-def _run(test_file, memory):
+def _run(test_file, cache_folder):
     """Runs the tests that failed last (at first: all) and returns the names of the tests that failed now."""
     command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh"]
-    pytest_run = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-rsfE", "-s", "-o", f"cache_dir={memory}", "--lf"]
+    pytest_run = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "no:xdist",
+        "-rsfE",
+        "-s",
+        "-o",
+        f"cache_dir={cache_folder}",
+        "--lf",
+    ]
     environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
-    # Path on which the process that others are forked from finds the modules to compile.
+    # The fork server imports the modules to compile from this path.
     paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment["PYTHONPATH"] = os.pathsep.join(paths)
     environment.pop("LCM_DEFAULT_URL", None)

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def paper_regressor(q):
-    """Returns the 7 x 12 gravity regressor at a pose q (7,) divided by g, columns in the paper's order [1]."""
+    """Returns the gravity regressor (7, 12) at a pose q (7,) divided by g. Columns are in the order of the paper."""
     s2, s4, s5, s6, s7 = np.sin(q[[1, 3, 4, 5, 6]])
     c2, c4, c5, c6, c7 = np.cos(q[[1, 3, 4, 5, 6]])
     S, C = np.sin(q[1] + q[2]), np.cos(q[1] + q[2])

@@ -1,4 +1,4 @@
-"""Files with the layouts of public recordings and known numbers."""
+"""Creates files with the layouts of public recordings and known numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dvrk_drake.errors import RecordingError
 
 
 def team_array(num_poses: int = 5) -> np.ndarray:
-    """Returns (8, 2, N): position j + k/100 of joint j at pose k, counted from 1; effort -10 times the position."""
+    """Returns an array (8, 2, N): position j + k/100 of joint j at pose k (from 1), effort -10 times the position."""
     joint, pose = np.meshgrid(np.arange(1, 9), np.arange(1, num_poses + 1) / 100, indexing="ij")
     return np.stack([joint + pose, -10 * (joint + pose)], axis=1)
 

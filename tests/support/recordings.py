@@ -15,7 +15,7 @@ Q_NAMES = [f"q{i}" for i in range(1, 8)]
 TAU_NAMES = [f"tau{i}" for i in range(1, 8)]
 HEADER = ",".join([*Q_NAMES, *TAU_NAMES])
 ROW = ",".join(f"0.{i}" for i in range(1, 15))
-# q_joint = M_MTM q_actuator for joints 2..4, as published; independent of the project's data.
+# Published coupling q_joint = M_MTM q_actuator, independent of the arm files.
 M_MTM = np.eye(7)
 M_MTM[1:4, 1:4] = [[1, 0, 0], [-1, 1, 0], [0.6697, -0.6697, 1]]
 

@@ -50,7 +50,7 @@ class Run:
 
 
 def breakaway(arm):
-    """Returns the effort (n,) on the actuators up to which the friction along the actuators alone sticks."""
+    """Returns the breakaway effort (n,) of the actuators [N m, N], from friction along the actuators only."""
     total = dict.fromkeys(arm.joint_names, 0.0)
     for effect in arm.effects.friction:
         owner, _, actuator = effect.coordinate.partition(".")

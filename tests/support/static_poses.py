@@ -1,4 +1,4 @@
-"""Motion between static poses with known torques."""
+"""Simulated motion between static poses with known torques."""
 
 import itertools
 
@@ -11,7 +11,7 @@ RATE = 200.0
 
 
 def motion_with_pauses(arm, poses, generator, travel=2.0, rest=0.4, rate=RATE):
-    """Returns a motion with a pause at each pose; torques are gravity plus a viscous friction during motion."""
+    """Returns a motion with a pause at each pose. The torques are gravity plus viscous friction."""
     t_travel, t_rest = np.arange(0, travel, 1 / rate), np.arange(0, rest, 1 / rate)
     s = t_travel / travel
     blend = 10 * s**3 - 15 * s**4 + 6 * s**5

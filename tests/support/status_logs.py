@@ -1,4 +1,4 @@
-"""Statuses of an MTM with random measurements, and LCM logs of them."""
+"""Creates statuses of an MTM with random measurements, and LCM logs."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Arm with dry friction that sticks, and a collector that moves it, without a network."""
+"""Simulated arm with static friction, and a collector that moves the arm without a network."""
 
 from concurrent.futures import Executor, Future
 
@@ -18,9 +18,9 @@ PERIOD = 1e-3
 
 
 class Disk(Executor):
-    """Replacement for the thread that writes, so that no test depends on a real disk.
+    """Replacement for the writing thread, so that no test depends on a disk.
 
-    It writes immediately, or if it is `slow`, when `finish` is called.
+    Work is done immediately, or with `slow` when `finish` is called.
     """
 
     def __init__(self, slow=False):
@@ -47,7 +47,7 @@ def random_poses(arm, count, seed=0, margin=0.1):
 
 
 class StickyArm:
-    """Arm with decoupled joints: weight, dry friction that sticks exactly, efforts as commanded."""
+    """Arm with decoupled joints, gravity and static friction. Its efforts equal the commands."""
 
     def __init__(self, arm, model, friction, q):
         self.arm, self.model, self.friction = arm, model, friction
@@ -72,7 +72,7 @@ class StickyArm:
             self.move(command.effort)
 
     def move(self, effort):
-        """Moves for one period under the effort."""
+        """Advances the motion by one period under an effort (n,)."""
         self.effort = np.array(effort)
         drive = self.effort - self.model.holding_torque(self.q)
         dv = PERIOD / self.inertia
@@ -83,9 +83,9 @@ class StickyArm:
 
 
 class GuardedArm(StickyArm):
-    """StickyArm with a guard that resumes automatically; its clock advances by one period per step.
+    """StickyArm with a guard that resumes automatically. The clock advances by one period per step.
 
-    If an operator must resume, `control` ends before a collector is called: tests/processes/test_control.py.
+    tests/processes/test_control.py tests guards that require an operator to resume.
     """
 
     def __init__(self, *arguments):
@@ -100,7 +100,7 @@ class GuardedArm(StickyArm):
         return status
 
     def step(self, command=None):
-        """Advances by one period, in which a command may arrive."""
+        """Advances by one period. `command` is received first if it is not None."""
         if command is not None:
             self.guard.receive(command, 1000 * self.ticks)
         self.acts = self.guard.state == Status.STATE_EFFORT
@@ -123,15 +123,16 @@ def make_collector(path, poses, friction, both_sides=True, *, arm_type=StickyArm
     return Collector(poses, controller, output, settings, **{"writer": Disk()} | options), controller, sticky
 
 
-def lead(collector, controller, sticky, seconds, until=lambda: False):
+def run_collector(collector, controller, sticky, seconds, until=lambda: False):
+    """Runs a collection for at most `seconds`, until it is finished or `until` returns true."""
     end = sticky.ticks + seconds / PERIOD
     while not (collector.finished or until()) and sticky.ticks < end:
         status, time = sticky.status(), PERIOD * sticky.ticks
-        sticky.step(controller.answer(status, time, collector.lead(status, time)))
+        sticky.step(controller.answer(status, time, collector.update(status, time)))
 
 
 def near_poses(count=3):
-    """Returns poses at which a one-sided collection takes about 1.3 s each."""
+    """Returns poses (count, 7) for which a one-sided collection takes about 1.3 s each."""
     return np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5]) + 0.05 * np.arange(count)[:, None]
 
 

@@ -1,4 +1,4 @@
-"""Motion with known efforts: the arm's inverse dynamics with friction, and channels without faults."""
+"""Creates recordings without faults of a motion with known efforts: inverse dynamics and friction."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def trajectory(arm: Arm, t: np.ndarray, period: float = PERIOD, seed: int = 1) -
 
 
 def inverse_dynamics(arm: Arm, plant: MultibodyPlant, q: np.ndarray, v: np.ndarray, vd: np.ndarray) -> np.ndarray:
-    """Returns the efforts (m, n) of the joints: those of the tree, projected with the linkage's map."""
+    """Returns the joint efforts (m, n): efforts of the tree, projected through the linkage."""
     context = plant.CreateDefaultContext()
     order = [plant.GetJointByName(name).velocity_start() for name in arm.tree_joint_names]
     tree = np.empty((3, len(q), plant.num_velocities()))
@@ -57,7 +57,7 @@ def inverse_dynamics(arm: Arm, plant: MultibodyPlant, q: np.ndarray, v: np.ndarr
 
 @cache
 def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
-    """Returns t, q, v, tau (joint coordinates) of PASSES * PERIOD seconds, at five times the recording's rate."""
+    """Returns t, q, v, tau (joint coordinates) for PASSES * PERIOD seconds, sampled at 5 RATE."""
     arm = load_arm(name)
     t = np.arange(0, PASSES * PERIOD, 0.2 / RATE)
     coarse = t[::5]
@@ -74,7 +74,7 @@ def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
 
 
 def clean_motion(name: str = "psm", *, at: np.ndarray | None = None, effort_lag: float = 0.0, **options) -> Recording:
-    """Returns joint data at 200 Hz, or at true times `at`; efforts with delay `effort_lag` [s] and white noise."""
+    """Returns a recording at 200 Hz or at times `at` [s]. Efforts have a delay `effort_lag` [s] and white noise."""
     t, q, v, tau = efforts(name, **options)
     times = t[::5] if at is None else at
 

@@ -1,4 +1,4 @@
-"""Teleoperation law with an ideal follower, and poses of handle and tip."""
+"""Teleoperation with an ideal follower, and poses of the handle and the instrument tip."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.teleoperation import Teleoperation
 
 MTM, PSM = load_arm("mtml"), load_arm("psm")
-#: Speeds of yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw: Wang et al. 2019.
+#: Maximum speeds of yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw [rad/s, m/s] (Wang et al. 2019).
 SPEED = np.array([1.7, 1.7, 0.35, 2.0, 2.0, 3.0, 3.0])
 PERIOD = 1e-3
 Q_M = np.array([0.1, 0.3, -0.1, 0.2, 1.0, 0.1, 0.3])
@@ -57,10 +57,10 @@ class Loop:
         return desired[:7].copy(), desired[7:].copy()
 
     def move(self, q_master, steps=400):
-        """Moves the master to q_master step by step, then lets the follower arrive; returns all desired positions."""
+        """Moves the master to q_master (7,) in `steps` steps, then waits. Returns the desired positions (m, 7)."""
         start = np.array(self.inputs["master_position"])
-        way = [self.step(master_position=start + s * (q_master - start))[0] for s in np.linspace(0, 1, steps)]
-        return np.array(way + [self.step()[0] for _ in range(steps)])
+        positions = [self.step(master_position=start + s * (q_master - start))[0] for s in np.linspace(0, 1, steps)]
+        return np.array(positions + [self.step()[0] for _ in range(steps)])
 
     def flag(self, name):
         return self.system.GetOutputPort(name).Eval(self.context)[0]

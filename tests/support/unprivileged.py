@@ -1,4 +1,4 @@
-"""Runs a check without root's permissions, so that tests of permissions also run as root."""
+"""Runs a check without root permissions, so that tests of permissions can be started by root."""
 
 import os
 import tempfile
@@ -12,7 +12,7 @@ NOBODY = 65534
 
 @contextmanager
 def public_folder() -> Iterator[Path]:
-    """Yields a temporary folder that every user may use; `tmp_path` of root is closed to others."""
+    """Yields a temporary folder that every user can access. Only root can access `tmp_path` of root."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         folder.chmod(0o777)

@@ -2,7 +2,7 @@
 
 import time
 
-#: Time limit of a test that would wait forever [s]; no test depends on its value, however busy the computer is.
+#: Time limit for conditions that are never met [s]. It is so long that no test depends on its value.
 TIMEOUT = 300.0
 
 
@@ -12,8 +12,8 @@ def wait_until(condition, what, process=None):
     Args:
         condition: Function that is called every millisecond.
         what: Expected condition, for the message.
-        process: Process that is expected to fulfil the condition; the test fails if it ends earlier. A
-            subprocess.Popen, or an object with its poll.
+        process: Process that must be running until the condition is met, with a method `poll` as in
+            subprocess.Popen; None for no process.
     """
     end = time.monotonic() + TIMEOUT
     while not condition():

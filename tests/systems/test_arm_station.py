@@ -238,7 +238,7 @@ def test_link_inertias_change_only_one_context():
     station.SetLinkInertias(heavy, {"wrist_roll_link": payload})
     mass = [station.plant.CalcTotalMass(station.GetSubsystemContext(station.plant, c)) for c in (heavy, nominal)]
     assert mass[0] - mass[1] == pytest.approx(1.0 - 0.06, abs=1e-12)
-    with pytest.raises(StationError, match=r"unknown link hand; links: .*wrist_roll_link"):
+    with pytest.raises(StationError, match=r"unknown link hand; known links: .*wrist_roll_link"):
         station.SetLinkInertias(heavy, {"hand": payload})
 
 

@@ -214,7 +214,7 @@ def test_elements_restart_relaxed():
         ({"ratio": np.nan}, "ratio must be"),
         ({"hysteresis_ratio": 0.91}, "hysteresis ratio must be between 0 and 0.9"),
         ({"widening": 0.9}, "widening must be 1..10"),
-        ({"holding_error": [0.1]}, "must be 7 numbers from 0"),
+        ({"holding_error": [0.1]}, "must be 7 numbers of 0 or more"),
     ],
 )
 def test_invalid_numbers_are_refused(options, what):

@@ -281,7 +281,7 @@ def test_errors_state_allowed_values(arguments, message):
 
 
 def test_model_of_another_arm_is_refused():
-    with pytest.raises(ModelError, match="base parameters must be"):
+    with pytest.raises(ModelError, match="base_parameters must have these names in this order"):
         GravityPidController(dataclasses.replace(MODEL, base_parameters=MODEL.base_parameters[1:]))
 
 

@@ -63,8 +63,8 @@ def test_frame_pose_and_jacobian_match_drake():
     J = frame.jacobian(Q)
     for i, step in enumerate(h * np.eye(7)):
         plus, minus = frame.pose(Q + step), frame.pose(Q - step)
-        turn = (plus.rotation() @ minus.rotation().inverse()).ToAngleAxis()
-        np.testing.assert_allclose(J[:3, i], turn.angle() * turn.axis() / (2 * h), atol=1e-8)
+        rotation = (plus.rotation() @ minus.rotation().inverse()).ToAngleAxis()
+        np.testing.assert_allclose(J[:3, i], rotation.angle() * rotation.axis() / (2 * h), atol=1e-8)
         np.testing.assert_allclose(J[3:, i], (plus.translation() - minus.translation()) / (2 * h), atol=1e-8)
 
 
@@ -145,7 +145,7 @@ def test_hand_moves_handle_to_pose_with_any_stiffness(firmer):
 def test_invalid_arguments_are_refused():
     with pytest.raises(ArmError, match='MTML: its SDF has no frame "thumb"; it has dh_0'):
         Hand(ARM, "thumb")
-    with pytest.raises(StationError, match=r"a hand's stiffness is nan; allowed: 1e-06\.\."):
+    with pytest.raises(StationError, match=r"grip of the hand: stiffness is nan; allowed: 1e-06\.\."):
         Hand(ARM, grip=Grip(stiffness=np.nan))
-    with pytest.raises(StationError, match="a hand's time_step must be a positive number; got 0"):
+    with pytest.raises(StationError, match="time_step of the hand must be a positive number of seconds; got 0"):
         Hand(ARM, time_step=0)

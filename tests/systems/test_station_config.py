@@ -90,7 +90,7 @@ def test_scenario_has_the_same_arm_fields():
         (
             "[0, 9.81, 0]",
             "[0, 981, 0]",
-            r"station\.yaml: gravity \(0, 981, 0\) must be three numbers of a size up to 30 m/s",
+            r"station\.yaml: gravity \(0, 981, 0\) must be a vector of three numbers with a length up to 30 m/s",
         ),
         ("seed: 3", "seed: -1", r"seed is -1; allowed: 0\.\."),
         ("[friction]", "[fraction]", "simulated arm: .*fraction"),
@@ -124,5 +124,5 @@ def test_missing_file_is_reported(tmp_path):
 
 def test_a_key_of_an_earlier_version_is_read_with_a_warning(path):
     path.write_text(path.read_text().replace("simulated_effects:", "real_arm:"))
-    with pytest.warns(FutureWarning, match='station.yaml: key "real_arm" is now "simulated_effects"'):
+    with pytest.warns(FutureWarning, match='station.yaml: key "real_arm" was renamed to "simulated_effects"'):
         assert load_station_config(path).simulated_effects == ["friction"]

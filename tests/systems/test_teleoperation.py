@@ -96,7 +96,7 @@ def test_tip_returns_from_limits_with_the_master(turn):
     assert np.all(way <= PSM.position_upper + 1e-12)
     touched = np.isclose(away, PSM.position_upper, atol=1e-9) | np.isclose(away, PSM.position_lower, atol=1e-9)
     assert touched.any()
-    # The pose of the tip is compared, since a roll may differ by a full turn.
+    # The pose of the tip is compared, since a roll may differ by a full rotation.
     np.testing.assert_allclose(tip(back[-1]).GetAsMatrix4(), tip(q_start).GetAsMatrix4(), atol=1e-9)
 
 
@@ -199,7 +199,7 @@ def test_scale_out_of_range_is_refused(scale):
 def test_other_invalid_arguments_are_refused():
     with pytest.raises(ControllerError, match="period must be a positive number"):
         Teleoperation(MTM, PSM, period=0.0)
-    with pytest.raises(ArmError, match="MTML has not the kinematics of a PSM"):
+    with pytest.raises(ArmError, match="MTML does not have the kinematics of a PSM"):
         Teleoperation(MTM, MTM)
     with pytest.raises(ArmError, match='PSM: its SDF has no frame "dh_7"; it has dh_0'):
         Teleoperation(PSM, PSM)
@@ -210,5 +210,5 @@ def test_other_invalid_arguments_are_refused():
 
 def test_velocity_limits_come_from_the_sdf():
     assert np.array_equal(Loop().system._speed, SPEED)
-    with pytest.raises(ControllerError, match="no <velocity> limit"):
+    with pytest.raises(ControllerError, match="no velocity limit"):
         _velocity_limits(MTM)

@@ -6,8 +6,8 @@ This file starts itself again inside a network namespace. Processes are forked f
 import signal
 
 import numpy as np
-from arm_observer import Observer, holds
-from arm_processes import PATIENT_DRIVER, dvrk_drake
+from arm_observer import Observer, is_holding
+from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
 from own_network import inside, outside, run_inside
 
 from dvrk_drake.cli import main
@@ -20,7 +20,7 @@ POSES = 3
 
 
 @outside
-def test_in_a_network_of_its_own(request):
+def test_runs_in_a_separate_network(request):
     run_inside(request)
 
 
@@ -29,15 +29,15 @@ def test_psm_collection_from_both_sides_completes(tmp_path):
     arm, poses, output = load_arm("psm"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
     assert main(["collect", "--arm", "psm", "--poses", str(poses), "--random", str(POSES), "--seed", "3"]) == 0
     observer = Observer("psm")
-    process = dvrk_drake("arm", "--arm", "psm", "--realtime", "--driver", PATIENT_DRIVER)
+    process = dvrk_drake("arm", "--arm", "psm", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
     try:
         observer.until(lambda status: True, "first status", process=process)
         command = ["collect", "--arm", "psm", "--poses", poses, "--output", output]
         command += ["--realtime", "--traverse-time", "2"]
         collecting = dvrk_drake(*command)
-        assert collecting.wait() == 0, collecting.said()
-        assert f"{POSES} of {POSES} poses" in collecting.said()
-        observer.until(holds, "hold")
+        assert collecting.wait() == 0, collecting.output()
+        assert f"{POSES} of {POSES} poses" in collecting.output()
+        observer.until(is_holding, "hold")
         assert observer.last.fault_code == 0
     finally:
         print(process.end(signal.SIGINT))

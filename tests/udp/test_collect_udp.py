@@ -7,8 +7,8 @@ import signal
 
 import numpy as np
 import pytest
-from arm_observer import Observer, holds, takes_efforts
-from arm_processes import PATIENT_DRIVER, dvrk_drake
+from arm_observer import Observer, accepts_efforts, is_holding
+from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
 from own_network import inside, outside, run_inside
 from waiting import wait_until
 
@@ -25,7 +25,7 @@ FORGOTTEN = 0.6
 
 
 @outside
-def test_in_a_network_of_its_own(request):
+def test_runs_in_a_separate_network(request):
     run_inside(request)
 
 
@@ -33,7 +33,7 @@ def test_in_a_network_of_its_own(request):
 def observer():
     """Returns the output of a running arm."""
     observer = Observer("mtml")
-    process = dvrk_drake("arm", "--arm", "mtml", "--realtime", "--driver", PATIENT_DRIVER)
+    process = dvrk_drake("arm", "--arm", "mtml", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
     observer.until(lambda status: True, "first status", process=process)
     yield observer
     said = process.end(signal.SIGINT)
@@ -41,7 +41,7 @@ def observer():
 
 
 def moving(status):
-    return takes_efforts(status) and np.abs(status.velocity).max() > 0.05
+    return accepts_efforts(status) and np.abs(status.velocity).max() > 0.05
 
 
 @inside
@@ -60,12 +60,12 @@ def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     process.end(signal.SIGKILL)
     finished = output.read_bytes()
     assert 2 <= len(read_recording(output, arm)) < POSES
-    observer.until(holds, "hold")
+    observer.until(is_holding, "hold")
     observer.during(FORGOTTEN)
 
     process = dvrk_drake(*command)
-    assert process.wait() == 0, process.said()
-    assert f"{POSES} of {POSES} poses" in process.said()
+    assert process.wait() == 0, process.output()
+    assert f"{POSES} of {POSES} poses" in process.output()
     assert output.read_bytes().startswith(finished)
     recording = read_recording(output, arm)
     np.testing.assert_allclose(recording.q, load_poses(poses, arm), atol=5e-3)
@@ -73,13 +73,13 @@ def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     error = np.abs(recording.tau - truth) / arm.effort_limits
     print(f"measured efforts are off by {error.max():.2g} of the effort limit at most")
     assert np.all(error < 0.005)
-    observer.until(holds, "hold")
+    observer.until(is_holding, "hold")
     observer.during(FORGOTTEN)
 
     model = tmp_path / "model.yaml"
     assert main(["identify", str(output), "--arm", "mtml", "--output", str(model)]) == 0
     process = dvrk_drake("run", "--arm", "mtml", "--model", model, "--mode", "gravity", "--realtime")
-    begun = observer.until(takes_efforts, "run", process=process)
+    begun = observer.until(accepts_efforts, "run", process=process)
     observer.during(3.0)
     released = np.array([status.position for status in observer.received[begun:]])
     said = process.end(signal.SIGINT)

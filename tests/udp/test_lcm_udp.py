@@ -15,8 +15,17 @@ import lcm
 import lcm_controller
 import numpy as np
 import pytest
-from arm_observer import NETWORK_URL, Observer, check_clock, holds, takes_efforts
-from arm_processes import FORKSERVER, PATIENT_DRIVER, POSES, CommandLine, Forked, start_arm, start_controller, start_run
+from arm_observer import NETWORK_URL, Observer, accepts_efforts, check_clock, is_holding
+from arm_processes import (
+    FORKSERVER,
+    LONG_TIMEOUT_DRIVER,
+    POSES,
+    CommandLine,
+    Forked,
+    start_arm,
+    start_controller,
+    start_run,
+)
 from own_network import inside, outside, run_inside, watchdog
 from waiting import TIMEOUT, wait_until
 
@@ -32,14 +41,14 @@ OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 #: Options of tests that publish invalid messages, which observers do not read.
 THIRD_URL = "udpm://239.255.76.67:7669?ttl=0"
 #: Options of an arm with long timeouts; its expiry [s] and a margin, after which it releases a silent sender.
-PATIENT, FORGOTTEN = ("--driver", PATIENT_DRIVER), 0.6
+PATIENT, FORGOTTEN = ("--driver", LONG_TIMEOUT_DRIVER), 0.6
 #: Speed at which logs are played: the network loses nothing when a busy computer delays the player.
 SLOWLY = 0.2
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
 
 
 @outside
-def test_in_a_network_of_its_own(request):
+def test_runs_in_a_separate_network(request):
     run_inside(request)
 
 
@@ -92,7 +101,7 @@ def send(network, status, sequence, sender_id, **fields):
 
 
 def reset(name, observer):
-    """Clears a fault by HOLD, HOLD, HOLD with the request. Repeats this if one of them was late."""
+    """Clears a fault by HOLD, HOLD, and HOLD with the request. Repeats this if a command was late."""
     network = lcm.LCM()
 
     def is_cleared():
@@ -101,7 +110,7 @@ def reset(name, observer):
         for k, asks in enumerate((False, False, True)):
             send(network, observer.last, k, sender_id, reset_fault=asks)
             observer.during(0.01)
-        return holds(observer.during(0.05)[-1])
+        return is_holding(observer.during(0.05)[-1])
 
     wait_until(is_cleared, "cleared fault")
 
@@ -118,7 +127,7 @@ def test_command_and_status_round_trip(arm):
         controller.end()
     received = observer.received[first : last + 1]
     check_clock(received)
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert received[-1].num_refused == received[0].num_refused
     assert received[-1].command_sequence > 2000
     assert drift(*received) < 1e-4
@@ -128,20 +137,20 @@ def test_command_and_status_round_trip(arm):
 @watchdog
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_arm_holds_after_controller_is_killed(name, tmp_path):
-    """Expiry of a real arm by the arm's clock and, with real-time scheduling, by the wall clock."""
+    """Tests the expiry by the arm's clock and, with real-time scheduling, by the wall clock."""
     (tmp_path / "driver.yaml").write_text("guard: {resume_automatically: true}\n")
     observer = Observer(name, OTHER_URL)
     arm = start_arm(name, "--lcm-url", OTHER_URL, "--driver", tmp_path / "driver.yaml")
     controller = start_controller(name, "--lcm-url", OTHER_URL)
     try:
         observer.until(lambda status: True, "first status", process=arm)
-        observer.until(takes_efforts, "start of the controller", process=controller)
+        observer.until(accepts_efforts, "start of the controller", process=controller)
         # A busy computer may make commands expire; then they start again.
-        wait_until(lambda: all(map(takes_efforts, observer.during(1.0))), "a second of efforts", controller)
+        wait_until(lambda: all(map(accepts_efforts, observer.during(1.0))), "a second of efforts", controller)
         realtime = not make_realtime()  # this thread too: it shares Python's lock with the observer's
         controller.send_signal(signal.SIGKILL)
         first = len(observer.received)
-        held = observer.until(holds, "hold")
+        held = observer.until(is_holding, "hold")
         last_command = max(
             k for k in range(held) if observer.received[k].num_accepted < observer.received[held].num_accepted
         )
@@ -162,7 +171,7 @@ def test_arm_holds_after_controller_is_killed(name, tmp_path):
 
 
 def stop(process, seconds):
-    """Stops a process for at least that long."""
+    """Stops a process for at least the given time."""
     process.send_signal(signal.SIGSTOP)
     stat = Path(f"/proc/{process.process.pid}/stat")
     wait_until(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T", "stop", process)
@@ -172,21 +181,21 @@ def stop(process, seconds):
 
 def waits_for_an_operator(status):
     """Accepts that the guard detected the stall first by its own period."""
-    return holds(status) and not status.fault_code and bool(status.fault_text)
+    return is_holding(status) and not status.fault_code and bool(status.fault_text)
 
 
 @inside
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
 def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
-    """Stalls by signals, with the expiry of a real arm. The test of 20 ms stalls uses a simulated clock.
+    """Stalls processes by signals, with the default expiry. Stalls of 20 ms are tested with a simulated clock.
 
     A busy computer may stop one of them before the test does: that has the same end.
     """
     observer, arm = Observer("mtml", OTHER_URL), start_arm("mtml", "--lcm-url", OTHER_URL)
     controller = start_controller("mtml", "--lcm-url", OTHER_URL)
     try:
-        begun = observer.until(takes_efforts, "start of the controller", process=controller)
+        begun = observer.until(accepts_efforts, "start of the controller", process=controller)
         stop(arm if stalled == "arm" else controller, seconds)
         held = observer.until(waits_for_an_operator, "hold", begun, arm)
         # The controller continues unchanged.
@@ -216,25 +225,25 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
     arm, run = start_arm("mtml", *url), start_run("mtml", *url)
     runs = [run]
     try:
-        begun = observer.until(takes_efforts, "run", process=run)
+        begun = observer.until(accepts_efforts, "run", process=run)
         stop(arm if stalled == "arm" else run, 0.2)
         held = observer.until(waits_for_an_operator, "hold", begun, arm)
         assert run.wait() == 2
         runs.append(start_run("mtml", *url))
         assert runs[-1].wait() == 2
         for ended in runs:
-            lines = [line for line in ended.said().splitlines() if line.startswith("dvrk-drake: error")]
+            lines = [line for line in ended.output().splitlines() if line.startswith("dvrk-drake: error")]
             (line,) = lines
             assert line.startswith("dvrk-drake: error: MTML took over and holds: ")
             assert line.endswith("Look at the arm, then start again with --reset")
         assert all(map(waits_for_an_operator, observer.received[held:]))
         runs.append(start_run("mtml", *url, "--reset"))
-        observer.until(lambda status: holds(status) and not status.fault_text, "resume", held, runs[-1])
-        observer.until(takes_efforts, "run", held, runs[-1])
+        observer.until(lambda status: is_holding(status) and not status.fault_text, "resume", held, runs[-1])
+        observer.until(accepts_efforts, "run", held, runs[-1])
     finally:
         for process in (*runs, arm):
             print(process.end(signal.SIGINT))
-    assert "MTML took over and waits for an operator, who resumes now: " in runs[-1].said()
+    assert "MTML took over and waits for an operator, who resumes now: " in runs[-1].output()
 
 
 @inside
@@ -245,20 +254,20 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     starts = CommandLine if (name, mode) == ("mtml", "gravity") else start_run
     process = starts(name, "--mode", mode, "--realtime")
     try:
-        begun = observer.until(takes_efforts, "run", process=process)
+        begun = observer.until(accepts_efforts, "run", process=process)
         observer.during(2.0)
         acting = observer.received[begun:]
     finally:
         said = process.end(signal.SIGINT)
     assert process.wait() == 0, said
-    assert all(map(takes_efforts, acting))
+    assert all(map(accepts_efforts, acting))
     steps = np.diff([status.sequence for status in acting])[:, None]
     efforts = np.array([status.effort_commanded for status in acting])
     assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * steps * load_arm(name).effort_limits)
-    held = observer.received[observer.until(holds, "hold", begun)]
+    held = observer.received[observer.until(is_holding, "hold", begun)]
     assert held.num_expired == expired  # it received HOLD and no command expired
     assert drift(*observer.during(0.1)) < 1e-3
-    assert "holds by itself" in said
+    assert "regulates the pose" in said
     assert "effort; " in said and " Hz, round trip " in said
     print(f"{name} {mode}: {said.splitlines()[-2].strip()}")
 
@@ -275,7 +284,7 @@ def test_run_stops_on_fault_and_refuses_faulty_arm():
             assert process.wait() == 2
         finally:
             process.end()
-        yield process.said()
+        yield process.output()
 
     run = ends()
     process = next(run)
@@ -331,7 +340,7 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
     observer.until(lambda status: unaccepted(status) - before > 9_000, "refusals", first, process)
     received = observer.received[first:]
     check_clock(received)
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert drift(*received) < 1e-4
 
 
@@ -341,13 +350,13 @@ def test_controller_clock_jump_leads_to_hold_and_restart(arm):
     first = len(observer.received)
     controller = start_controller(name, "--clock-jump", {"mtml": "10", "psm": "-10"}[name])
     try:
-        begun = observer.until(takes_efforts, "start of the controller", process=controller)
+        begun = observer.until(accepts_efforts, "start of the controller", process=controller)
         jumped = observer.until(
             lambda status: status.refusal_code == Status.REFUSAL_CLOCK_JUMP, "refusal", begun, controller
         )
         # The last good command expires first.
-        held = observer.until(holds, "hold", jumped, controller)
-        observer.until(takes_efforts, "a new start", held, controller)
+        held = observer.until(is_holding, "hold", jumped, controller)
+        observer.until(accepts_efforts, "a new start", held, controller)
         observer.during(0.2)
     finally:
         controller.end()
@@ -391,19 +400,19 @@ def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
     with Logged(tmp_path / "commands", NETWORK_URL) as log:
         controller = start_controller(name)
         try:
-            begun = observer.until(takes_efforts, "start of the controller", process=controller)
+            begun = observer.until(accepts_efforts, "start of the controller", process=controller)
             accepted = observer.received[begun].num_accepted
             observer.until(lambda status: status.num_accepted > accepted + 500, "500 commands", process=controller)
         finally:
             controller.end()
-        observer.until(holds, "hold")
+        observer.until(is_holding, "hold")
     before, first = observer.last, len(observer.received)
     assert log.count(name) > 500
     log.play()
     enough = before.num_refused + 0.9 * log.count(name)
     observer.until(lambda status: status.num_refused > enough, "refusals", first)
     received = observer.received[first:]
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert received[-1].num_accepted == before.num_accepted
     assert received[-1].refusal_code == Status.REFUSAL_STALE
     assert drift(*received) < 1e-3
@@ -419,14 +428,14 @@ def test_restarted_arm_ignores_run_and_log(tmp_path):
     run = start_run("mtml", "--mode", "hold", "--realtime", *on_other)
     try:
         with Logged(tmp_path / "commands", OTHER_URL) as log:
-            begun = observer.until(takes_efforts, "run", process=run)
+            begun = observer.until(accepts_efforts, "run", process=run)
             killed, accepted = observer.received[begun].session_id, observer.received[begun].num_accepted
             observer.until(lambda status: status.num_accepted > accepted + 500, "500 commands", process=run)
             arm.end(signal.SIGKILL)
             arm = start_arm("mtml", *PATIENT, *on_other)
             first = observer.until(lambda status: status.session_id != killed, "a new session", process=arm)
             assert run.wait() == 2
-        assert "no status of MTML for 1 s" in run.said()
+        assert "no status of MTML for 1 s" in run.output()
         assert observer.last.num_refused == 0
         assert log.count("mtml") > 500
         log.play()
@@ -435,7 +444,7 @@ def test_restarted_arm_ignores_run_and_log(tmp_path):
     finally:
         print(run.end(), arm.end())
     received = observer.received[first:]
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert received[-1].num_accepted == 0
     assert received[-1].ignored_code == Status.REFUSAL_WRONG_SESSION
     assert drift(*received) < 1e-3
@@ -522,12 +531,12 @@ def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
 
 
 @inside
-def test_of_two_controllers_the_first_stays_in_command(arm):
+def test_first_of_two_controllers_stays_in_control(arm):
     name, _, observer = arm
     first = start_controller(name)
     second = None
     try:
-        begun = observer.until(takes_efforts, "start of the controller", process=first)
+        begun = observer.until(accepts_efforts, "start of the controller", process=first)
         sender = observer.received[begun].command_sender_id
         second = start_controller(name)
         ignored = observer.last.num_ignored
@@ -545,7 +554,7 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
 @watchdog
 @inside
 def test_key_protects_from_flood_of_foreign_commands(tmp_path):
-    """Good commands of an unknown sender, as fast as a process can publish them.
+    """Floods the arm with valid commands of an unknown sender, as fast as a process can publish them.
 
     The rate is compared with that of a peer, a process with the same period and scheduling that reads no messages:
     where the machine stands still, both do. Without real-time scheduling a flood takes computing time from all
@@ -562,7 +571,7 @@ def test_key_protects_from_flood_of_foreign_commands(tmp_path):
     run = start_run("mtml", "--mode", "hold", "--realtime", *map(str, options))
     ticks, others = FORKSERVER.Value("q"), []
     try:
-        first = observer.until(takes_efforts, "run", process=run)
+        first = observer.until(accepts_efforts, "run", process=run)
         others.append(Forked(lcm_controller.tick, ticks))
         wait_until(lambda: ticks.value > 100, "the peer", others[0])
         ignored = observer.last.num_ignored
@@ -578,7 +587,7 @@ def test_key_protects_from_flood_of_foreign_commands(tmp_path):
         said = run.end(signal.SIGINT)
         said += arm.end(signal.SIGINT)
     realtime = "no real-time scheduling" not in said
-    acting = np.mean([takes_efforts(status) for status in received])
+    acting = np.mean([accepts_efforts(status) for status in received])
     flooded = received[-1].num_ignored - received[0].num_ignored
     print(f"{of_arm} periods of the arm, {of_peer} of the peer, {flooded} foreign messages; {realtime=}")
     print(f"efforts act in {acting:.3f} of the time")

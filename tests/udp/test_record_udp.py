@@ -23,14 +23,14 @@ COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(7)
 
 
 @outside
-def test_in_a_network_of_its_own(request):
+def test_runs_in_a_separate_network(request):
     if not (TOOLS / "lcm-logger").exists():
         pytest.skip(f"no {TOOLS}/lcm-logger: the lcm wheel ships it")
     run_inside(request)
 
 
 def start_records(paths, *options, arms=("mtml", "mtml")):
-    """Starts recorders and waits until they listen. They start together, as each waits only 10 s for a status."""
+    """Starts recorders together and waits until they listen, because each waits only 10 s for a status."""
     command = [sys.executable, "-m", "dvrk_drake.cli", "record"]
     started = [
         (start(*command, "--arm", arm, "--output", path, *options), arm) for path, arm in zip(paths, arms, strict=False)
@@ -78,7 +78,7 @@ def rows_in(path):
 
 
 def has_status(path):
-    """Returns whether a log has a complete status, i.e. another one begins."""
+    """Returns whether a log contains a complete status, i.e. whether another event begins after it."""
     return path.exists() and path.read_bytes().count(b"DVRK_STATUS_MTML") > 1
 
 
@@ -90,7 +90,7 @@ def wait_for(mark, *paths):
 
 
 def end_logger(logger, path):
-    """Stops it when it has written all earlier messages."""
+    """Stops a process when it has written all earlier messages."""
     publisher = lcm.LCM()
 
     def is_done():
@@ -161,7 +161,7 @@ def missing_at_first(path):
 
 @inside
 def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
-    """Kills it when the first file has that many of 2000 rows."""
+    """Kills the process when the first file has a given number of 2000 rows."""
     original = by_utime(played)
     for count in (1, 100, 300, 600):
         paths = [tmp_path / f"{count}{name}" for name in (".csv", ".log", "logger.log")]
@@ -197,17 +197,17 @@ def test_missing_status_is_explained(tmp_path, played):
     arms = ("psm", "mtmr", "mtml")
     waiting = dict(zip(arms, start_records([tmp_path / f"{arm}.csv" for arm in arms], arms=arms), strict=True))
     said = end(waiting.pop("mtmr"), signal.SIGINT)
-    assert "mtmr.csv: not made: ended before the first status of MTMR" in said
+    assert "mtmr.csv was not written: the recording ended before the first status of MTMR" in said
     messages = {
-        "psm": "no message within 10 s on channel DVRK_STATUS_PSM of udpm://239.255.76.67:7667?ttl=0; "
-        "there is DVRK_STATUS_MTML",
+        "psm": "no message within 10 s on channel DVRK_STATUS_PSM of udpm://239.255.76.67:7667?ttl=0. "
+        "Channels with messages: DVRK_STATUS_MTML",
         "mtml": "no status of MTML within 10 s on channel DVRK_STATUS_MTML of udpm://239.255.76.67:7667?ttl=0: "
-        "messages left out, no lcmt_dvrk_status, or one of another version",
+        "messages omitted, not an lcmt_dvrk_status of this version",
     }
     for arm, process in waiting.items():
         assert process.wait(TIMEOUT) == 2
         assert messages[arm] in process.stdout.read()
     ended.set()
     assert alone.wait(TIMEOUT) == 2
-    assert "does the arm's process or bridge run, on this network?" in alone.stdout.read()
+    assert "Check that the arm's process or bridge runs on this network." in alone.stdout.read()
     assert not list(tmp_path.glob("*.csv"))

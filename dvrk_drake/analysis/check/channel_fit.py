@@ -22,24 +22,27 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Prior standard deviations. The first two apply to link parameters and to the effects in the arm file, as shares
-#: of their size. The third applies to simple friction, the fourth to offsets, springs and cables of unknown size. Both
-#: are shares of the RMS effort.
-LINK_DEVIATION, EFFECT_DEVIATION, FRICTION_DEVIATION, POSITION_DEVIATION = 0.3, 0.5, 0.1, 1.0
-#: Prior standard deviations of the base tilt [rad] and of a position offset [rad], [m], and smallest prior standard
-#: deviation of a rotor inertia [kg m^2; kg].
-TILT_DEVIATION, OFFSET_DEVIATION, MIN_ROTOR_DEVIATION = 0.05, (0.1, 0.01), 3e-6
-#: Final samples per period of the effort's cut-off frequency, and time excluded at each end because of filter
-#: transients [s].
-OVERSAMPLING, ENDS = 2.5, 1.0
-#: Largest number of independent measurements assumed for an effort, because model errors do not average out.
+#: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of their size.
+LINK_DEVIATION, EFFECT_DEVIATION = 0.3, 0.5
+#: Prior standard deviation of additional effects, as a share of the RMS effort: for viscous and Coulomb friction, and
+#: for offsets, springs and cables without a coefficient in the arm file.
+FRICTION_DEVIATION, POSITION_DEVIATION = 0.1, 1.0
+#: Prior standard deviation of the base tilt [rad] and of a position offset [rad], [m].
+TILT_DEVIATION, OFFSET_DEVIATION = 0.05, (0.1, 0.01)
+#: Smallest prior standard deviation of a rotor inertia [kg m^2; kg].
+MIN_ROTOR_DEVIATION = 3e-6
+#: Samples of the fit per period of the effort's cut-off frequency.
+OVERSAMPLING = 2.5
+#: Duration that is excluded at each end because of filter transients [s].
+ENDS = 1.0
+#: Largest assumed number of independent measurements of an effort, because model errors do not average out.
 MAX_INDEPENDENT = 220.0
-#: Smallest assumed error of an actuator as a share of its effort.
+#: Smallest assumed error of an actuator as a share of its RMS effort.
 MIN_ERROR = 0.02
-#: Smallest range of a joint over poses at rest for the joint to be included [rad], [m].
+#: Smallest range of an actuator over poses at rest for its effort to be used [rad], [m].
 MIN_RANGE = 0.1, 0.01
-#: Smallest squared relative change of the efforts for one prior deviation along a direction of the rigid-body
-#: parameters. Directions with a smaller change are excluded.
+#: Smallest information about a direction in the space of rigid-body parameters: squared relative change of the efforts
+#: for one prior standard deviation. Directions with less information are excluded.
 MIN_INFORMATION = 1e-6
 #: Step of the numerical derivative with respect to a position [rad, m].
 _STEP = 1e-3
@@ -49,16 +52,16 @@ class ChannelFit:
     """Linear model of a recording's efforts with priors for rigid bodies, base tilt and drive effects of the arm file.
 
     All quantities are in actuator coordinates. A motion is low-pass filtered at the arm's `effort_cut_off` and sampled
-    as coarsely as that allows, so that a fit takes milliseconds. Poses at rest are explained by gravity, springs,
-    cables and offsets.
+    at the lowest possible rate, so that a fit takes milliseconds. The model of poses at rest has gravity, springs,
+    cables and offsets only.
 
     Attributes:
         recording: Recording that is fitted.
         arm: Arm that was recorded.
-        clock: Times of a motion's rows.
+        clock: True times of the rows of a motion, None for poses at rest.
         moves: True for a motion, False for poses at rest.
-        used: Indices (k,) of the actuators that move and have an effort. The model explains these efforts.
-        resting: Indices (l,) of the actuators that have an effort and do not move. A constant explains these efforts.
+        used: Indices (k,) of the actuators that move and have an effort. The model is fitted to these efforts.
+        resting: Indices (l,) of the actuators that have an effort and do not move. Constants fit these efforts.
         log_likelihood: Log-likelihood of the unmodified recording, up to a constant.
     """
 
@@ -112,7 +115,7 @@ class ChannelFit:
         return np.asarray(np.linalg.inv(J.T) @ transform @ J.T)
 
     def gain(self, transform: NDArray[np.float64]) -> float:
-        """Returns the gain in log-likelihood if the true actuator efforts are `transform` (n, n) times the recorded."""
+        """Returns the gain in log-likelihood if `transform` (n, n) is applied to the recorded actuator efforts."""
         volume = self._independent * float(np.log(abs(np.linalg.det(transform))))
         return self._fit(self._tau @ transform.T)[0] + volume - self.log_likelihood
 
@@ -123,26 +126,26 @@ class ChannelFit:
         return deviation * float(x[-1]), deviation * float(np.sqrt(np.linalg.inv(precision)[-1, -1]))
 
     def dissipation(self) -> NDArray[np.float64]:
-        """Returns the ratio (n,) of the dissipated power to the power of the friction in the arm file.
+        """Returns the ratio (n,) of the dissipated friction power to the power expected from the arm file.
 
-        The power of the fitted links, springs and cables is subtracted first because its mean over a motion is not
+        The power of the fitted links, springs and cables is subtracted first, because its mean over a motion is not
         zero. The ratio is nan for actuators without friction in the arm file.
         """
         v = self._sampled(self.arm.transmission.velocity(self._v))
         friction = np.array([effect.kind not in POSITION_KINDS for effect in self._drive.effects])
-        carrying = np.append(self._x[: self._num_rigid], np.where(friction, 0.0, self._x[self._num_rigid :]))
-        stated = np.where(friction, self._drive.mean, 0.0)
-        power = np.full(self.arm.num_joints, np.nan)
+        without_friction = np.append(self._x[: self._num_rigid], np.where(friction, 0.0, self._x[self._num_rigid :]))
+        expected_friction = np.where(friction, self._drive.mean, 0.0)
+        ratios = np.full(self.arm.num_joints, np.nan)
         for i in self.used:
-            if expected := float(self._effect_columns[i] @ stated @ v[:, i]):
+            if expected := float(self._effect_columns[i] @ expected_friction @ v[:, i]):
                 own, columns = self._columns[i]
-                left = self._tau[:, i] - self._nominal[:, i] - columns @ carrying[own]
-                power[i] = float(left @ v[:, i]) / expected
-        return power
+                residual = self._tau[:, i] - self._nominal[:, i] - columns @ without_friction[own]
+                ratios[i] = float(residual @ v[:, i]) / expected
+        return ratios
 
     def _sampled_efforts(self, grid: MotionGrid) -> NDArray[np.float64]:
         tau = self.recording.in_actuator_coordinates(self.arm).measured_effort()
-        # Repeated rows have the time of the row before them.
+        # A repeated row has the time of the previous row.
         times, rows = np.unique(grid.row_times, return_index=True)
         return self._sampled(resample(times, low_pass(tau, grid.rate, self._cut_off)[rows], grid.t))
 
@@ -168,7 +171,7 @@ class ChannelFit:
         values, vectors = np.linalg.eigh(information)
         directions = vectors[:, values > MIN_INFORMATION]
         self._to_parameters = deviation[:, None] * directions
-        tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._weights_of_unit_gravity(q)
+        tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._unit_gravity_efforts(q)
         self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)
         self._rows = np.array([self.arm.effect_coordinates[effect.coordinate] for effect in drive.effects])
         shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, self._q, self._v)))
@@ -191,10 +194,10 @@ class ChannelFit:
     def _fit(
         self, tau: NDArray[np.float64], column: NDArray[np.float64] | None = None
     ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """Fits efforts tau (r, n), optionally with an additional `column` (r, n) whose prior deviation is 1.
+        """Fits efforts tau (r, n), optionally with an additional `column` (r, n) with a prior deviation of 1.
 
         Returns:
-            The log-likelihood, the unknowns x (k,) and their precision (k, k).
+            Log-likelihood, coefficients x (k,) and their precision (k, k).
         """
         extra = 0 if column is None else 1
         precision, mean = np.append(self._precision, np.ones(extra)), np.append(self._mean, np.zeros(extra))
@@ -243,20 +246,20 @@ class ChannelFit:
             change += self._filtered(shifted - at) @ (self._rows[chosen] * coefficients[:, None])
         return np.asarray(change / _STEP)
 
-    def _weights_of_unit_gravity(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _unit_gravity_efforts(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the holding efforts (r, n, 2) under a gravity of 1 m/s^2 along the x- and y-axis of the base."""
-        weights, rest = [], np.zeros_like(q)
+        efforts, zero = [], np.zeros_like(q)
         for regressor in self._tilted:
-            torque = regressor.torque(q, rest, rest, regressor.values)
-            weights.append(self._filtered(self._to_joint.pull_back_effort(torque)))
-        return np.stack(weights, axis=2)
+            torque = regressor.torque(q, zero, zero, regressor.values)
+            efforts.append(self._filtered(self._to_joint.pull_back_effort(torque)))
+        return np.stack(efforts, axis=2)
 
     def _sampled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns x at the final samples, interpolated from the motion's grid."""
+        """Returns x, given on the grid of the motion, at the samples of the fit."""
         return self._inner(x[:: self._half_step]) if self.moves else x
 
     def _filtered(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Filters x (m, ...), given at twice the rate of the final samples, and returns it at the final samples."""
+        """Filters x (m, ...), given at twice the rate of the fit, and returns it at the samples of the fit."""
         if not self.moves:
             return x
         flat = low_pass(x.reshape(len(x), -1), GRID_RATE / self._half_step, self._cut_off)
@@ -269,20 +272,20 @@ class ChannelFit:
 
 @cache
 def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor], BaseColumns]:
-    """Returns the arm's regressor, those under 1 m/s^2 of gravity along the base's x and y, and its base columns."""
+    """Returns the regressor, two regressors for unit gravity along the base x- and y-axes, and the base columns."""
     regressor = DynamicRegressor(arm)
-    lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
-    return regressor, lying, base_columns([regressor])
+    tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
+    return regressor, tilted, base_columns([regressor])
 
 
 class _DriveEffects(NamedTuple):
     """Drive effects with priors of their coefficients.
 
     Attributes:
-        effects: Tuple of e effects.
+        effects: List of e effects.
         mean: Prior means (e,) of the coefficients.
-        deviation: Prior standard deviations (e,) of the coefficients, 0 where `share` applies.
-        share: Prior standard deviations (e,) as shares of the RMS effort of the actuator that the effect acts on.
+        deviation: Prior standard deviations (e,) of the coefficients, 0 if `share` applies instead.
+        share: Prior standard deviations (e,) of the efforts of the effects, as shares of the RMS effort.
     """
 
     effects: list[ActuatorEffect]
@@ -292,19 +295,19 @@ class _DriveEffects(NamedTuple):
 
 
 def _drive_effects(arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], moves: bool) -> _DriveEffects:
-    """Returns the effects stated in the arm file, its springs and cables of unknown size, and simple friction.
+    """Returns the effects of the arm file, including springs and cables without a coefficient, and additional friction.
 
-    Friction is omitted if the arm is at rest.
+    The additional friction is viscous and Coulomb friction of each actuator. Friction is omitted if the arm is at rest.
     """
-    stated: list[DriveEffect] = [*(arm.effects.friction if moves else ()), *arm.effects.cables, *arm.effects.springs]
-    sized = {effect.coordinate for effect in stated if effect.kind in POSITION_KINDS}
+    known: list[DriveEffect] = [*(arm.effects.friction if moves else ()), *arm.effects.cables, *arm.effects.springs]
+    with_coefficient = {effect.coordinate for effect in known if effect.kind in POSITION_KINDS}
     others = [ActuatorEffect(f"actuator.{name}", "offset") for name in arm.joint_names]
-    others += [effect for effect in named_effects(arm, q) if effect.coordinate not in sized]
+    others += [effect for effect in named_effects(arm, q) if effect.coordinate not in with_coefficient]
     for name, speed in zip(arm.joint_names, np.std(arm.transmission.velocity(v), axis=0), strict=True):
         if moves:
             others.append(ActuatorEffect(f"actuator.{name}", "viscous"))
             others.append(ActuatorEffect(f"actuator.{name}", "coulomb", DIRECTION_WIDTH * float(speed) or 1.0))
-    effects = [*map(ActuatorEffect.of, stated), *others]
-    mean = np.array([e.coefficient for e in stated] + [0.0] * len(others))
+    effects = [*map(ActuatorEffect.of, known), *others]
+    mean = np.array([e.coefficient for e in known] + [0.0] * len(others))
     share = [POSITION_DEVIATION if e.kind in POSITION_KINDS else FRICTION_DEVIATION for e in effects]
     return _DriveEffects(effects, mean, EFFECT_DEVIATION * np.abs(mean), np.array(share))

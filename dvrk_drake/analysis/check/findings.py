@@ -17,9 +17,9 @@ class Finding:
     Attributes:
         severity: "note" for information, "warning" if results will be less accurate, "refusal" if they would be wrong.
         kind: Short, stable name of the finding, e.g. "repeated rows".
-        where: Joints, channels or rows that are affected.
-        what: Description with numbers.
-        advice: Recommended action, or the action that the software takes.
+        where: Affected joints, channels or rows.
+        what: Description of the problem with numbers, without a final period.
+        advice: Sentences with the consequence and the recommended action, or "".
         joints: Indices of the affected joints, starting at 0.
         size: Numerical value of the finding in SI units, nan if there is none.
     """
@@ -33,14 +33,14 @@ class Finding:
     size: float = float("nan")
 
     def __str__(self) -> str:
-        return f"{self.severity}: {self.where}: {self.what}; {self.advice}"
+        return f"{self.severity}: {self.where}: {self.what}. {self.advice}".rstrip()
 
 
 @dataclass(frozen=True)
 class JointSignals:
     """Statistics of the signals of one joint, or of its actuator for motor and sensor quantities.
 
-    Attributes are None where they do not apply.
+    An attribute is None if it does not apply.
 
     Attributes:
         name: Name of the joint.
@@ -50,11 +50,13 @@ class JointSignals:
         acceleration: RMS acceleration below the velocity's cut-off frequency [rad/s^2, m/s^2].
         effort: RMS effort [N m, N].
         peak_effort: Largest effort divided by the joint's effort limit [1].
-        velocity_gain, velocity_lag: Gain [1] and lag [s] of qd relative to dq/dt.
-        effort_lag: Lag of tau relative to the motion [s], None if it is not identifiable.
+        velocity_gain: Gain of qd relative to dq/dt [1].
+        velocity_lag: Lag of qd relative to dq/dt [s].
+        effort_lag: Lag of tau relative to the motion [s], None if it is not significant.
         work: Mean of tau v divided by rms(tau) rms(v) [1]. Friction makes it positive.
-        effort_cut_off, velocity_cut_off: Frequency above which noise exceeds the signal [Hz].
-        floor: Repeatability floor of the effort [1].
+        effort_cut_off: Frequency above which noise exceeds the effort signal [Hz].
+        velocity_cut_off: Frequency above which noise exceeds the velocity signal [Hz].
+        floor: Repeatability of the effort: relative RMS difference between periods [1].
     """
 
     name: str
@@ -80,15 +82,15 @@ class RecordingReport:
     Attributes:
         source: Source of the recording.
         arm: Name of the arm.
-        kind: "motion" if the rows are closely spaced in time, otherwise "poses".
+        kind: "motion" if the rows have times with short intervals, otherwise "poses".
         rows: Number of rows of the recording.
         joints: Statistics of the joints, in the arm's order.
         findings: Refusals first, then warnings, then notes.
         rate: Median sampling rate of a motion [Hz].
         duration: Duration of a motion [s].
-        jitter: Deviation of the true from the recorded intervals, divided by the mean interval [1].
+        jitter: Standard deviation of true minus recorded intervals, divided by the mean interval [1].
         repeated: Share of rows that repeat the previous row [1].
-        period: Period of a repeating motion [s].
+        period: Period of a periodic motion [s].
         floor_cut_off: Cut-off frequency of the low-pass filter for `floor` [Hz].
     """
 
@@ -117,16 +119,16 @@ class RecordingReport:
 
     @property
     def refusal(self) -> str:
-        """First refusal in one line, with the number of all refusals. Empty without refusals."""
+        """First refusal in one line, with the number of refusals, or "" if there is none."""
         if not self.refusals:
             return ""
         first, *others = self.refusals
-        reasons = f"refused for {len(others) + 1} reasons, the first: " if others else "refused: "
+        count = f"refused (first of {len(others) + 1} reasons): " if others else "refused: "
         where = "" if first.where == self.source else f"{first.where}: "
-        return f"{self.source}: {reasons}{where}{first.what}; {first.advice}"
+        return f"{self.source}: {count}{where}{first.what}. {first.advice}".rstrip()
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the report for JSON. Values that do not apply are None."""
+        """Returns the report as a dictionary for JSON. Values that do not apply are None."""
         return _without_nan(asdict(self))
 
 

@@ -1,4 +1,4 @@
-"""Checks the clock, noise and repetition of a motion, and the consistency of its channels."""
+"""Checks the times, noise and repetition of a motion, and the consistency of its channels."""
 
 from __future__ import annotations
 
@@ -24,32 +24,37 @@ from dvrk_drake.analysis.signals.true_time import (
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
 
-#: Repeated rows below this share are attributed to chance.
+#: Smallest reported share of repeated rows. Smaller shares can occur by chance.
 MIN_REPEATED = 0.005
-#: Additional share of repeated rows at which a block of channels is attributed to a slower topic.
+#: Smallest additional share of repeated rows for reporting that q, qd or tau comes from a slower topic.
 MIN_EXTRA = 0.05
 #: Smallest gap between two rows in median intervals, and in [s].
 GAP, MIN_GAP = 5.0, MAX_PERIOD
-#: Smallest reported jitter as a share of an interval.
+#: Smallest reported jitter as a share of the mean interval.
 MIN_JITTER = 0.05
-#: An effort has a wrong sign if Coulomb friction is this many standard errors below 0. It is also wrong if the motor's
-#: work is below minus the second value and the estimated Coulomb friction is negative.
-MIN_GAIN, OPPOSITE = 5.0, 0.05
-#: Joints are hardly identifiable separately if the correlation of their speeds exceeds this value.
+#: An effort has the wrong sign in two cases: its Coulomb friction is more than the first number of standard errors
+#: below 0, or it is negative and the relative work of the motor is below minus the second number.
+MIN_SIGN_ERRORS, MIN_NEGATIVE_WORK = 5.0, 0.05
+#: Joints are hardly identifiable separately if the correlation of their velocities exceeds this value.
 MIN_CORRELATION = 0.95
 #: Smallest duration of a motion for the estimation of lags, signs and noise [s].
 MIN_DURATION = 10.0
 
 
 def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tuple[RecordingReport, list[Finding]]:
-    """Checks a motion with increasing t whose q, qd and tau are in one coordinate system.
+    """Checks a motion.
+
+    Args:
+        report: Report to which the statistics of the motion are added.
+        recording: Motion with increasing t, in joint or actuator coordinates.
+        arm: Arm that was recorded.
 
     Returns:
-        The report with the statistics of the motion, and the findings.
+        Report with the statistics of the motion, and the findings.
     """
     interval = float(np.median(np.diff(np.asarray(recording.t))))
     gaps = _gaps(np.asarray(recording.t), interval)
-    actuators = _longest_piece(recording.in_actuator_coordinates(arm), gaps)
+    actuators = _longest_segment(recording.in_actuator_coordinates(arm), gaps)
     clock = true_time(actuators)
     t = np.asarray(actuators.t)
     duration, rate = float(t[-1] - t[0]), 1 / interval
@@ -58,8 +63,8 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
         report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
     )
     if duration < MIN_DURATION or rate < 2 / MAX_PERIOD:
-        what = f"{duration:.3g} s at {rate:.3g} Hz"
-        advice = f"lags, noise and repetition are judged from {MIN_DURATION:g} s at {2 / MAX_PERIOD:g} Hz on"
+        what = f"the motion has {duration:.3g} s at {rate:.3g} Hz, so lags, signs, noise and repetition are not checked"
+        advice = f"Record at least {MIN_DURATION:g} s at {2 / MAX_PERIOD:g} Hz or more."
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
     signals = motion_signals(actuators, 20.0, rate=min(rate, GRID_RATE))
     moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
@@ -67,10 +72,10 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
     lags = effort_lag(signals, moving)
     names = arm.joint_names
     work = _work(signals)
-    findings += _velocities(agreement, names) + _lags(lags, names) + _together(signals, moving, names)
-    findings += _signs(work, lags, names)
-    even = t[0] + np.arange(len(t)) * (duration / (len(t) - 1))
-    rows = actuators if np.ptp(np.diff(t)) < 1e-3 / rate else _resampled(actuators, even)
+    findings += _velocities(agreement, names) + _lags(lags, names) + _correlated_joints(signals, moving, names)
+    findings += _wrong_signs(work, lags, arm)
+    even_times = t[0] + np.arange(len(t)) * (duration / (len(t) - 1))
+    rows = actuators if np.ptp(np.diff(t)) < 1e-3 / rate else _resampled(actuators, even_times)
     period = find_period(rows.q, rate)
     report, more = _noise(report, rows, rate, period, arm)
     findings += more
@@ -92,26 +97,29 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
 
 def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
     findings = []
-    whole = float(np.mean(repeated_rows(actuators)))
+    all_signals = float(np.mean(repeated_rows(actuators)))
     blocks = {
         name: float(np.mean(repeated_block(block)))
         for name, block in (("q", actuators.q), ("qd", actuators.qd), ("tau", actuators.tau))
         if block is not None and np.any(block)
     }
-    if whole > MIN_REPEATED:
-        shares = ", ".join(f"{name} alone {share:.1%}" for name, share in blocks.items())
-        what = f"{whole:.1%} repeat the row before ({shares})"
-        advice = "a slower topic was polled: they are left out, and true times are made; record each message once"
-        findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=whole))
+    if all_signals > MIN_REPEATED:
+        shares = ", ".join(f"{name} {100 * share:.1f} %" for name, share in blocks.items())
+        what = f"{100 * all_signals:.1f} % of the rows repeat the previous row ({shares})"
+        advice = "Repeated rows are not used. They occur if a topic is polled too fast: record each message once."
+        findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=all_signals))
     for name, share in blocks.items():
         # Constant channels are reported by another check.
-        if whole + MIN_EXTRA < share < 1 - 2 / len(actuators):
-            what = f"{share:.1%} of the rows repeat {name} but not the rest"
-            advice = "it comes from a slower topic than the rest, and is up to one of its intervals late"
+        if all_signals + MIN_EXTRA < share < 1 - 2 / len(actuators):
+            what = f"{100 * share:.1f} % of the rows repeat {name} but not the other signals"
+            advice = f"{name} comes from a slower topic and is late by up to one interval of that topic."
             findings.append(Finding("warning", "repeated channel", name, what, advice, size=share))
     if clock.reconstructed and clock.jitter > MIN_JITTER:
-        what = f"q and qd say that rows are off their times: true intervals deviate by {clock.jitter:.0%} (1 sigma)"
-        advice = "times are made from q and qd; record the controller's own time stamps"
+        what = (
+            "time stamps disagree with the positions and velocities (intervals deviate by "
+            f"{100 * clock.jitter:.0f} %, 1 sigma)"
+        )
+        advice = "Intervals are reconstructed from q and qd. Record the controller's time stamps to avoid this."
         findings.append(Finding("warning", "jitter", "t", what, advice, size=clock.jitter))
     return findings
 
@@ -121,7 +129,7 @@ def _gaps(t: NDArray[np.float64], interval: float) -> NDArray[np.int_]:
     return np.flatnonzero(np.diff(t) > max(GAP * interval, MIN_GAP))
 
 
-def _longest_piece(recording: Recording, gaps: NDArray[np.int_]) -> Recording:
+def _longest_segment(recording: Recording, gaps: NDArray[np.int_]) -> Recording:
     edges = np.concatenate([[0], gaps + 1, [len(recording)]])
     longest = int(np.argmax(np.diff(edges)))
     rows = slice(edges[longest], edges[longest + 1])
@@ -140,8 +148,9 @@ def _gap_findings(recording: Recording, gaps: NDArray[np.int_]) -> list[Finding]
         return []
     intervals = np.diff(np.asarray(recording.t))
     largest = int(gaps[np.argmax(intervals[gaps])])
-    what = f"{len(gaps)} gaps, the largest {intervals[largest]:.3g} s before {recording.where(largest + 1)}"
-    advice = "the motion in the gap is unknown: split the recording there; signals are checked in the longest piece"
+    gap = f"{intervals[largest]:.3g} s before {recording.where(largest + 1)}"
+    what = f"the times have a gap of {gap}" if len(gaps) == 1 else f"the times have {len(gaps)} gaps, the largest {gap}"
+    advice = "Split the recording at each gap, where the motion is unknown. Only the longest segment is checked."
     return [Finding("warning", "gaps", "t", what, advice, size=float(intervals[largest]))]
 
 
@@ -155,18 +164,19 @@ def _agreement(actuators: Recording, clock: TrueTime, signals: MotionSignals) ->
 def _velocities(agreement: VelocityAgreement | None, names: tuple[str, ...]) -> list[Finding]:
     if agreement is None:
         what = "the recording has no velocities"
-        return [Finding("note", "no velocities", "qd", what, "q is differentiated; its times must be good")]
+        advice = "Velocities are computed from q and t, so the times must be accurate."
+        return [Finding("note", "no velocities", "qd", what, advice)]
     findings = []
     for j in np.flatnonzero(~agreement.agrees & np.isfinite(agreement.gain)):
         gain, lag = float(agreement.gain[j]), float(agreement.lag[j])
-        what = f"qd{j + 1} is {gain:.3g} times dq/dt and {1e3 * lag:.1f} ms late (mismatch {agreement.mismatch[j]:.0%})"
+        mismatch = f"mismatch {100 * agreement.mismatch[j]:.0f} %"
+        what = f"qd{j + 1} is {gain:.3g} times dq/dt and {1e3 * lag:.1f} ms late ({mismatch})"
+        advice = "Velocities are computed from q instead."
         if abs(gain * np.pi / 180 - 1) < 0.1:
-            what += ": degrees a second?"
+            advice += f" The unit of qd{j + 1} may be deg/s; use rad/s."
         elif gain < 0:
-            what += ": its sign is wrong"
-        findings.append(
-            Finding("warning", "velocity disagrees", names[j], what, "q is differentiated instead", (int(j),), gain)
-        )
+            advice += f" The sign of qd{j + 1} is wrong."
+        findings.append(Finding("warning", "velocity disagrees", names[j], what, advice, (int(j),), gain))
     return findings
 
 
@@ -174,16 +184,16 @@ def _lags(lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
     findings = []
     for j in np.flatnonzero(lags.determined):
         lag, error = 1e3 * float(lags.lag[j]), 1e3 * float(lags.standard_error[j])
-        size = f"{abs(lag):.1f} ms (standard error {error:.1f})"
+        size = f"{abs(lag):.1f} ms (standard error {error:.1f} ms)"
         if abs(lags.lag[j]) > MAX_LAG - LAG_STEP:
             size = f"{1e3 * MAX_LAG:.0f} ms or more"
-        what = f"tau{j + 1} looks {size} {'late' if lag > 0 else 'early'}"
-        advice = "a delay, or friction that builds up over some way: fit hysteresis before you shift it"
+        what = f"tau{j + 1} {'lags' if lag > 0 else 'leads'} the motion by {size}"
+        advice = "Presliding friction causes a similar lag. Fit presliding friction before you correct a delay."
         findings.append(Finding("note", "effort lag", names[j], what, advice, (int(j),), float(lags.lag[j])))
     return findings
 
 
-def _together(signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[str, ...]) -> list[Finding]:
+def _correlated_joints(signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[str, ...]) -> list[Finding]:
     index = np.flatnonzero(moving)
     if len(index) < 2:
         return []
@@ -191,8 +201,8 @@ def _together(signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[st
     findings = []
     for a, b in np.argwhere(np.triu(correlation, 1) > MIN_CORRELATION):
         i, j = int(index[a]), int(index[b])
-        what = f"move together (correlation of their speeds {correlation[a, b]:.3f})"
-        advice = "their inertia and friction are not identifiable separately; move them independently"
+        what = f"these joints move together (correlation of their velocities {correlation[a, b]:.3f})"
+        advice = "Their inertia and friction are not identifiable separately. Move the joints independently."
         size = float(correlation[a, b])
         findings.append(Finding("warning", "move together", f"{names[i]}, {names[j]}", what, advice, (i, j), size))
     return findings
@@ -205,19 +215,20 @@ def _work(signals: MotionSignals) -> NDArray[np.float64]:
         return np.asarray(np.mean(signals.tau * signals.v, axis=0) / size)
 
 
-def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
+def _wrong_signs(work: NDArray[np.float64], lags: EffortLag, arm: Arm) -> list[Finding]:
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = lags.coulomb / lags.coulomb_error
-    # Work alone is not sufficient: gravity and inertia may transfer it from other joints.
-    wrong = (errors < -MIN_GAIN) | ((work < -OPPOSITE) & (errors < 0))
+    # Work alone is not sufficient, because gravity and inertia may transfer power from other joints.
+    wrong = (errors < -MIN_SIGN_ERRORS) | ((work < -MIN_NEGATIVE_WORK) & (errors < 0))
     findings = []
     for j in np.flatnonzero(wrong):
+        friction, unit = float(lags.coulomb[j]), "N" if arm.prismatic[j] else "N m"
         what = (
-            f"friction pushes instead of braking: Coulomb {lags.coulomb[j]:.2g} ({errors[j]:.1f} standard errors), "
-            f"work {work[j]:.2f}"
+            f"tau{j + 1} or q{j + 1} has the wrong sign, because the estimated Coulomb friction is negative "
+            f"({friction:.2g} {unit}, {errors[j]:.1f} standard errors; relative work {work[j]:.2f})"
         )
-        advice = f"tau{j + 1} or the direction of q{j + 1} has the wrong sign: efforts are positive towards +q"
-        findings.append(Finding("refusal", "effort sign", names[j], what, advice, (int(j),), float(lags.coulomb[j])))
+        advice = f"Efforts must be positive in the direction of +q{j + 1}. Correct the sign."
+        findings.append(Finding("refusal", "effort sign", arm.joint_names[j], what, advice, (int(j),), friction))
     return findings
 
 
@@ -232,34 +243,35 @@ def _noise(
     report: RecordingReport, rows: Recording, rate: float, period: float | None, arm: Arm
 ) -> tuple[RecordingReport, list[Finding]]:
     tau = rows.measured_effort()
-    of_tau = spectra(tau, rate, period)
+    tau_spectra = spectra(tau, rate, period)
     v = np.gradient(rows.q, 1 / rate, axis=0) if rows.qd is None else rows.qd
-    cuts = zip(cut_offs(of_tau), cut_offs(spectra(v, rate, period)), strict=True)
+    cuts = zip(cut_offs(tau_spectra), cut_offs(spectra(v, rate, period)), strict=True)
     joints: list[JointSignals] = [
         replace(joint, effort_cut_off=float(a), velocity_cut_off=float(b))
         for joint, (a, b) in zip(report.joints, cuts, strict=True)
     ]
     if period is None:
-        what = "the motion does not repeat, so no repeatability floor can be computed"
-        advice = "let an excitation motion run twice or more: the floor tells how good a model can be"
+        what = "the motion does not repeat, so the repeatability of the efforts cannot be computed"
+        advice = (
+            "Run an excitation motion at least twice. Repeatability is about the smallest error that a model can have."
+        )
         return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
     floor = repeatability_floor(tau, rate, period, arm.identification.effort_cut_off)
     joints = [replace(joint, floor=float(value)) for joint, value in zip(joints, floor, strict=True)]
-    what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {len(tau) / rate / period:.1f} times"
+    what = f"the period is {period:.4f} s ({1 / period:.4f} Hz), and the recording has {len(tau) / rate / period:.1f}"
+    what += " periods"
     advice = (
-        "compare that with the frequency that was asked for; repeatability is about the least error that a model can "
-        "have"
+        "Compare the period with the commanded period. Repeatability is about the smallest error that a model can have."
     )
     findings = [Finding("note", "repetition", "motion", what, advice, size=period)]
     for j, name in enumerate(arm.joint_names):
-        if band := narrow_band(of_tau, j):
+        if band := narrow_band(tau_spectra, j):
             what = (
-                f"tau{j + 1} has noise between {band.lower:.0f} and {band.upper:.0f} Hz, {band.share:.0%} of its RMS, "
-                "that does not repeat"
+                f"tau{j + 1} has noise between {band.lower:.0f} and {band.upper:.0f} Hz "
+                f"({100 * band.share:.0f} % of its RMS)"
             )
-            findings.append(
-                Finding("note", "narrow-band noise", name, what, "filter below it before a fit", (j,), band.share)
-            )
+            advice = "Low-pass filter the effort below this band before a fit."
+            findings.append(Finding("note", "narrow-band noise", name, what, advice, (j,), band.share))
     return replace(
         report, joints=tuple(joints), period=period, floor_cut_off=arm.identification.effort_cut_off
     ), findings

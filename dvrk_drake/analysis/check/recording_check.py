@@ -1,4 +1,4 @@
-"""Checks a recording before identification and reports each problem with its place and advice."""
+"""Checks a recording before identification and reports each problem with its location and advice."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 
-#: A joint with a smaller range has not moved [rad], [m].
+#: Smallest range of the positions of a joint that moves [rad], [m].
 MIN_RANGE = 0.02, 0.002
 #: Smallest share of the range between the limits for a joint's parameters to be well identifiable.
 MIN_COVERAGE = 0.1
-#: Smallest reported excess of a pose beyond a limit [rad], [m].
+#: Smallest reported excess of a position beyond a limit [rad], [m].
 LIMIT_MARGIN = 0.005, 0.0005
-#: Ratio of a motion's effort to its limit above which the effort is a measurement error, even if the limit is inexact.
+#: Largest possible ratio of an effort to its limit in a motion. A larger ratio is a measurement error.
 IMPOSSIBLE_EFFORT = 5.0
-#: Excess beyond the joint stops above which a position is a measurement error [rad].
+#: Largest possible excess of a position beyond a coupled limit [rad]. A larger excess is a measurement error.
 IMPOSSIBLE_EXCESS = 0.3
-#: Smallest number of consecutive rows at the extreme effort, and smallest share of all rows, for a clipped effort.
+#: Smallest number of consecutive rows at the extreme effort, and smallest share of all rows, for a saturated effort.
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
-#: Largest relative deviation of the times from those implied by q and qd. A larger one indicates a wrong unit or rate.
+#: Largest relative error of the times compared with q and qd. A larger error indicates a wrong unit or rate.
 TIME_TOLERANCE = 0.05
 #: Number of rows between two compared positions.
 BLOCK = 20
@@ -40,32 +40,33 @@ _ORDER: dict[Severity, int] = {"refusal": 0, "warning": 1, "note": 2}
 
 
 def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
-    """Checks poses or a motion from a CSV file or an LCM log, in joint or actuator coordinates.
+    """Checks poses or a motion, without testing for exchanged channels.
 
     Limits are checked in joint coordinates. Sensors, motors and friction are checked in actuator coordinates. Problems
     of the recording are returned as findings and never raised.
 
     Args:
-        recording: Recording without preprocessing.
+        recording: Recording without preprocessing, in joint or actuator coordinates.
         arm: Arm that was recorded.
     """
     source = recording.source or "recording"
     report = RecordingReport(source, arm.name, "motion" if recording.is_motion else "poses", len(recording))
-    findings = [Finding("note", "reading", source, note, "read the rest with that in mind") for note in recording.notes]
+    findings = [Finding("note", "reading", source, note.removesuffix("."), "") for note in recording.notes]
     try:
         joints = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
         tau = joints.measured_effort()
         check_effort_unit(joints, arm)
     except RecordingError as error:
-        refusal = Finding("refusal", "unusable", source, _without_source(str(error), source), "nothing else is checked")
+        what, advice = _what_and_advice(error, source)
+        refusal = Finding("refusal", "unusable", source, what, advice)
         return replace(report, findings=(refusal, *findings))
-    numbers = _joint_signals(joints, arm)
-    findings += _positions(joints, arm, numbers)
+    joint_signals = _joint_signals(joints, arm)
+    findings += _positions(joints, arm, joint_signals)
     findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm, report.kind)
     time = _time(recording, report.kind)
     findings += time
-    report = replace(report, joints=numbers)
+    report = replace(report, joints=joint_signals)
     if any(finding.severity == "refusal" for finding in time):
         pass
     elif report.kind == "motion":
@@ -88,7 +89,7 @@ def _joint_signals(joints: Recording, arm: Arm) -> tuple[JointSignals, ...]:
     )
 
 
-def _positions(joints: Recording, arm: Arm, numbers: tuple[JointSignals, ...]) -> list[Finding]:
+def _positions(joints: Recording, arm: Arm, joint_signals: tuple[JointSignals, ...]) -> list[Finding]:
     findings = []
     A, lower, upper = arm.limit_matrix()
     names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
@@ -97,66 +98,78 @@ def _positions(joints: Recording, arm: Arm, numbers: tuple[JointSignals, ...]) -
     excess = np.maximum(lower - values, values - upper)
     for i in np.flatnonzero(np.max(excess, axis=0) > margins):
         row = int(np.argmax(excess[:, i]))
+        unit = "m" if i < arm.num_joints and arm.prismatic[i] else "rad"
         what = (
-            f"outside {lower[i]:.4g}..{upper[i]:.4g} in {np.mean(excess[:, i] > margins[i]):.1%} of the rows, "
-            f"furthest {values[row, i]:.4g} at {joints.where(row)}"
+            f"outside its limits {lower[i]:.4g}..{upper[i]:.4g} {unit} in "
+            f"{100 * np.mean(excess[:, i] > margins[i]):.1f} % of the rows, furthest {values[row, i]:.4g} {unit} at "
+            f"{joints.where(row)}"
         )
-        advice = "there it may press on a stop, and its effort is not the arm's own; check its zero and its limits"
+        advice = (
+            "Efforts measured at a joint stop are not valid. Check the encoder offset and the limits of the arm file."
+        )
         moved = tuple(int(j) for j in np.flatnonzero(A[i]))
         severity: Severity = "warning"
         if i >= arm.num_joints and excess[row, i] > IMPOSSIBLE_EXCESS:
             severity = "refusal"
-            advice = (
-                "no arm goes there, its links would cross: are these positions of actuators (--coordinates actuator)?"
-            )
+            advice = "The arm cannot reach this position. If these are actuator positions, use --coordinates actuator."
         findings.append(Finding(severity, "outside limits", names[i], what, advice, moved, float(excess[row, i])))
-    still = [j for j, least in enumerate(arm.per_joint(*MIN_RANGE)) if numbers[j].range < least]
-    for j, joint in enumerate(numbers):
-        if j in still:
-            what = f"never moves: its positions cover {joint.range:.2g} {'m' if arm.prismatic[j] else 'rad'}"
-            advice = "nothing of it can be identified, and what it carries only together; record it moving"
+    min_range = arm.per_joint(*MIN_RANGE)
+    for j, joint in enumerate(joint_signals):
+        if joint.range < min_range[j]:
+            what = f"the joint does not move (range {joint.range:.2g} {'m' if arm.prismatic[j] else 'rad'})"
+            advice = "Its parameters are not identifiable. Record a motion of this joint."
             findings.append(Finding("warning", "never moves", joint.name, what, advice, (j,), joint.range))
         elif joint.coverage < MIN_COVERAGE:
-            what = f"covers {joint.coverage:.1%} of its range"
-            advice = "its parameters will be uncertain and valid there only; let it move further"
+            what = f"the joint covers only {100 * joint.coverage:.1f} % of its range"
+            advice = "Its parameters will be uncertain and valid only in this range. Move the joint further."
             findings.append(Finding("warning", "little excitation", joint.name, what, advice, (j,), joint.coverage))
     return findings
 
 
 def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str) -> list[Finding]:
     if not np.any(tau):
-        advice = "the motors were off or are not recorded"
-        return [Finding("refusal", "no effort", "efforts", "all of them are always 0", advice)]
+        advice = "The motors were off, or the efforts were not recorded."
+        return [Finding("refusal", "no effort", "efforts", "all efforts are 0 in all rows", advice)]
     findings = []
-    least_range = arm.per_joint(*MIN_RANGE)
+    min_range = arm.per_joint(*MIN_RANGE)
     for j, name in enumerate(arm.joint_names):
         if not np.any(tau[:, j]):
-            advice = "its motor was off or is not recorded; nothing of it can be identified"
-            findings.append(Finding("warning", "no effort", name, f"tau{j + 1} is always 0", advice, (j,)))
+            what = f"tau{j + 1} is 0 in all rows"
+            advice = (
+                "The motor was off, or its effort was not recorded. The parameters of this joint are not identifiable."
+            )
+            findings.append(Finding("warning", "no effort", name, what, advice, (j,)))
             continue
         exceeds = int(np.sum(np.abs(tau[:, j]) > arm.effort_limits[j]))
         if exceeds:
             most = float(np.max(np.abs(tau[:, j])) / arm.effort_limits[j])
-            what = f"effort above its limit of {arm.effort_limits[j]:.3g} in {exceeds} rows, up to {most:.0%}"
-            advice = "such peaks may be clipped or spikes of the current's measurement"
+            limit = f"{arm.effort_limits[j]:.3g} {'N' if arm.prismatic[j] else 'N m'}"
+            what = (
+                f"tau{j + 1} exceeds its limit of {limit} in {exceeds} row{'s' * (exceeds != 1)}, with a peak at "
+                f"{100 * most:.0f} % of the limit"
+            )
+            advice = "Usual causes: clipped efforts, or spikes of the current measurement."
             severity: Severity = "note"
             if kind == "motion" and most > IMPOSSIBLE_EFFORT:
-                # A pose may be at a joint stop and is excluded later. In a motion a few such rows spoil the whole fit.
+                # Such poses are excluded later. In a motion, a few such rows make the whole fit wrong.
                 severity = "refusal"
                 advice = (
-                    "no motor of this arm does that; mend or remove the spikes, or correct the limit in the arm's file"
+                    "The motor cannot produce this effort. Remove the spikes, or correct the limit in the arm file."
                 )
             findings.append(Finding(severity, "above effort limit", name, what, advice, (j,), most))
-        # A joint at rest needs a constant effort, which is not saturation.
-        if np.ptp(actuators.q[:, j]) < least_range[j]:
+        # The effort of a joint at rest is constant, which is not saturation.
+        if np.ptp(actuators.q[:, j]) < min_range[j]:
             continue
         measured = actuators.measured_effort()[:, j]
         shares = {extreme: _flat_share(measured, extreme) for extreme in (float(measured.max()), float(measured.min()))}
         flat = {extreme: share for extreme, share in shares.items() if share > FLAT_SHARE}
         if flat:
-            at = " and at ".join(f"{extreme:.4g} in {share:.1%} of the rows" for extreme, share in flat.items())
-            what = f"effort stays at its extreme: at {at}"
-            advice = "it was saturated: what the joint did there is not what tau says; record a gentler motion"
+            unit = "N" if arm.prismatic[j] else "N m"
+            at = " and at ".join(
+                f"{extreme:.4g} {unit} in {100 * share:.1f} % of the rows" for extreme, share in flat.items()
+            )
+            what = f"the effort is saturated at {at}"
+            advice = "A saturated effort is not the true effort. Record a slower motion."
             findings.append(Finding("warning", "saturated effort", name, what, advice, (j,), max(flat.values())))
     return findings
 
@@ -170,75 +183,76 @@ def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
 
 
 def _time(recording: Recording, kind: str) -> list[Finding]:
-    """Reports times that decrease, and times whose unit disagrees with q and qd."""
+    """Returns findings for missing times, times that do not increase, and times that disagree with q and qd."""
     t, qd = recording.t, recording.qd
     if t is None:
         if qd is not None and np.max(np.sqrt(np.mean(qd**2, axis=0))) > REST_SPEED[0]:
-            what = "the arm moves (qd), but rows have no time t"
-            return [Finding("warning", "no times", "t", what, "taken for poses; write t [s] to use it as a motion")]
+            what = "the arm moves (qd), but the rows have no times t"
+            advice = "The rows are treated as poses. Add a column t [s] to use them as a motion."
+            return [Finding("warning", "no times", "t", what, advice)]
         return []
-    back = np.flatnonzero(np.diff(t) <= 0)
-    if len(back):
-        row = int(back[0]) + 1
-        what = f"does not increase in {len(back)} rows, first at {recording.where(row)}"
+    decreasing = np.flatnonzero(np.diff(t) <= 0)
+    if len(decreasing):
+        row, count = int(decreasing[0]) + 1, len(decreasing)
+        what = f"times do not increase in {count} row{'s' * (count != 1)}, first at {recording.where(row)}"
         severity: Severity = "refusal" if kind == "motion" else "warning"
-        advice = "rows must follow in time: sort them, and write one clock's times [s]"
-        return [Finding(severity, "time goes back", "t", what, advice, size=float(len(back)))]
+        advice = "Sort the rows by time, and use the times of one clock [s]."
+        return [Finding(severity, "time goes back", "t", what, advice, size=float(count))]
     factor = _time_factor(recording)
     if factor is None or abs(factor - 1) < TIME_TOLERANCE:
         return []
     units = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
     unit = next((name for size, name in units.items() if abs(factor / size - 1) < 0.1), "")
-    guess = f"is t in {unit}?" if unit else "is the rate right, and are all of qd in rad/s (m/s)?"
-    what = f"runs {factor:.4g} times as fast as q and qd say; {guess}"
-    return [
-        Finding("refusal", "wrong time", "t", what, "write t in s, q in rad (m) and qd in rad/s (m/s)", size=factor)
-    ]
+    cause = f"t may be in {unit}" if unit else "usual causes: a wrong rate, or qd in another unit"
+    what = f"times increase {factor:.4g} times as fast as q and qd imply ({cause})"
+    advice = "Use t in s, q in rad (m) and qd in rad/s (m/s)."
+    return [Finding("refusal", "wrong time", "t", what, advice, size=factor)]
 
 
 def _time_factor(recording: Recording) -> float | None:
-    """Returns the ratio of recorded to true time.
+    """Returns the ratio of recorded to true time, or None if it is not identifiable.
 
-    Most joints that move must agree on it within 10 %. Otherwise the result is None.
+    At least two joints must move, and the ratios of most of them must agree within 10 %.
     """
     t, q, qd = recording.t, recording.q, recording.qd
     if t is None or qd is None or len(t) < MIN_ROWS:
         return None
     # Differences over several rows cancel jitter and repeated rows.
-    way = np.diff(
+    integrals = np.diff(
         np.vstack([q[:1] * 0, np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(t)[:, None], axis=0)])[::BLOCK], axis=0
     )
     dq = np.diff(q[::BLOCK], axis=0)
     moving = np.sqrt(np.mean(qd**2, axis=0)) > REST_SPEED[1]
-    squares = np.sum(dq**2, axis=0) * np.sum(way**2, axis=0)
-    related = np.sum(dq * way, axis=0) > 0.6 * np.sqrt(squares)
-    chosen = moving & related & (squares > 0)
-    if np.sum(chosen) < 2:
+    squares = np.sum(dq**2, axis=0) * np.sum(integrals**2, axis=0)
+    correlated = np.sum(dq * integrals, axis=0) > 0.6 * np.sqrt(squares)
+    used = moving & correlated & (squares > 0)
+    if np.sum(used) < 2:
         return None
-    factors = np.sqrt(np.sum(way[:, chosen] ** 2, axis=0) / np.sum(dq[:, chosen] ** 2, axis=0))
+    factors = np.sqrt(np.sum(integrals[:, used] ** 2, axis=0) / np.sum(dq[:, used] ** 2, axis=0))
     factor = float(np.median(factors))
     return factor if np.mean(np.abs(factors / factor - 1) < 0.1) > 0.5 else None
 
 
-def _without_source(message: str, source: str) -> str:
-    return message.removeprefix(source).lstrip(": ")
+def _what_and_advice(error: Exception, source: str) -> tuple[str, str]:
+    """Returns the first sentence of an error, without the source of the recording, and the other sentences."""
+    what, _, advice = str(error).removeprefix(f"{source}: ").removesuffix(".").partition(". ")
+    return what, f"{advice}." if advice else ""
 
 
 def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -> RecordingReport:
-    """Checks a recording for faults before identification, like `dvrk-drake check`.
+    """Checks a recording for faults before identification, as `dvrk-drake check` does.
 
-    Faults are, for example, wrong units or signs, exchanged channels, efforts at their limit, decreasing times, late or
+    Examples of faults are wrong units or signs, exchanged channels, saturated efforts, decreasing times, late or
     repeated signals, and joints that do not move. Faults are not raised but returned as findings of the report.
 
     Args:
         recording: Poses or motion with efforts (m, n), in joint or actuator coordinates, without preprocessing.
         arm: Arm that was recorded.
-        progress: Function that is called with the step, "checking the recording", and its completed share 0..1.
+        progress: Callback that receives the step, "checking the recording", and its finished share, 0 to 1.
 
     Returns:
-        Report with `findings`, each with severity, place, advice and size. Its `refusals` and `warnings` are subsets of
-        them, `joints` has statistics of each joint, and `as_dict` returns the report for JSON. `identify` rejects a
-        recording that has refusals.
+        Report with `findings`; `refusals` and `warnings` are the findings of these severities. `joints` has the
+        statistics of each joint. `identify` rejects a recording with refusals.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -256,7 +270,7 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     if report.refusals:
         return report
     refusals = _refusals_of_identify(recording, arm)
-    # Findings repeated by a refusal, together with the required action.
+    # The refusal repeats the warning of too few poses.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
 
@@ -267,29 +281,29 @@ def require_usable(
     progress: Progress | None = None,
     *,
     channels: bool = False,
-    apart_from: str = "",
+    ignored_kind: str = "",
 ) -> RecordingReport:
     """Checks a recording and raises an error if it is not usable.
 
     Args:
         recording: Recording, see `check_recording`.
         arm: Arm that was recorded.
-        progress: Function that is called with the step, "checking the recording", and its completed share 0..1.
-        channels: Also checks the channels, see `check_with_channels`.
-        apart_from: Kind of findings that are ignored.
+        progress: Callback that receives the step, "checking the recording", and its finished share, 0 to 1.
+        channels: True to check the channels too, see `check_with_channels`.
+        ignored_kind: Kind of the findings that are ignored, or "".
 
     Returns:
-        The report, without refusals.
+        Report without refusals.
 
     Raises:
-        RecordingError: The recording has a refusal. The message is the first one, and the refusals and warnings are
-            the `findings` of the error.
+        RecordingError: The recording has a refusal. The message is the first refusal. The `findings` of the error are
+            all refusals and warnings.
     """
     report_share = step_progress(progress, "checking the recording")
     report_share(0.0)
     report = (check_with_channels if channels else check_recording)(recording, arm)
     report_share(1.0)
-    kept = tuple(finding for finding in report.findings if finding.kind != apart_from)
+    kept = tuple(finding for finding in report.findings if finding.kind != ignored_kind)
     report = replace(report, findings=kept)
     if report.refusals:
         error = RecordingError(report.refusal)
@@ -299,10 +313,10 @@ def require_usable(
 
 
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
-    """Checks a recording like `check_recording`, and its channels with `check_channels` if there are no other refusals.
+    """Checks a recording with `check_recording`, and its channels with `check_channels` if there are no other refusals.
 
-    Exchanged channels resemble efforts of a wrong sign. A refusal for wrong signs is therefore replaced by the refusal
-    that names the exchanged channels.
+    Exchanged channels have a similar effect as efforts of wrong sign. A refusal for exchanged channels therefore
+    replaces the refusals for wrong signs.
     """
     report = check_recording(recording, arm)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]
@@ -311,7 +325,7 @@ def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     try:
         found = check_channels(recording, arm)
     except RecordingError:
-        return report  # The motion is too short or too coarse for a fit. identify rejects it for that reason.
+        return report  # The motion is too short, or its rate too low, for a fit. identify rejects it for that reason.
     if any(finding.severity == "refusal" for finding in found):
         kept = [finding for finding in report.findings if finding.severity != "refusal"]
         return replace(report, findings=(*found, *kept))
@@ -329,7 +343,7 @@ def _refusals_of_identify(recording: Recording, arm: Arm) -> tuple[Finding, ...]
             return ()
         usable_poses(found.recording, arm)
     except (RecordingError, IdentificationError) as error:
-        what, _, advice = str(error).removeprefix(f"{recording.source or 'recording'}: ").partition("; ")
-        return (Finding("refusal", "identify refuses", "identify", f"will refuse it: {what}", advice),)
+        what, advice = _what_and_advice(error, recording.source or "recording")
+        return (Finding("refusal", "identify refuses", "identify", f"rejects the recording: {what}", advice),)
     # For a motion with static segments, only those are used for identification.
     return () if found.recording is recording else check_recording(found.recording, arm).refusals

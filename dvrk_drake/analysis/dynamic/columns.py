@@ -14,8 +14,8 @@ from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
     effect_fault,
+    is_prismatic,
     position_along,
-    slides,
     spring_over,
 )
 from dvrk_drake.dynamics.base_parameters import independent_columns
@@ -29,23 +29,25 @@ COULOMB_WIDTHS = (0.03, 0.1, 0.4)
 #: Width of the smoothed sign function for asymmetric and Stribeck friction.
 DIRECTION_WIDTH = 0.1
 ASYMMETRIC = "asymmetric friction"
-#: Effect names that an arm file accepts, with the periods per turn of their sine and cosine.
+#: Names of effects in an arm file, with the number of periods per revolution of their sine and cosine.
 NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicColumns:
-    """Columns of the linear model tau ~ rigid (base phi) + effects c, at r filtered rows, per actuator.
+    """Columns of the linear model tau = rigid (base phi) + effects c of each actuator, at r filtered rows.
 
     Attributes:
-        tau: (r, n) measured efforts of the actuators.
-        base: (b, p) matrix that maps all p rigid-body parameters to the base parameters for any gravity direction.
+        tau: Measured efforts (r, n) of the actuators [N m, N].
+        base: Matrix (b, p) that maps all p rigid-body parameters to the base parameters for any gravity direction.
             The links come first, then one rotor per actuator.
-        rigid: (r, n, b) columns of the base parameters.
-        tilts: (2, r, n, b) derivatives of `rigid` with respect to the x and y components of gravity [s^2/m].
-        effects: Candidate effects, in the order of the columns.
-        shapes: For each actuator, (r, e) shape functions of the effects along their coordinates.
-        rows: (e, n) coordinate of each effect. The columns of actuator i are shapes[i] * rows[:, i].
+        rigid: Columns (r, n, b) of the base parameters.
+        tilts: Derivatives (2, r, n, b) of `rigid` with respect to the x and y components of gravity [s^2/m]. Empty if
+            the base may not tilt.
+        effects: Effects, in the order of their columns.
+        shapes: Shape functions (r, e) of the effects along their coordinates, for each actuator.
+        rows: Coordinates (e, n) of the effects: motion of the coordinate per unit motion of each actuator. The columns
+            of actuator i are shapes[i] * rows[:, i].
     """
 
     tau: NDArray[np.float64]
@@ -58,19 +60,19 @@ class DynamicColumns:
 
 
 def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """Returns the effects that are always in the model.
+    """Returns the mandatory effects of the model.
 
-    Every actuator has an offset. Every coordinate has viscous, Coulomb and presliding friction. The effects of the arm
-    file (`motion.known_effects`) are added.
+    These are an offset of every actuator, viscous, Coulomb and presliding friction of every coordinate, and the effects
+    of the arm file (`motion.known_effects`).
 
     Raises:
-        ArmError: The file names an unknown coordinate or an unknown effect.
+        ArmError: The arm file contains an unknown coordinate or an unknown effect.
     """
     known = arm.identification.known_effects
     if unknown := set(known) - set(distinct_coordinates(arm)):
         raise ArmError(
-            f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}; "
-            f"known: {', '.join(distinct_coordinates(arm))}"
+            f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}. "
+            f"Allowed: {', '.join(distinct_coordinates(arm))}."
         )
     effects, travels = [], arm.identification.presliding_travels
     for name, x, v in _coordinates(arm, grid):
@@ -103,12 +105,12 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
         effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
         known = arm.identification.known_effects.get(name, [])
         for which in NAMED_EFFECTS:
-            # Next to known position-dependent torques, others are redundant within the range of the motion. Outside of
-            # that range they diverge.
+            # A coordinate with known position-dependent torques gets no others. They are redundant within the range of
+            # the motion and diverge outside of it.
             by_position = which != ASYMMETRIC
             if which in known or (by_position and set(known) - {ASYMMETRIC}):
                 continue
-            if which == "spring" or not by_position or not slides(arm, name):
+            if which == "spring" or not by_position or not is_prismatic(arm, name):
                 effects += _named(arm, name, which, x, v)
     return effects
 
@@ -116,10 +118,10 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 def _named(
     arm: Arm, coordinate: str, which: str, x: NDArray[np.float64], v: NDArray[np.float64]
 ) -> list[ActuatorEffect]:
-    """Returns the effects that the arm file names `which`."""
+    """Returns the effects with the name `which` of an arm file, scaled for positions x (m,) and velocities v (m,)."""
     where = f"{arm.source}: motion.known_effects.{coordinate}"
     if which not in NAMED_EFFECTS:
-        raise ArmError(f'{where}: unknown "{which}"; known: {", ".join(NAMED_EFFECTS)}')
+        raise ArmError(f'{where}: unknown effect "{which}". Allowed: {", ".join(NAMED_EFFECTS)}.')
     if which == ASYMMETRIC:
         return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
     if which == "spring":
@@ -136,18 +138,18 @@ def dynamic_columns(
     """Computes the columns of all parameters and effects.
 
     Args:
-        grid: Motion, resampled.
-        tau: (rows, n) recorded efforts of the actuators.
+        grid: Resampled motion.
+        tau: Measured efforts (m, n) of the actuators at the rows of the recording [N m, N].
         regressor: Regressor of the arm with its nominal mounting.
-        effects: Effects to compute columns for.
+        effects: Effects of the model.
     """
     arm = grid.arm
     # Efforts are linear in gravity. The efforts at rest under unit gravity are therefore the derivative.
-    lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
-    columns = base_columns([regressor, *lying])
+    tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
+    columns = base_columns([regressor, *tilted])
     rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), columns)
-    rest = np.zeros_like(grid.q)
-    tilts = [_filtered(grid, r.regressor(grid.q, rest, rest), columns) for r in lying]
+    zero = np.zeros_like(grid.q)
+    tilts = [_filtered(grid, r.regressor(grid.q, zero, zero), columns) for r in tilted]
     on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
     rows = np.array([arm.effect_coordinates[effect.coordinate] for effect in effects])
     delays = np.array(grid.settings.effort_delay)
@@ -156,10 +158,10 @@ def dynamic_columns(
         if delay not in by_delay:
             acting = np.flatnonzero(np.any(rows[:, delays == delay], axis=1))
             by_delay[delay] = np.zeros((len(rigid), len(effects)))
-            by_delay[delay][:, acting] = grid.behind_filter(grid.at_rows(on_grid[:, acting], i))
+            by_delay[delay][:, acting] = grid.filter_efforts(grid.at_rows(on_grid[:, acting], i))
     shapes = tuple(by_delay[delay] for delay in delays)
     return DynamicColumns(
-        tau=grid.behind_filter(tau),
+        tau=grid.filter_efforts(tau),
         base=columns.base,
         rigid=rigid,
         tilts=np.array(tilts).reshape(-1, *rigid.shape),
@@ -173,9 +175,9 @@ class BaseColumns(NamedTuple):
     """Linearly independent columns of an arm's regressor, see `independent_columns`.
 
     Attributes:
-        independent: (b,) indices of the independent columns.
-        base: (b, p) matrix that maps all parameters to the base parameters.
-        moves: (n, b) mask of the columns that are not 0 for a joint.
+        independent: Indices (b,) of the independent columns.
+        base: Matrix (b, p) that maps all parameters to the base parameters.
+        moves: Mask (n, b) of the columns that are not 0 for a joint.
     """
 
     independent: NDArray[np.int_]
@@ -188,8 +190,8 @@ class BaseColumns(NamedTuple):
         """Returns the indices (c,) and values (m, c) of the nonzero columns of one actuator.
 
         Args:
-            Y: (m, n, p) regressor of the joints.
-            drives: (n,) motion of each joint per unit of the actuator.
+            Y: Regressor (m, n, p) of the joints.
+            drives: Motion (n,) of each joint per unit motion of the actuator.
         """
         joints = np.flatnonzero(drives)
         own = np.flatnonzero(np.any(self.moves[joints], axis=0))
@@ -197,7 +199,10 @@ class BaseColumns(NamedTuple):
 
 
 def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
-    """Finds the independent columns of one arm for all given gravities, without coupled rotors (`rotor_inertias`)."""
+    """Returns the independent columns of one arm for the gravities of all regressors.
+
+    Coupled rotors are not included, see `rotor_inertias`.
+    """
     arm, p = regressors[0].arm, len(regressors[0].values)
     generator = np.random.default_rng(0)
     q, v, vd = generator.normal(0, 2, (3, p // 2, arm.num_joints))
@@ -212,17 +217,17 @@ def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) ->
     out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(columns.independent)))
     for i, drives in enumerate(grid.arm.transmission.inverse.matrix.T):
         own, of_actuator = columns.of_actuator(Y, drives)
-        out[:, i, own] = grid.behind_filter(grid.at_rows(of_actuator, i))
+        out[:, i, own] = grid.filter_efforts(grid.at_rows(of_actuator, i))
     return out
 
 
 def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
-    """Returns name, position and velocity of every coordinate of the drives."""
+    """Returns name, position (m,) and velocity (m,) of each coordinate of the drives."""
     rows, a_dot = arm.effect_coordinates, arm.transmission.velocity(grid.v)
     names = distinct_coordinates(arm)
     return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]
 
 
 def _rounded(x: float) -> float:
-    """Rounds a scale to three significant digits, because a scale is chosen and not measured."""
+    """Rounds the scale of an effect to three significant digits."""
     return float(f"{x:.3g}")

@@ -1,4 +1,4 @@
-"""Identifies the full dynamics of an arm from one recorded motion: consistent links, rotors and drive effects."""
+"""Identifies the full dynamics of an arm from one motion: physically consistent links, rotors and drive effects."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Effects below this share of the actuators' RMS effort are omitted from the model.
+#: Smallest coefficient of an effect in the model, in units of its prior standard deviation.
 MIN_EFFECT = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class DynamicIdentification(Identification):
-    """Model identified from a motion. It has `dynamics`, and its base parameters are computed from those links.
+    """Model identified from a motion. The model has `dynamics`, and base parameters computed from the links.
 
     Attributes:
-        grid: Motion, resampled.
-        period: Period of the motion [s], or None.
-        measured: (r, n) measured efforts of the actuators after low-pass filtering, without the ends [N m, N].
-        predicted: (r, n) predicted efforts, processed in the same way [N m, N].
-        dry_friction: Sum of Coulomb and presliding friction per coordinate, with its standard error [N m, N].
+        grid: Resampled motion.
+        period: Period of the motion [s], or None if it does not repeat.
+        measured: Measured efforts (r, n) of the actuators after low-pass filtering, without the ends [N m, N].
+        predicted: Predicted efforts (r, n) of the actuators at the same rows, after the same filter [N m, N].
+        dry_friction: Sum of Coulomb and presliding friction of each coordinate, with its standard error [N m, N].
         nominal_mass: Total mass of the links in the SDF [kg].
     """
 
@@ -59,24 +59,24 @@ def identify_dynamic(
 ) -> DynamicIdentification:
     """Identifies the dynamics of `arm` from a motion.
 
-    Measured efforts and regressor columns pass the same low-pass filter. Every actuator has an offset. Actuators, and
-    joints that share actuators, have viscous, smoothed Coulomb and presliding friction. Springs, cables and asymmetric
-    friction are included if the arm file lists them. Further effects are chosen by cross-validation over the phase of
-    the motion.
+    Measured efforts and regressor columns are filtered with the same low-pass filter. Every actuator has an offset.
+    Actuators, and joints that share actuators, have viscous, smoothed Coulomb and presliding friction. Springs, cables
+    and asymmetric friction are included if the arm file lists them. Further effects are selected by cross-validation
+    over the phase of the motion.
 
-    The link parameters are physically consistent. They fit the recording, and stay at the values of the SDF where the
-    recording is not informative (`consistent_parameters`). The direction of gravity is estimated if the arm file allows
-    a base tilt. The cross-validated errors are prediction errors on held-out phases (`cross_validate`).
+    The link parameters are physically consistent. Parameters that the recording cannot identify keep the values of the
+    SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a base tilt. The
+    cross-validated errors are prediction errors on held-out phases (`cross_validate`).
 
     Args:
-        recording: Motion with t and tau, in actuator or joint coordinates.
+        recording: Motion with t and tau, in joint or actuator coordinates.
         arm: Arm that was recorded.
         progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
         RecordingError: The recording does not fit the arm, or is not a motion.
-        IdentificationError: The program for consistent parameters did not converge, or the prediction for a moving
-            actuator is worse than zero torque.
+        IdentificationError: The solver for consistent parameters did not converge, or the cross-validated error of a
+            moving actuator exceeds its effort.
     """
     grid = motion_grid(recording, arm, default_settings(arm))
     tau = recording.in_actuator_coordinates(arm).measured_effort()
@@ -84,20 +84,20 @@ def identify_dynamic(
     period = period_of(grid)
     problem = motion_problem(grid, tau, period)
     progress(0.2)
-    choice = select_effects(problem, lambda share: progress(0.2 + 0.3 * share))
-    problem, chosen = choice.problem, choice.chosen
-    fit = problem.consistent(chosen, choice.weights)
-    left_out = cross_validate(choice, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
-    _refuse_worse_than_zero(recording, grid, np.sqrt(left_out / np.maximum(problem.efforts, np.finfo(float).tiny)))
-    left = residuals(problem, chosen, fit)
-    covariance = parameter_covariance(problem, fit, left, grid.rate, grid.settings.effort_cut_off, period)
+    selection = select_effects(problem, lambda share: progress(0.2 + 0.3 * share))
+    problem, effects = selection.problem, selection.effects
+    fit = problem.consistent(effects, selection.weights)
+    held_out = cross_validate(selection, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
+    _refuse_worse_than_zero(recording, grid, np.sqrt(held_out / np.maximum(problem.efforts, np.finfo(float).tiny)))
+    error = residuals(problem, effects, fit)
+    covariance = parameter_covariance(problem, fit, error, grid.rate, grid.settings.effort_cut_off, period)
     estimates = DynamicEstimates(problem, fit, covariance)
-    section = _section(problem, chosen, fit, covariance, left_out, grid, tau, period)
+    section = _section(problem, effects, fit, covariance, held_out, grid, tau, period)
     section.links = estimates.links()
     section.base_parameters, section.correlations = estimates.base_parameters()
     model = _model(recording, arm, section, covariance)
     progress(1.0)
-    predicted = problem.columns.tau - left
+    predicted = problem.columns.tau - error
     nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
     return DynamicIdentification(
         model=model,
@@ -113,14 +113,21 @@ def identify_dynamic(
 
 
 def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDArray[np.float64]) -> None:
-    """Raises IdentificationError if the cross-validated relative error (n,) of a moving actuator exceeds 1."""
+    """Raises IdentificationError if the cross-validated relative error of a moving actuator exceeds 1.
+
+    Args:
+        recording: Recording that the model was identified from, for the message.
+        grid: Resampled motion.
+        errors: Cross-validated relative errors (n,) of the actuators [1].
+    """
     arm = grid.arm
     moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
     if len(bad := np.flatnonzero(moves & (errors > 1))):
+        joints = ", ".join(f"{arm.joint_names[i]} ({100 * errors[i]:.0f} %)" for i in bad)
         raise IdentificationError(
-            f"{recording.source or 'recording'}: no model: its cross-validated error exceeds the effort itself on "
-            f"{', '.join(f'{arm.joint_names[i]} ({errors[i]:.0%})' for i in bad)}; check the arm, the coordinates, and "
-            "the order, signs and units of the columns (dvrk-drake check)"
+            f"{recording.source or 'recording'}: no model was identified, because the cross-validated error exceeds "
+            f"the effort itself on {joints}. Check the arm, the coordinates, and the order, signs and units of the "
+            "columns (dvrk-drake check)."
         )
 
 
@@ -130,38 +137,45 @@ def motion_problem(
     """Returns the least-squares problem of a motion.
 
     Args:
-        grid: Motion, resampled.
-        tau: (m, n) measured efforts of the actuators, one row per row of the recording.
-        period: Period of the motion [s], or None.
-        effects: Effects of the model. By default they are the drive effects and the optional effects.
+        grid: Resampled motion.
+        tau: Measured efforts (m, n) of the actuators at the rows of the recording [N m, N].
+        period: Period of the motion [s], or None if it does not repeat.
+        effects: Effects of the model, all mandatory. None selects the drive effects as mandatory effects and the
+            optional effects as candidates.
     """
-    always = effects if effects is not None else drive_effects(grid.arm, grid)
+    mandatory = effects if effects is not None else drive_effects(grid.arm, grid)
     candidates = [] if effects is not None else optional_effects(grid.arm, grid)
     regressor = DynamicRegressor(grid.arm)
-    columns = dynamic_columns(grid, tau, regressor, [*always, *candidates])
+    columns = dynamic_columns(grid, tau, regressor, [*mandatory, *candidates])
     fold, edge = phase_folds(grid, period)
     # A low-pass filtered effort has two independent values per period of the cut-off frequency. Repetitions of the
     # motion add none.
     duration = len(columns.tau) / grid.rate
     independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
-    return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(always))
+    return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(mandatory))
 
 
-def residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
-    """Returns the effort residuals (r, n) of a fit with these effects, on the rows of `problem`."""
+def residuals(problem: DynamicProblem, effects: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
+    """Returns the effort residuals (r, n) of a fit on the rows of `problem`, which need not be the rows of the fit.
+
+    Args:
+        problem: Problem with the rows.
+        effects: Indices (e,) of the effects in the fit.
+        fit: Fit with these effects.
+    """
     columns, p = problem.columns, problem.num_rigid
     drive = np.column_stack(
-        [columns.shapes[i][:, chosen] @ (columns.rows[chosen, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]
+        [columns.shapes[i][:, effects] @ (columns.rows[effects, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]
     )
     return columns.tau - problem.rigid @ (columns.base @ fit.x[:p]) - drive
 
 
 def _section(
     problem: DynamicProblem,
-    chosen: NDArray[np.int_],
+    selected: NDArray[np.int_],
     fit: ConsistentFit,
     covariance: NDArray[np.float64],
-    left_out: NDArray[np.float64],
+    held_out: NDArray[np.float64],
     grid: MotionGrid,
     tau: NDArray[np.float64],
     period: float | None,
@@ -173,9 +187,9 @@ def _section(
         for i, name in enumerate(arm.joint_names, start=p - arm.num_joints)
     ]
     effects = []
-    for k, effect in enumerate(problem.columns.effects[c] for c in chosen):
+    for k, effect in enumerate(problem.columns.effects[c] for c in selected):
         value = float(fit.x[p + k])
-        if value**2 * problem.effect_precision[chosen[k]] > MIN_EFFECT**2:
+        if value**2 * problem.effect_precision[selected[k]] > MIN_EFFECT**2:
             effects.append(
                 DriveEffect(effect.coordinate, effect.kind, effect.scale, value, standard_error=float(sd[p + k]))
             )
@@ -187,7 +201,7 @@ def _section(
     actuators = [
         ActuatorStatistics(name, *map(float, numbers))
         for name, *numbers in zip(
-            arm.joint_names, size, np.sqrt(fit.errors / rows), np.sqrt(left_out / rows), floor, strict=True
+            arm.joint_names, size, np.sqrt(fit.errors / rows), np.sqrt(held_out / rows), floor, strict=True
         )
     ]
     gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)

@@ -25,13 +25,13 @@ from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.dynamics.physical_consistency import reached_bounds
 from dvrk_drake.models.arm import Arm
 
-#: Above this absolute correlation two parameters are not identifiable separately, only their sum or difference is.
+#: Largest absolute correlation of two parameters that are identifiable separately.
 STRONG_CORRELATION = 0.95
 
 
 @dataclass(frozen=True)
 class StrongCorrelation:
-    """Two parameters that are not identifiable separately, with the correlation of their estimates, -1 to 1."""
+    """Names of two parameters that are not identifiable separately, and the correlation of their estimates, -1 to 1."""
 
     first: str
     second: str
@@ -40,7 +40,7 @@ class StrongCorrelation:
     def __str__(self) -> str:
         what = "difference" if self.correlation > 0 else "sum"
         pair = f"{self.first} and {self.second}"
-        return f"{pair}: correlation {self.correlation:+.3f}, only their scaled {what} is well known"
+        return f"{pair}: correlation {self.correlation:+.3f}, only a scaled {what} is identifiable"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +48,9 @@ class ParameterUncertainty:
     """Standard errors and correlations of the estimates of b parameters.
 
     Attributes:
-        names: (b,) names of the parameters.
-        standard_errors: (b,) standard errors in the units of the parameters.
-        correlation: (b, b) correlations of the estimates.
+        names: Names of the b parameters.
+        standard_errors: Standard errors (b,) in the units of the parameters.
+        correlation: Correlations (b, b) of the estimates.
     """
 
     names: tuple[str, ...]
@@ -70,11 +70,11 @@ class ParameterUncertainty:
         return [StrongCorrelation(self.names[i], self.names[k], float(self.correlation[i, k])) for i, k in pairs]
 
 
-#: Longest time lag at which effort errors are assumed correlated, apart from whole periods [s].
-MEMORY = 1.0
-#: Sampling rate of the rows, relative to the rate that the cut-off of the low-pass filter requires.
+#: Largest time lag of correlated effort errors, in addition to whole periods [s].
+CORRELATION_TIME = 1.0
+#: Ratio of the sampling rate of the used rows to the rate that the cut-off of the low-pass filter requires.
 _OVERSAMPLING = 2.0
-#: Least overlap of two passes, as a share of the motion, for estimating the error that repeats.
+#: Smallest overlap of two periods, as a share of the motion, for estimating the repeating error.
 _MIN_OVERLAP = 0.2
 
 
@@ -86,53 +86,53 @@ def parameter_covariance(
     cut_off: float,
     period: float | None,
 ) -> NDArray[np.float64]:
-    """Returns the covariance (p + e, p + e) of `fit.x` for the given effects.
+    """Returns the covariance (p + e, p + e) of `fit.x`, for fixed effects and without inequality constraints.
 
-    Inequality constraints are not treated as information. With A = (X'WX + P)^-1, the inverse Hessian of the cost,
+    With the inverse Hessian of the cost A = (X'WX + P)^-1, the covariance is
 
-        covariance = A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
+        A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
 
     where P is the precision of the priors and Omega_i is the covariance of the error of actuator i over time. Omega_i
-    is estimated from the residuals. Slowly varying errors, such as those of the friction model, therefore count as few
-    measurements. Errors that repeat in every period of the motion count once, whatever the number of periods.
+    is estimated from the residuals. Slowly varying errors, for example of the friction model, therefore count as few
+    measurements. Errors that repeat in every period count once, independent of the number of periods.
 
     Residuals of a fit, (1 - H) e with the hat matrix H, are smaller than the errors. Residuals of held-out phases,
-    e / (1 - H), are larger by the same factor. Their products are unbiased (MacKinnon and White, "Some
+    e / (1 - H), are larger by the same factor. Products of both are unbiased (MacKinnon and White, "Some
     heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
 
     Args:
         problem: Problem that was solved.
-        fit: Its solution.
-        residuals: (r, n) effort residuals of the fit.
+        fit: Solution of the problem.
+        residuals: Effort residuals (r, n) of the fit [N m, N].
         rate: Rate of the rows [Hz].
         cut_off: Cut-off of the low-pass filter of the efforts [Hz].
-        period: Period of the motion [s], or None.
+        period: Period of the motion [s], or None if it does not repeat.
     """
     step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
     rows = slice(None, None, step)
     A = _inverse(fit.information + fit.prior_precision)
-    to_base = problem.to_base(len(fit.chosen))
+    to_base = problem.to_base(len(fit.effects))
     middle = np.zeros((len(to_base),) * 2)
-    columns = [problem.chosen_columns(i, fit.chosen) for i in range(len(fit.weights))]
-    unseen = _unseen_residuals(problem, fit, residuals, columns, to_base)
+    columns = [problem.actuator_columns(i, fit.effects) for i in range(len(fit.weights))]
+    held_out = _held_out_residuals(problem, fit, residuals, columns, to_base)
     for i, (weight, (own, X)) in enumerate(zip(fit.weights, columns, strict=True)):
-        covariance = error_covariance(residuals[rows, i], unseen[rows, i], rate / step, period)
+        covariance = error_covariance(residuals[rows, i], held_out[rows, i], rate / step, period)
         middle[own[:, None], own] += (weight * step) ** 2 * (X[rows].T @ matmul_toeplitz(covariance, X[rows]))
     return np.asarray(A @ (to_base.T @ middle @ to_base + fit.prior_precision) @ A, dtype=np.float64)
 
 
-def _unseen_residuals(
+def _held_out_residuals(
     problem: DynamicProblem,
     fit: ConsistentFit,
     residuals: NDArray[np.float64],
     columns: Sequence[OwnColumns],
     to_base: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Returns the residuals (r, n) of each fold for a fit to the other folds.
+    """Returns the residuals (r, n) of the rows of each fold for a fit to the other folds.
 
-    One Newton step gives the exact fit, except for changes of active inequality constraints.
+    One Newton step gives the exact fit if the active inequality constraints do not change.
     """
-    unseen = residuals.copy()
+    held_out = residuals.copy()
     free = np.flatnonzero(fit.x > fit.lower)
     to_free = to_base[:, free]
     known = (fit.information + fit.prior_precision)[np.ix_(free, free)]
@@ -141,38 +141,38 @@ def _unseen_residuals(
         sums = NormalEquations.of(((own, X[rows]) for own, X in columns), len(to_base), residuals[rows]).total
         own_sums = sums.weighted(fit.weights)
         step = to_free @ (_inverse(known - to_free.T @ own_sums[:-1, :-1] @ to_free) @ (to_free.T @ own_sums[:-1, -1]))
-        unseen[rows] += np.column_stack([X[rows] @ step[own] for own, X in columns])
-    return unseen
+        held_out[rows] += np.column_stack([X[rows] @ step[own] for own, X in columns])
+    return held_out
 
 
 def error_covariance(
-    seen: NDArray[np.float64], unseen: NDArray[np.float64], rate: float, period: float | None
+    fitted: NDArray[np.float64], held_out: NDArray[np.float64], rate: float, period: float | None
 ) -> NDArray[np.float64]:
-    """Returns the autocovariance (r,) of an actuator's error, by lag in rows.
+    """Returns the autocovariance (r,) of an actuator's error, for lags of 0 to r - 1 rows.
 
-    Up to a lag of `MEMORY` it is the covariance of the error, tapered with a Parzen window. At whole periods it is the
-    covariance of the repeating part of the error, estimated from the first repetition.
+    Up to a lag of `CORRELATION_TIME`, it is the covariance of the error, tapered with a Parzen window. Around whole
+    periods, it is the covariance of the repeating part of the error, estimated at a lag of one period.
 
     Args:
-        seen: (r,) residuals of a fit to all rows.
-        unseen: (r,) residuals of fits without these rows.
+        fitted: Residuals (r,) of a fit to all rows.
+        held_out: Residuals (r,) of fits to other folds.
         rate: Rate of the rows [Hz].
-        period: Period of the motion [s], or None.
+        period: Period of the motion [s], or None if it does not repeat.
     """
-    count = len(seen)
-    both = correlation(seen, unseen)
-    lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
-    reach = min(round(MEMORY * rate), count - 1)
-    window = _parzen(np.arange(-reach, reach + 1) / reach)
-    near = np.concatenate([lags[reach:0:-1], lags[: reach + 1]]) * window
-    covariance = np.zeros(count + reach)
-    covariance[: reach + 1] = near[reach:]
+    count = len(fitted)
+    products = correlation(fitted, held_out)
+    lags = (products + products[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
+    width = min(round(CORRELATION_TIME * rate), count - 1)
+    window = _parzen(np.arange(-width, width + 1) / width)
+    near_zero = np.concatenate([lags[width:0:-1], lags[: width + 1]]) * window
+    covariance = np.zeros(count + width)
+    covariance[: width + 1] = near_zero[width:]
     shift = 0 if period is None else round(period * rate)
-    if reach < shift and (count - shift - reach) > _MIN_OVERLAP * count:
-        again = lags[shift - reach : shift + reach + 1] * window
-        for start in range(shift, count + reach, shift):
-            until = min(start + reach + 1, len(covariance))
-            covariance[start - reach : until] += again[: until - start + reach]
+    if width < shift and (count - shift - width) > _MIN_OVERLAP * count:
+        near_period = lags[shift - width : shift + width + 1] * window
+        for start in range(shift, count + width, shift):
+            end = min(start + width + 1, len(covariance))
+            covariance[start - width : end] += near_period[: end - start + width]
     return _nearest_covariance(covariance[:count])
 
 
@@ -182,7 +182,7 @@ def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _nearest_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the nearest covariance with a nonnegative spectrum, because estimates can have negative spectra."""
+    """Returns the nearest covariance with a nonnegative spectrum."""
     circulant = np.concatenate([covariance, covariance[-1:0:-1]])
     spectrum = np.maximum(np.fft.rfft(circulant).real, 0.0)
     return np.asarray(np.fft.irfft(spectrum, len(circulant))[: len(covariance)], dtype=np.float64)
@@ -193,9 +193,9 @@ def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale), dtype=np.float64)
 
 
-#: Least share of the prior variance that the motion must remove for a base parameter to count as identifiable.
+#: Smallest identifiability of an identifiable base parameter: 1 - variance / prior variance.
 MIN_IDENTIFIABILITY = 0.5
-#: Effect kinds that `dry_friction` sums.
+#: Effect kinds that are dry friction.
 DRY_KINDS = ("coulomb", "presliding")
 
 
@@ -203,17 +203,17 @@ class DynamicEstimates:
     """Parameter estimates of one fit."""
 
     def __init__(self, problem: DynamicProblem, fit: ConsistentFit, covariance: NDArray[np.float64]) -> None:
-        """Stores the fit and the covariance (p + e, p + e) of `fit.x`, see `parameter_covariance`."""
+        """Constructs the estimates from a fit and the covariance (p + e, p + e) of `fit.x`."""
         self._problem, self._fit, self._covariance = problem, fit, covariance
         self._prior = np.linalg.inv(fit.prior_precision)
-        self._effects = [problem.columns.effects[k] for k in fit.chosen]
+        self._effects = [problem.columns.effects[k] for k in fit.effects]
 
     def links(self) -> list[LinkEstimate]:
-        """Returns the estimates of every link."""
+        """Returns the estimates of all links."""
         estimates = []
         for k, link in enumerate(self._problem.regressor.links):
-            chosen = slice(10 * k, 10 * k + 10)
-            x, variance = self._fit.x[chosen], np.diag(self._covariance)[chosen]
+            rows = slice(10 * k, 10 * k + 10)
+            x, variance = self._fit.x[rows], np.diag(self._covariance)[rows]
             estimates.append(
                 LinkEstimate(
                     link.link,
@@ -227,23 +227,23 @@ class DynamicEstimates:
         return estimates
 
     def base_parameters(self) -> tuple[list[MotionParameterEstimate], list[CorrelatedEstimates]]:
-        """Returns the base parameters, and the strong correlations between them and with effects."""
+        """Returns the base parameters, and their strong correlations with each other and with effects."""
         problem, p = self._problem, self._problem.num_rigid
         base = derive_base_parameters(problem.regressor, coupled_rotors=False)
         B = base.combination
         values = B @ self._fit.x[:p]
-        before = np.einsum("bp,pq,bq->b", B, self._prior[:p, :p], B)
+        prior_variances = np.einsum("bp,pq,bq->b", B, self._prior[:p, :p], B)
         # Effects at their lower bound, 0, are not included.
-        there = p + np.flatnonzero(self._fit.x[p:] != 0)
-        to_all = np.zeros((len(B) + len(there), len(self._fit.x)))
+        nonzero = p + np.flatnonzero(self._fit.x[p:] != 0)
+        to_all = np.zeros((len(B) + len(nonzero), len(self._fit.x)))
         to_all[: len(B), :p] = B
-        to_all[len(B) + np.arange(len(there)), there] = 1.0
-        names = (*base.base.names, *(str(self._effects[k - p]) for k in there))
+        to_all[len(B) + np.arange(len(nonzero)), nonzero] = 1.0
+        names = (*base.base.names, *(str(self._effects[k - p]) for k in nonzero))
         uncertainty = ParameterUncertainty.of_covariance(names, to_all @ self._covariance @ to_all.T)
         estimates = [
             MotionParameterEstimate(name, unit, float(value), float(error), _identifiability(error**2, variance))
             for name, unit, value, error, variance in zip(
-                base.base.names, base.base.units, values, uncertainty.standard_errors, before, strict=False
+                base.base.names, base.base.units, values, uncertainty.standard_errors, prior_variances, strict=False
             )
         ]
         identifiable = {estimate.name for estimate in estimates if estimate.identifiability >= MIN_IDENTIFIABILITY}
@@ -259,19 +259,19 @@ class DynamicEstimates:
         p = self._problem.num_rigid
         friction = {}
         for name in dict.fromkeys(effect.coordinate for effect in self._effects):
-            which = [
+            dry = [
                 p + k
                 for k, effect in enumerate(self._effects)
                 if effect.coordinate == name and effect.kind in DRY_KINDS
             ]
-            if which:
-                variance = float(np.sum(self._covariance[np.ix_(which, which)]))
-                friction[name] = float(np.sum(self._fit.x[which])), variance**0.5
+            if dry:
+                variance = float(np.sum(self._covariance[np.ix_(dry, dry)]))
+                friction[name] = float(np.sum(self._fit.x[dry])), variance**0.5
         return friction
 
 
-def _identifiability(variance: float, before: float) -> float:
-    return float(np.clip(1 - variance / before, 0.0, 1.0))
+def _identifiability(variance: float, prior_variance: float) -> float:
+    return float(np.clip(1 - variance / prior_variance, 0.0, 1.0))
 
 
 def base_parameter_estimates(
@@ -280,9 +280,9 @@ def base_parameter_estimates(
     """Returns the base parameters of the section's links with standard errors.
 
     Args:
-        arm: Arm, mounted as in the section.
+        arm: Arm with the gravity direction of the section.
         section: Identified dynamics.
-        covariance: Covariance of the parameters. The link parameters come first.
+        covariance: Covariance of the parameters, starting with the link parameters.
     """
     gravity = gravity_parameters(arm)
     B = gravity.combination_of([link.link for link in section.links])

@@ -12,7 +12,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-#: Largest number of exchanges of unknowns between the positive set and the zero set.
+#: Largest number of iterations that exchange unknowns between the positive set and the zero set.
 MAX_EXCHANGES = 10
 #: Indices of the nonzero columns of an actuator, and these columns (r, c).
 OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
@@ -23,9 +23,9 @@ class SquareSums:
     """Products [X tau]'[X tau] of every actuator, summed over some rows.
 
     Attributes:
-        size: k + 1, the number of columns with the measured effort, which is the last.
-        own: (n) indices of the nonzero columns of each actuator, with that of the effort.
-        blocks: (n) sums of products (c, c) of these columns.
+        size: Number k + 1 of columns. The last column is the measured effort.
+        own: Indices (c,) of the nonzero columns of each actuator, including the effort.
+        blocks: Sums of products (c, c) of these columns, for each actuator.
     """
 
     size: int
@@ -33,7 +33,7 @@ class SquareSums:
     blocks: tuple[NDArray[np.float64], ...]
 
     def weighted(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the sum (k + 1, k + 1) over the actuators, each multiplied by its weight."""
+        """Returns the sum (k + 1, k + 1) over the actuators with their weights (n,)."""
         sums = np.zeros((self.size, self.size))
         for weight, own, block in zip(weights, self.own, self.blocks, strict=True):
             sums[own[:, None], own] += weight * block
@@ -41,8 +41,8 @@ class SquareSums:
 
     def squares(self, combination: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the sum of squares (n,) of a linear combination (k + 1,) of the columns and the effort."""
-        parts = [combination[own] for own in self.own]
-        return np.array([max(x @ block @ x, 0.0) for x, block in zip(parts, self.blocks, strict=True)])
+        coefficients = [combination[own] for own in self.own]
+        return np.array([max(x @ block @ x, 0.0) for x, block in zip(coefficients, self.blocks, strict=True)])
 
     def squared_errors(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the sum of squared residuals (n,) for x (k,)."""
@@ -58,9 +58,9 @@ class NormalEquations:
     """Products [X tau]'[X tau] of every actuator, for every fold of a motion.
 
     Attributes:
-        size: As in `SquareSums`.
-        own: As in `SquareSums`.
-        products: (n) products (folds, 3, c, c). The three parts of a fold are its start, its middle and its end.
+        size: Number of columns, see `SquareSums`.
+        own: Indices of the nonzero columns of each actuator, see `SquareSums`.
+        products: Products (folds, 3, c, c) for each actuator, for the start, the middle and the end of each fold.
     """
 
     size: int
@@ -79,11 +79,11 @@ class NormalEquations:
         """Accumulates the products.
 
         Args:
-            columns: Columns of each of the n actuators.
-            size: k, the number of all columns.
-            tau: (r, n) measured efforts.
-            fold: (r,) fold of each row. By default there is one fold.
-            edge: (r, 2) masks of the rows at the start and at the end of their fold.
+            columns: Nonzero columns of each of the n actuators.
+            size: Number k of all columns.
+            tau: Measured efforts (r, n).
+            fold: Fold (r,) of each row. None means one fold.
+            edge: Masks (r, 2) of the rows at the start and at the end of their fold. None means no row.
         """
         fold = np.zeros(len(tau), dtype=int) if fold is None else fold
         edge = np.zeros((len(tau), 2), dtype=bool) if edge is None else edge
@@ -105,11 +105,11 @@ class NormalEquations:
         return self.products[0].shape[0]
 
     def others(self, first: int, count: int) -> NDArray[np.int_]:
-        """Returns the indices (folds - count,) of the folds that follow `count` folds from `first` on, cyclically."""
+        """Returns the indices (folds - count,) of the other folds, starting after the `count` folds from `first`."""
         return np.arange(first + count, first + self.folds) % self.folds
 
     def without(self, first: int, count: int) -> NormalEquations:
-        """Returns the products of the other folds, without the edges that adjoin the removed folds."""
+        """Returns the normal equations without `count` folds from `first`, and without the rows next to these folds."""
         products = tuple(p[self.others(first, count)] for p in self.products)
         for p in products:
             p[0, 0] = 0.0
@@ -118,31 +118,32 @@ class NormalEquations:
 
     @cached_property
     def total(self) -> SquareSums:
-        """Sums over the whole motion."""
+        """Sums over all rows of the motion."""
         return self._sums(p.sum(axis=(0, 1)) for p in self.products)
 
     def of_fold(self, fold: int, count: int = 1) -> SquareSums:
-        """Returns the sums over `count` folds from `fold` on."""
-        chosen = np.arange(fold, fold + count) % self.folds
-        return self._sums(p[chosen].sum(axis=(0, 1)) for p in self.products)
+        """Returns the sums over `count` adjacent folds, starting with `fold`."""
+        folds = np.arange(fold, fold + count) % self.folds
+        return self._sums(p[folds].sum(axis=(0, 1)) for p in self.products)
 
     def without_fold(self, fold: int, count: int = 1) -> SquareSums:
-        """Returns the sums over all rows except those of `count` folds and the adjoining edges of their neighbours."""
+        """Returns the sums over all rows, excluding `count` folds from `fold` and the rows next to these folds."""
         before, after = (fold - 1) % self.folds, (fold + count) % self.folds
-        out = self.of_fold(fold, count).blocks
-        blocks = zip(self.total.blocks, out, self.products, strict=True)
-        return self._sums(whole - own - p[before, 2] - p[after, 0] for whole, own, p in blocks)
+        excluded = self.of_fold(fold, count).blocks
+        blocks = zip(self.total.blocks, excluded, self.products, strict=True)
+        return self._sums(total - held_out - p[before, 2] - p[after, 0] for total, held_out, p in blocks)
 
     def _sums(self, blocks: Iterable[NDArray[np.float64]]) -> SquareSums:
         return SquareSums(self.size, self.own, tuple(blocks))
 
 
 class NonNegativeFit:
-    """Weighted non-negative least squares for one set of unknowns, or for this set and one more.
+    """Weighted non-negative least squares for a set of unknowns, optionally with one additional unknown.
 
     The solution x (k,) minimises |y|^2 - 2 y' X x + x' (X' X + diag(precision)) x. Unknowns without a sign constraint
-    are eliminated first, which leaves the Schur complement of the others. One more unknown adds one row to it, or one
-    step of elimination. The rest is a small non-negative least-squares problem.
+    are eliminated first, which leaves the Schur complement of the constrained unknowns. An additional unknown adds one
+    row to the complement if it is constrained, otherwise one elimination step. The result is a small non-negative
+    least-squares problem.
     """
 
     def __init__(
@@ -151,21 +152,23 @@ class NonNegativeFit:
         precision: NDArray[np.float64],
         non_negative: NDArray[np.bool_],
         used: NDArray[np.int_],
-        others: NDArray[np.int_] | None = None,
+        candidates: NDArray[np.int_] | None = None,
     ) -> None:
         """Eliminates the unknowns without a sign constraint.
 
         Args:
-            sums: (k + 1, k + 1) weighted sums of squares and products, the measured effort last.
-            precision: (k,) reciprocal prior variance of each unknown about 0, positive.
-            non_negative: (k,) mask of the unknowns that must not be negative.
-            used: Indices of the unknowns. All others are 0.
-            others: Indices of the unknowns that `solve` may add.
+            sums: Weighted sums of products (k + 1, k + 1). The last column is the measured effort.
+            precision: Reciprocal prior variances (k,) of the unknowns about 0, positive.
+            non_negative: Mask (k,) of the unknowns that must not be negative.
+            used: Indices of the unknowns in the fit. The remaining elements of x are 0.
+            candidates: Indices of the unknowns that `solve` may add, or None.
         """
         self._scale = np.append(1 / np.sqrt(np.diag(sums)[:-1] + precision), 1.0)
-        self._free, bound = used[~non_negative[used]], used[non_negative[used]]
-        self._bound, self._non_negative = np.arange(len(bound)), non_negative
-        self._rest = np.concatenate([bound, [] if others is None else others, [len(precision)]]).astype(int)
+        self._free, constrained = used[~non_negative[used]], used[non_negative[used]]
+        self._constrained, self._non_negative = np.arange(len(constrained)), non_negative
+        self._remaining = np.concatenate(
+            [constrained, [] if candidates is None else candidates, [len(precision)]]
+        ).astype(int)
 
         def scaled(rows: NDArray[np.int_], columns: NDArray[np.int_]) -> NDArray[np.float64]:
             return sums[rows[:, None], columns] * self._scale[rows, None] * self._scale[columns]
@@ -173,41 +176,41 @@ class NonNegativeFit:
         H = scaled(self._free, self._free)
         H[np.diag_indices_from(H)] = 1.0
         self._factor = scipy.linalg.cholesky(H, lower=True, check_finite=False)
-        self._coupling = _solve_lower(self._factor, scaled(self._free, self._rest))
-        S = scaled(self._rest, self._rest)
+        self._coupling = _solve_lower(self._factor, scaled(self._free, self._remaining))
+        S = scaled(self._remaining, self._remaining)
         S[np.diag_indices(len(S) - 1)] = 1.0
         self._schur = S - self._coupling.T @ self._coupling
-        self._positive = np.ones(len(bound), dtype=bool)
-        self._positive = self._minimum(self._schur, self._bound) > 0
+        self._positive = np.ones(len(constrained), dtype=bool)
+        self._positive = self._minimum(self._schur, self._constrained) > 0
 
     def solve(self, added: int | None = None) -> NDArray[np.float64]:
-        """Returns x (k,), optionally with one of `others` added."""
-        S, bound = self._schur, self._bound
-        y = np.zeros(len(self._rest))
+        """Returns x (k,), with the candidate `added` in the fit unless it is None."""
+        S, constrained = self._schur, self._constrained
+        y = np.zeros(len(self._remaining))
         if added is not None:
-            j = int(np.flatnonzero(self._rest == added)[0])
+            j = int(np.flatnonzero(self._remaining == added)[0])
             if self._non_negative[added]:
-                bound = np.append(bound, j)
+                constrained = np.append(constrained, j)
             else:
                 S = S - np.outer(S[j], S[j] / S[j, j])
-        y[bound] = self._minimum(S, bound)
+        y[constrained] = self._minimum(S, constrained)
         if added is not None and not self._non_negative[added]:
             y[j] = (self._schur[j, -1] - self._schur[j] @ y) / self._schur[j, j]
         y[-1] = -1.0
         x = np.zeros(len(self._scale))
-        x[self._rest] = y
+        x[self._remaining] = y
         x[self._free] = scipy.linalg.solve_triangular(
             self._factor, -self._coupling @ y, lower=True, trans=1, check_finite=False
         )
         return (x * self._scale)[:-1]
 
-    def _minimum(self, S: NDArray[np.float64], bound: NDArray[np.int_]) -> NDArray[np.float64]:
+    def _minimum(self, S: NDArray[np.float64], constrained: NDArray[np.int_]) -> NDArray[np.float64]:
         """Returns y >= 0 that minimises y' S y / 2 - b' y, starting from the current positive set.
 
-        All unknowns with a wrong sign, or with a wrong slope at 0, change sets at once (Portugal, Judice and Vicente,
-        1994). This takes a few solutions. If it cycles, the method of Lawson and Hanson is used.
+        In each iteration, all unknowns with a wrong sign, or with a wrong slope at 0, change to the other set
+        (Portugal, Judice and Vicente, 1994). If this does not converge, the method of Lawson and Hanson is used.
         """
-        H, b = S[bound[:, None], bound], S[bound, -1]
+        H, b = S[constrained[:, None], constrained], S[constrained, -1]
         positive = np.append(self._positive, np.ones(len(b) - len(self._positive), dtype=bool))
         for _ in range(MAX_EXCHANGES):
             y = np.zeros(len(b))

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 
-#: Least reduction of the cross-validated relative error, averaged over the actuators, for adding an effect. Smaller
-#: gains are due to chance: on the public motions they select different effects in different phases, and the errors on
-#: held-out phases increase.
+#: Smallest reduction of the cross-validated relative error, averaged over the actuators, for adding an effect. Smaller
+#: gains are due to chance: on the public motions, they add other effects in other phases and increase the errors on
+#: held-out phases.
 MIN_GAIN = 0.005
-#: Number of the most promising effects that are evaluated at every step.
-TRIALS = 8
-#: Least relative error of an actuator that the weights assume.
+#: Number of candidate effects that are cross-validated in each step.
+NUM_TRIALS = 8
+#: Smallest relative error of an actuator that the weights assume.
 MIN_ERROR = 0.02
 
 
@@ -26,13 +26,15 @@ class StepwiseSelection:
     """Stepwise selection of effects on one motion, in unknowns with prior mean 0.
 
     Attributes:
-        equations: Normal equations. The columns are the rigid-body unknowns, the effects and the remaining effort.
-        efforts: (folds, n) sums of squares of the measured efforts.
-        rows: (folds,) numbers of rows.
+        equations: Normal equations with columns for the rigid-body unknowns, the effects and the tilt. The efforts are
+            measured minus nominal efforts.
+        efforts: Sums of squares (folds, n) of the measured efforts.
+        rows: Numbers of rows (folds,).
         num_rigid: Number of rigid-body unknowns.
-        precision: (k,) reciprocal prior variances of all unknowns.
-        non_negative: (k,) mask of the unknowns that must not be negative.
-        independent: Share of the rows that are independent measurements of an actuator's effort.
+        precision: Reciprocal prior variances (k,) of all unknowns.
+        non_negative: Mask (k,) of the unknowns that must not be negative.
+        independent: Share of the rows that are independent measurements of an effort.
+        weights: Weights (n,) of the squared errors of the actuators, updated by `fit`.
     """
 
     equations: NormalEquations
@@ -46,20 +48,20 @@ class StepwiseSelection:
     def __post_init__(self) -> None:
         equations = self.equations
         self._total = equations.total
-        self._learnt = [equations.without_fold(fold) for fold in range(equations.folds)]
-        self._predicted = [equations.of_fold(fold) for fold in range(equations.folds)]
+        self._training = [equations.without_fold(fold) for fold in range(equations.folds)]
+        self._held_out = [equations.of_fold(fold) for fold in range(equations.folds)]
         self._efforts = np.sum(self.efforts, axis=0)
         self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
 
     def without(self, first: int, count: int) -> StepwiseSelection:
-        """Returns the selection without `count` folds from `first` on."""
+        """Returns the selection without the `count` folds that begin at `first`."""
         kept = self.equations.others(first, count)
         return replace(
             self, equations=self.equations.without(first, count), efforts=self.efforts[kept], rows=self.rows[kept]
         )
 
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns all unknowns (k,), 0 for excluded effects, and updates the weights from the residuals."""
+        """Returns the estimates (k,) of all unknowns, 0 for excluded effects, and updates `weights`."""
         for _ in range(3):
             x = self._fit_to(self._total.weighted(self.weights), effects).solve()
             self.weights = self._weights(self._total.squared_errors(x) / self._efforts)
@@ -70,66 +72,72 @@ class StepwiseSelection:
         return np.asarray(np.sqrt(self._total.squared_errors(x) / self._efforts))
 
     def cross_validated(self, effects: NDArray[np.int_], candidates: Sequence[int] = ()) -> tuple[float, list[float]]:
-        """Returns the cross-validated error with `effects`, and with each candidate added, for the current weights.
+        """Returns the cross-validated relative error with `effects`, and the errors with one candidate added.
 
-        The error is relative, and averaged over the actuators.
+        The errors are means over the actuators, for the current weights.
         """
         squares = np.zeros((1 + len(candidates), len(self._efforts)))
         added = [None, *(self.num_rigid + k for k in candidates)]
-        for learnt, predicted in zip(self._learnt, self._predicted, strict=True):
-            fit = self._fit_to(learnt.weighted(self.weights), effects, np.array(candidates, dtype=int))
-            squares += [predicted.squared_errors(fit.solve(k)) for k in added]
+        for training, held_out in zip(self._training, self._held_out, strict=True):
+            fit = self._fit_to(training.weighted(self.weights), effects, np.array(candidates, dtype=int))
+            squares += [held_out.squared_errors(fit.solve(k)) for k in added]
         error, *errors = np.mean(np.sqrt(squares / self._efforts), axis=1).tolist()
         return error, errors
 
-    def choose(
-        self, start: NDArray[np.int_], candidates: NDArray[np.int_], report: Callable[[float], object] = lambda _: None
+    def select(
+        self,
+        mandatory: NDArray[np.int_],
+        candidates: NDArray[np.int_],
+        progress: Callable[[float], object] = lambda _: None,
     ) -> NDArray[np.int_]:
-        """Adds candidates to `start` while the gain is at least `MIN_GAIN`, then drops those that are no longer useful.
+        """Adds candidates while the gain is at least `MIN_GAIN`, then removes candidates with a small gain.
 
         Args:
-            start: Indices of the effects to start from, counted from 0.
-            candidates: Indices of the effects that may be added, counted from 0.
-            report: Callback that receives the estimated share of the work that is done.
+            mandatory: Indices of the effects that are always included, starting at 0.
+            candidates: Indices of the effects that may be added, starting at 0.
+            progress: Callback that receives the estimated finished share, 0 to 1.
+
+        Returns:
+            Indices (f,) of the mandatory and the added effects.
         """
-        chosen = start
+        selected = mandatory
         for step in itertools.count():
-            report(1 - 0.85**step)
-            self.fit(chosen)
-            tries = self._promising(chosen, np.setdiff1d(candidates, chosen))
-            best, errors = self.cross_validated(chosen, tries.tolist())
+            progress(1 - 0.85**step)
+            self.fit(selected)
+            trials = self._best_candidates(selected, np.setdiff1d(candidates, selected))
+            best, errors = self.cross_validated(selected, trials.tolist())
             if not errors or min(errors) > best - MIN_GAIN:
                 break
-            chosen = np.union1d(chosen, tries[[np.argmin(errors)]])
-        for k in np.intersect1d(candidates, chosen):
-            without = np.setdiff1d(chosen, [k])
+            selected = np.union1d(selected, trials[[np.argmin(errors)]])
+        for k in np.intersect1d(candidates, selected):
+            without = np.setdiff1d(selected, [k])
             error, _ = self.cross_validated(without)
             if error < best + MIN_GAIN / 2:
-                chosen, best = without, error
-        return chosen
+                selected, best = without, error
+        return selected
 
-    def _promising(self, chosen: NDArray[np.int_], open_: NDArray[np.int_]) -> NDArray[np.int_]:
-        """Returns the open effects that reduce the sum of squares most, without sign constraints."""
-        used, new = self._index(chosen), self.num_rigid + open_
+    def _best_candidates(self, selected: NDArray[np.int_], candidates: NDArray[np.int_]) -> NDArray[np.int_]:
+        """Returns the `NUM_TRIALS` candidates that reduce the sum of squares most, without sign constraints."""
+        used, new = self._index(selected), self.num_rigid + candidates
         sums = self._total.weighted(self.weights)
-        x = self._fit_to(sums, chosen).solve()
+        x = self._fit_to(sums, selected).solve()
         residual = (sums[:-1, -1] - sums[:-1, :-1] @ x)[new]
         H = sums[np.ix_(used, used)] + np.diag(self.precision[used])
         explained = np.einsum("ij,ij->j", sums[np.ix_(used, new)], np.linalg.solve(H, sums[np.ix_(used, new)]))
         gain = residual**2 / (np.diag(sums)[new] + self.precision[new] - explained)
-        return open_[np.argsort(-gain)[:TRIALS]]
+        return candidates[np.argsort(-gain)[:NUM_TRIALS]]
 
     def _index(self, effects: NDArray[np.int_]) -> NDArray[np.int_]:
         return np.concatenate([np.arange(self.num_rigid), self.num_rigid + np.sort(effects)])
 
     def _fit_to(
-        self, sums: NDArray[np.float64], effects: NDArray[np.int_], others: NDArray[np.int_] | None = None
+        self, sums: NDArray[np.float64], effects: NDArray[np.int_], candidates: NDArray[np.int_] | None = None
     ) -> NonNegativeFit:
-        """Returns the fit to weighted sums. `others` are effects that may be added."""
-        new = None if others is None else self.num_rigid + others
+        """Returns the fit to weighted sums (k + 1, k + 1) with `effects`, to which `candidates` may be added."""
+        new = None if candidates is None else self.num_rigid + candidates
         return NonNegativeFit(sums, self.precision, self.non_negative, self._index(effects), new)
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the reciprocal variances of independent measurements, from the squared relative errors."""
+        """Returns the weights (n,) of the actuators for their squared relative errors (n,)."""
         variance = np.maximum(squared, MIN_ERROR**2) * self._efforts / np.sum(self.rows)
         return np.asarray(self.independent / variance)

@@ -1,4 +1,4 @@
-"""Validates a dynamic model on a motion and splits its error into kinds."""
+"""Validates a dynamic model on a motion and divides its error into causes."""
 
 from __future__ import annotations
 
@@ -15,21 +15,27 @@ from dvrk_drake.analysis.verdict import judge, rule_text
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.recordings.recording import Recording
 
-#: Width of the smoothed sign function of the friction-like error, as a share of the RMS speed.
+#: Width of the smoothed sign function of the friction-like error, as a share of the RMS velocity.
 _FRICTION_WIDTH = 0.1
-#: Number of harmonics over the travel of the joint in the position-dependent error.
+#: Number of harmonics of the actuator position in the position-dependent error.
 _HARMONICS = 2
 
 
 @dataclass(frozen=True)
 class ActuatorError:
-    """Error of one actuator over a motion after low-pass filtering, RMS in N m (N if prismatic).
+    """RMS effort error of one actuator over a motion, after low-pass filtering.
 
-    `relative_error` is rms_error / rms_effort, None if nothing was measured. The next four fields are shares of
-    rms_error^2. `bias` is the share of the mean error. `friction_like` is the further share that viscous and Coulomb
-    friction in the actuator explain. `position_dependent` is the further share that two harmonics over the travel
-    explain. `other` is the remainder. `repeatability` is the relative difference between periods, None if the motion
-    does not repeat. For `verdict` see `judge`.
+    Attributes:
+        name: Name of the joint of the actuator.
+        rms_effort: RMS measured effort [N m, N if prismatic].
+        rms_error: RMS of measured minus predicted effort [N m, N if prismatic].
+        relative_error: rms_error / rms_effort [1], None if the effort is 0.
+        bias: Share of rms_error^2 due to the mean error.
+        friction_like: Additional share that is explained by viscous and Coulomb friction in the actuator.
+        position_dependent: Additional share that is explained by two harmonics of the position over its range.
+        other: Remaining share.
+        repeatability: Relative RMS difference of the efforts between periods [1], None if the motion does not repeat.
+        verdict: Verdict on the actuator, see `judge`.
     """
 
     name: str
@@ -51,11 +57,11 @@ class DynamicValidation(Validation):
     Attributes:
         actuators: Errors of the actuators, in the arm's order.
         cut_off: Cut-off of the low-pass filter of the compared efforts [Hz].
-        t: (r,) times of the compared rows [s]. One second at each end is omitted because of filter transients.
-        q: (r, n) positions of the actuators.
-        v: (r, n) velocities of the actuators.
-        measured: (r, n) measured efforts of the actuators after low-pass filtering.
-        predicted: (r, n) predicted efforts of the actuators after low-pass filtering.
+        t: Times (r,) of the compared rows [s]. One second at each end is omitted because of filter transients.
+        q: Positions (r, n) of the actuators [rad, m].
+        v: Velocities (r, n) of the actuators [rad/s, m/s].
+        measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
+        predicted: Predicted efforts (r, n) of the actuators after low-pass filtering [N m, N].
     """
 
     actuators: list[ActuatorError]
@@ -83,7 +89,7 @@ class DynamicValidation(Validation):
         return {actuator.name: actuator.relative_error for actuator in self.actuators}
 
     def as_dict(self) -> dict:
-        """Returns what `validate --json` writes."""
+        """Returns the data of `validate --json`."""
         return {
             "verdict": self.verdict,
             "rule": rule_text(in_motion=True),
@@ -95,7 +101,7 @@ class DynamicValidation(Validation):
 
 
 def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
-    """Predicts the efforts (m, n) of the actuators at all rows of a motion, low-pass filtered as in the identification.
+    """Returns the predicted efforts (m, n) of the actuators at all rows of a motion, after the low-pass filter.
 
     Raises:
         RecordingError: The recording does not fit the arm, or is not a motion.
@@ -120,7 +126,7 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     arm = model.arm
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     grid = motion_grid(recording, arm, dynamics.section.signals)
-    measured, predicted = grid.behind_filter(tau), grid.behind_filter(_efforts(model, grid))
+    measured, predicted = grid.filter_efforts(tau), grid.filter_efforts(_efforts(model, grid))
     a = grid.efforts_at_rows(arm.transmission.position(grid.q))[grid.inner]
     v = grid.efforts_at_rows(arm.transmission.velocity(grid.v))[grid.inner]
     period = period_of(grid)
@@ -170,14 +176,16 @@ def _actuator_error(
     ]
     shares = []
     columns: list[NDArray[np.float64]] = []
-    whole = left = float(np.sum(error**2)) or 1.0
+    total = unexplained = float(np.sum(error**2)) or 1.0
     for kind in kinds:
         columns += kind
         X = np.column_stack(columns)
-        rest = float(np.sum((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2))
-        shares.append((left - rest) / whole)
-        left = rest
+        remaining = float(np.sum((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2))
+        shares.append((unexplained - remaining) / total)
+        unexplained = remaining
     bias, friction, position = shares
     relative = size / effort if effort > 0 else None
     verdict = judge(effort, size, effort_limit, in_motion=True)
-    return ActuatorError(name, effort, size, relative, bias, friction, position, left / whole, repeatability, verdict)
+    return ActuatorError(
+        name, effort, size, relative, bias, friction, position, unexplained / total, repeatability, verdict
+    )

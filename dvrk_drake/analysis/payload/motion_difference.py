@@ -1,4 +1,4 @@
-"""Difference between the efforts of two recordings of the same motion, after alignment in time."""
+"""Computes the difference between the efforts of two recordings of the same motion, after alignment in time."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from dvrk_drake.recordings.recording import Recording
 class Whitening:
     """Whitening filter x[t] - sum_k coefficients[k - 1] x[t - k step] for each channel.
 
-    The step is half a period of the cut-off frequency of the low-pass filter of the rows. Sampling at this spacing
-    contains their full bandwidth and nothing above it.
+    The step is half a period of the cut-off frequency of the low-pass filter. Sampling at this interval contains the
+    full bandwidth of the filtered rows.
 
     Attributes:
-        coefficients: Coefficients (n, order) of each channel. Zeros leave the channel unchanged.
+        coefficients: Coefficients (n, order) of the channels.
         step: Number of rows between the values that are combined.
     """
 
@@ -34,12 +34,19 @@ class Whitening:
 
     @classmethod
     def none(cls, channels: int) -> Whitening:
-        """Returns the whitening filter that leaves white rows unchanged."""
+        """Returns a filter that does not change its input."""
         return cls(np.zeros((channels, 0)), 1)
 
     @classmethod
     def of(cls, residual: NDArray[np.float64], order: int, rate: float, cut_off: float) -> Whitening:
-        """Fits the autoregression of residuals (r, n), filtered at `cut_off` [Hz] and sampled at `rate` [Hz]."""
+        """Fits an autoregression to residuals.
+
+        Args:
+            residual: Residuals (r, n), low-pass filtered.
+            order: Order of the autoregression.
+            rate: Sampling rate [Hz].
+            cut_off: Cut-off of the low-pass filter [Hz].
+        """
         step = max(1, round(rate / (2 * cut_off)))
         coefficients = []
         for x in residual.T:
@@ -48,15 +55,15 @@ class Whitening:
         return cls(np.array(coefficients), step)
 
     @property
-    def lost(self) -> int:
-        """Number of rows at the start that are removed because they have no preceding rows."""
+    def num_removed(self) -> int:
+        """Number of rows at the start that the filter removes, because they have no preceding rows."""
         return self.coefficients.shape[1] * self.step
 
     def __call__(self, x: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
-        """Returns the filtered rows (r - lost, ...) for the rows x (r, ...) of one channel."""
-        y = x[self.lost :].copy()
+        """Returns the filtered rows (r - num_removed, ...) for the rows x (r, ...) of one channel."""
+        y = x[self.num_removed :].copy()
         for k, a in enumerate(self.coefficients[channel], start=1):
-            y -= a * x[self.lost - k * self.step : len(x) - k * self.step]
+            y -= a * x[self.num_removed - k * self.step : len(x) - k * self.step]
         return y
 
 
@@ -64,38 +71,37 @@ class Whitening:
 MAX_SHIFT = 5.0
 #: Smallest duration of the motion that both recordings must contain [s].
 MIN_OVERLAP = 5.0
-#: Cut-off frequency of the low-pass filter of the difference [Hz]. The effort of a payload is as slow as the motion,
-#: and the rest is noise.
+#: Largest cut-off frequency of the low-pass filter of the difference [Hz]. Efforts of a payload have the frequencies of
+#: the motion, which are lower.
 CUT_OFF = 5.0
 #: Expected change of position-dependent torques as a share of an actuator's RMS effort. Between two days of a PSM
-#: without payload it is 0.4 to 9 % for the actuators, with an RMS of 5.6 % (psm_one, psm_one_no_weight of
-#: docs/public_recordings.md).
+#: without payload, the RMS over the actuators is 5.6 % (psm_one and psm_one_no_weight of docs/public_recordings.md).
 DRIFT = 0.06
-#: Number of linear segments of a position-dependent torque over an actuator's range. Joint stops and folds of cables
-#: have local effects.
-PIECES = 8
+#: Number of linear segments of a position-dependent torque over an actuator's range. Many segments are necessary,
+#: because joint stops and cables have local effects.
+NUM_SEGMENTS = 8
 #: Correlation length of a position-dependent torque as a share of the range.
-CORRELATED = 0.25
-#: Number of columns of `changes` without prior: offset, Coulomb friction and viscous friction.
-_SIMPLE = 3
+CORRELATION_LENGTH = 0.25
+#: Number of columns of `changes` without prior: offset, dry friction and viscous friction.
+_NUM_WITHOUT_PRIOR = 3
 #: Step of the search before refinement [s].
 _STEP = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class MotionDifference:
-    """Difference from a reference to another recording of the same motion.
+    """Difference of the efforts of two recordings of the same motion, a second recording minus a reference.
 
     Attributes:
-        grid: Grid of the other motion.
-        rows: Indices or mask (r,) of its inner rows that have a counterpart in the reference.
-        period: Period of a repeating motion [s], or None.
-        shift: Time shift [s]. The other motion at t corresponds to the reference at t + shift.
-        tau: Filtered difference of the efforts of the actuators (k, n) [N m, N], other minus reference. The difference
-            predicted by the model for the small differences of the two motions is subtracted.
-        changes: Columns (k, n, c) for possible changes of each drive: an offset, Coulomb and viscous friction, and
-            position-dependent torques (cables, springs, a joint stop), which are piecewise linear.
-        deviation: Prior standard deviations (n, c) of the changes as RMS efforts [N m, N], inf where there is no prior.
+        grid: Resampled motion of the second recording.
+        rows: Mask (r,) of the inner rows of `grid` that the reference also contains. It selects k rows.
+        period: Period of the motion [s], or None if it does not repeat.
+        shift: Time shift [s]. Time t of the second recording corresponds to time t + shift of the reference.
+        tau: Low-pass filtered difference (k, n) of the actuator efforts [N m, N]. The model predicts the effect of the
+            small differences of the two motions, which is subtracted.
+        changes: Columns (k, n, c) for possible changes of each drive: an offset, dry and viscous friction, and
+            piecewise linear position-dependent torques (cables, springs, joint stops).
+        deviation: Prior standard deviations (n, c) of the changes as RMS efforts [N m, N], inf if there is no prior.
     """
 
     grid: MotionGrid
@@ -113,7 +119,7 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
     Args:
         reference: Recording of the motion before the change, in joint or actuator coordinates.
         other: Recording of the same motion after the change, in joint or actuator coordinates.
-        model: Model of the arm before the change. It is only used for the small differences of the motions.
+        model: Model of the arm before the change. It predicts the effect of small differences of the two motions.
 
     Raises:
         RecordingError: A recording is not a motion of this arm, an effort has the wrong sign, or the recordings are not
@@ -121,89 +127,87 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
     """
     signals = model.section.signals
     settings = replace(signals, effort_cut_off=min(CUT_OFF, signals.effort_cut_off))
-    before, grid = (motion_grid(recording, model.arm, settings) for recording in (reference, other))
+    reference_grid, grid = (motion_grid(recording, model.arm, settings) for recording in (reference, other))
     period = period_of(grid)
-    shift = _shift(before, grid, period, other)
+    shift = _shift(reference_grid, grid, period, other)
     expected = drive_efforts(model, grid)
-    (tau, left), (_, left_before) = (
-        _efforts(reference_or_other, own, efforts, model)
-        for reference_or_other, own, efforts in (
-            (other, grid, expected),
-            (reference, before, drive_efforts(model, before)),
-        )
-    )
-    t, t_before = grid.row_times[grid.inner] + shift, before.row_times[before.inner]
-    rows = (t >= t_before[0]) & (t <= t_before[-1])
+    tau, residual = _efforts(other, grid, expected, model)
+    _, reference_residual = _efforts(reference, reference_grid, drive_efforts(model, reference_grid), model)
+    t, reference_t = grid.row_times[grid.inner] + shift, reference_grid.row_times[reference_grid.inner]
+    rows = (t >= reference_t[0]) & (t <= reference_t[-1])
     changes = _changes(model, grid, expected)[rows]
     size = np.sqrt(np.mean(tau**2, axis=0))
     deviation = np.full(changes.shape[1:], np.inf)
-    parts = np.sqrt(np.mean(changes[..., _SIMPLE:] ** 2, axis=0))
-    deviation[:, _SIMPLE:] = DRIFT * size[:, None] * parts / np.linalg.norm(parts, axis=1, keepdims=True)
-    change = left[rows] - _at(t_before, left_before, t[rows])
+    sizes = np.sqrt(np.mean(changes[..., _NUM_WITHOUT_PRIOR:] ** 2, axis=0))
+    deviation[:, _NUM_WITHOUT_PRIOR:] = DRIFT * size[:, None] * sizes / np.linalg.norm(sizes, axis=1, keepdims=True)
+    change = residual[rows] - _interpolate(reference_t, reference_residual, t[rows])
     return MotionDifference(grid, rows, period, shift, change, changes, deviation)
 
 
 def _efforts(
     recording: Recording, grid: MotionGrid, expected: DriveEfforts, model: DynamicModel
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the filtered efforts of the actuators (r, n), measured and minus those predicted by the model."""
-    tau = grid.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort())
+    """Returns the measured efforts (r, n) and the residuals (r, n) of the model, after low-pass filtering."""
+    tau = grid.filter_efforts(recording.in_actuator_coordinates(model.arm).measured_effort())
     refuse_opposite_efforts(recording, model.arm.joint_names, tau, expected.total())
     return tau, tau - expected.total()
 
 
 def _changes(model: DynamicModel, grid: MotionGrid, expected: DriveEfforts) -> NDArray[np.float64]:
-    """Returns the columns (r, n, 3 + PIECES + 1) for changes of the drives at the inner rows."""
+    """Returns the columns (r, n, c) for changes of the drives at the inner rows, see `MotionDifference.changes`."""
     transmission = model.arm.transmission
-    speed = grid.behind_filter(grid.efforts_at_rows(transmission.velocity(grid.v)))
+    velocity = grid.filter_efforts(grid.efforts_at_rows(transmission.velocity(grid.v)))
     a = transmission.position(grid.q)
     shapes = np.stack([_shapes(x) for x in a.T], axis=1)
-    flat = grid.behind_filter(np.stack([grid.at_rows(shapes[:, i], i) for i in range(a.shape[1])], axis=1))
-    simple = np.stack([np.ones_like(speed), expected.friction_part("dry"), speed], axis=2)
-    return np.concatenate([simple, flat], axis=2)
+    position_dependent = grid.filter_efforts(
+        np.stack([grid.at_rows(shapes[:, i], i) for i in range(a.shape[1])], axis=1)
+    )
+    without_prior = np.stack([np.ones_like(velocity), expected.friction_part("dry"), velocity], axis=2)
+    return np.concatenate([without_prior, position_dependent], axis=2)
 
 
 def _shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns basis functions (m, PIECES + 1) at positions (m,).
+    """Returns basis functions (m, NUM_SEGMENTS + 1) at positions (m,).
 
-    With independent weights their sum is linear between knots, and adjacent knots are correlated. It is a Gaussian
-    process over the range with a squared-exponential kernel.
+    For independent coefficients, their sum is a Gaussian process over the range with a squared-exponential kernel,
+    interpolated linearly between knots.
     """
-    place = (x - np.min(x)) / max(float(np.ptp(x)), np.finfo(float).tiny)
-    knots = np.linspace(0.0, 1.0, PIECES + 1)
-    hats = np.maximum(1 - PIECES * np.abs(place[:, None] - knots), 0.0)
-    kernel = np.exp(-0.5 * ((knots[:, None] - knots) / CORRELATED) ** 2)
+    scaled = (x - np.min(x)) / max(float(np.ptp(x)), np.finfo(float).tiny)
+    knots = np.linspace(0.0, 1.0, NUM_SEGMENTS + 1)
+    hats = np.maximum(1 - NUM_SEGMENTS * np.abs(scaled[:, None] - knots), 0.0)
+    kernel = np.exp(-0.5 * ((knots[:, None] - knots) / CORRELATION_LENGTH) ** 2)
     values, vectors = np.linalg.eigh(kernel)
     return np.asarray(hats @ (vectors * np.sqrt(np.maximum(values, 0.0))))
 
 
-def _at(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolate(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
     different = np.concatenate([[True], np.diff(t) > 0])
     return np.asarray(PchipInterpolator(t[different], x[different], axis=0)(times), dtype=float)
 
 
 def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recording: Recording) -> float:
-    """Returns the shift at which the positions, in units of their standard deviations, agree best."""
+    """Returns the time shift [s] with the smallest difference of the positions, scaled by their standard deviations."""
     deviation = np.std(other.q, axis=0)
     moving = deviation > 1e-3
     x, y = (grid.q[:, moving] / deviation[moving] for grid in (reference, other))
     step = round(_STEP * GRID_RATE)
     start = other.t[0] - reference.t[0]
 
-    def apart(shift: int) -> float:
+    def distance(shift: int) -> float:
         """Returns half the mean squared difference between x[i + shift] and y[i]."""
         first, last = max(0, -shift), min(len(y), len(x) - shift)
         if last - first < MIN_OVERLAP * GRID_RATE:
             return np.inf
         return float(np.mean((x[first + shift : last + shift : step] - y[first:last:step]) ** 2)) / 2
 
-    reach = round((MAX_SHIFT if period is None else period / 2) * GRID_RATE)
-    coarse = min(range(-reach, reach + 1, step), key=apart)
-    best = min(range(coarse - step, coarse + step + 1), key=apart)
-    if not apart(best) < SAME_MOTION**2:
+    max_shift = round((MAX_SHIFT if period is None else period / 2) * GRID_RATE)
+    coarse = min(range(-max_shift, max_shift + 1, step), key=distance)
+    best = min(range(coarse - step, coarse + step + 1), key=distance)
+    if not distance(best) < SAME_MOTION**2:
         raise RecordingError(
-            f"{recording.source or 'recording'}: is not the motion of the reference: at the best alignment positions "
-            f"differ by {np.sqrt(apart(best)):.0%} of their standard deviation; at most {SAME_MOTION:.0%} is allowed"
+            f"{recording.source or 'recording'}: the motion differs from the reference. After alignment in time, the "
+            f"positions differ by {100 * np.sqrt(distance(best)):.0f} % of their standard deviation; at most "
+            f"{100 * SAME_MOTION:.0f} % is allowed."
         )
     inner = y[max(0, -best) + 1 : min(len(y), len(x) - best) - 1]
     at = np.arange(max(0, -best) + 1, max(0, -best) + 1 + len(inner)) + best

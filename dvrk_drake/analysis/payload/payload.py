@@ -28,13 +28,13 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Confidence level of the reported intervals.
 CONFIDENCE = 0.95
-#: Links whose cross-validation error is within this factor of the smallest explain the recording equally well.
+#: Largest ratio of cross-validated errors of links that explain the change equally well.
 SAME_ERROR = 1.05
-#: Recordings whose efforts differ by less than this share are identical.
+#: Smallest relative RMS difference between the efforts of two different recordings.
 MIN_DIFFERENCE = 1e-6
-#: Order of the autoregression that whitens the errors, and the number of times it is fitted.
-AUTOREGRESSION, WHITENED = 2, 2
-#: Smallest load of an actuator by the payload, as a share of the difference of its efforts, for it to be used.
+#: Order of the autoregression that whitens the errors, and number of times that it is fitted.
+AUTOREGRESSION_ORDER, NUM_WHITENING_ITERATIONS = 2, 2
+#: Smallest RMS effort of the payload on an actuator that it loads, as a share of the RMS difference of the efforts.
 MIN_LOAD = 1e-6
 
 
@@ -45,9 +45,9 @@ class PayloadActuator:
     Attributes:
         name: Name of the joint of the actuator.
         change: Difference between the recordings.
-        payload: Part that is explained by the payload.
-        left: Residual that neither the payload nor changes of the drive explain.
-        explained: 1 - left^2 / change^2, or None if the payload does not load the actuator.
+        payload: Effort of the payload.
+        left: Residual after subtracting the payload and the changes of the drive.
+        explained: 1 - left^2 / change^2 [1], or None if the payload does not load the actuator.
     """
 
     name: str
@@ -59,18 +59,18 @@ class PayloadActuator:
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Point mass on a link.
+    """Estimate of a payload, modelled as a point mass on a link.
 
     Attributes:
         link: Name of the link that carries the payload.
         body: Mass [kg] and position in the link frame [m].
         mass_error: Standard error of the mass [kg].
-        place_error: Standard errors (3,) of the position [m], nan for coordinates that are not identifiable.
-        quantile: Half the width of the interval of `CONFIDENCE`, in standard errors.
-        largest_at_com: Upper end of the interval of a mass that is at the link's own centre of mass [kg].
-        place_in_base: Position (3,) in the base frame with all joints at 0 [m].
-        left_out: RMS error of cross-validation over the phase of the motion, divided by the error without a payload.
-            Geometric mean over the actuators.
+        position_error: Standard errors (3,) of the position [m], nan for coordinates that are not identifiable.
+        quantile: Half-width of the confidence interval (`CONFIDENCE`), in standard errors.
+        largest_at_com: Upper end of the confidence interval of a mass at the link's own centre of mass [kg].
+        position_in_base: Position (3,) in the base frame with all joints at 0 [m].
+        relative_error: Cross-validated RMS error over the phase of the motion, divided by the error without a payload
+            [1]. Geometric mean over the actuators.
         actuators: Efforts of the actuators, in the arm's order.
         shift: Time shift between the two recordings [s].
     """
@@ -78,43 +78,43 @@ class Payload:
     link: str
     body: PointMass
     mass_error: float
-    place_error: NDArray[np.float64]
+    position_error: NDArray[np.float64]
     quantile: float
     largest_at_com: float
-    place_in_base: NDArray[np.float64]
-    left_out: float
+    position_in_base: NDArray[np.float64]
+    relative_error: float
     actuators: list[PayloadActuator]
     shift: float
 
     @property
     def found(self) -> bool:
-        """True if the interval of the mass excludes 0."""
+        """True if the confidence interval of the mass excludes 0."""
         return self.body.mass > self.quantile * self.mass_error
 
     def as_dict(self, estimates: Sequence[Payload] = ()) -> dict:
-        """Returns the entry of `payload --json`, with None for coordinates that are not identifiable.
+        """Returns the data of `payload --json`, with None for coordinates that are not identifiable.
 
         Args:
-            estimates: Payloads on all links, for comparison. The bound of the mass is omitted if a payload on another
-                link explains the change.
+            estimates: Payloads on all links, for comparison. If no payload was found on this link and a payload on
+                another link explains the change, "largest_at_com" is None.
         """
-        known = self.body.determined
-        elsewhere = shown_elsewhere(self, estimates)
+        determined = self.body.determined
+        contradicted = bool(contradicting_links(self, estimates))
 
         def numbers(values: NDArray[np.float64]) -> list[float | None]:
-            return [float(v) if ok else None for v, ok in zip(values, known, strict=True)]
+            return [float(v) if known else None for v, known in zip(values, determined, strict=True)]
 
         return {
             "link": self.link,
             "found": self.found,
-            "largest_at_com": None if elsewhere and not self.found else self.largest_at_com,
+            "largest_at_com": None if contradicted and not self.found else self.largest_at_com,
             "mass": self.body.mass,
             "mass_standard_error": self.mass_error,
-            "place_in_link": numbers(self.body.place),
-            "place_standard_error": numbers(self.place_error),
+            "place_in_link": numbers(self.body.position),
+            "place_standard_error": numbers(self.position_error),
             "confidence": CONFIDENCE,
             "quantile": self.quantile,
-            "left_out_error": self.left_out,
+            "left_out_error": self.relative_error,
             "better_links": [payload.link for payload in better_links(self, estimates)],
             "shift": self.shift,
             "actuators": [asdict(actuator) for actuator in self.actuators],
@@ -128,25 +128,25 @@ def estimate_payload(
     links: Sequence[str] | None = None,
     progress: Callable[[float], object] = lambda _: None,
 ) -> list[Payload]:
-    """Estimates the point mass on each link that best explains the change from the reference, best link first.
+    """Estimates a point mass on each link from the change of the efforts, best link first.
 
-    For each actuator, the difference of the efforts is explained by two parts: the ten regressor columns of the link
-    with the parameters of a point mass, and possible changes of the drives (`MotionDifference.changes`). A payload is
-    assumed to be small compared with its distance from the joint axes. This assumption separates mass and position on
-    a link that rotates about a fixed point, where only m p and the inertia m p p' are identifiable.
+    The model of the change of an actuator's effort has two parts: the ten regressor columns of the link with the
+    parameters of a point mass, and possible changes of the drives (`MotionDifference.changes`). The payload is assumed
+    to be small compared with its distance from the joint axes. This assumption separates mass and position on a link
+    that rotates about a fixed point, where only m p and the inertia m p p' are identifiable.
 
-    The residual of each actuator is whitened (`Whitening`), because errors from offsets, friction and cables are slow,
-    while inertia affects the fast parts of a motion. The standard errors are a delete-one jackknife over the folds of
-    `phase_folds`. Unlike errors of independent rows, errors that repeat with the motion do not average out over its
-    repetitions. The standard errors are not smaller than those of independent rows.
+    The residual of each actuator is whitened (`Whitening`), because errors of offsets, friction and cables vary slowly,
+    whereas inertia affects the fast parts of a motion. The standard errors are a delete-one jackknife over the folds of
+    `phase_folds`, because errors that repeat with the motion do not average out over its periods. They are at least
+    the standard errors for independent rows.
 
     Args:
-        reference: Recording of the motion without the payload.
-        loaded: Recording of the same motion with the payload.
-        model: Model of the arm in the reference. It determines the shape of Coulomb friction and the effect of
-            differences between the motions.
-        links: Names of links. Defaults to all moving links.
-        progress: Function that is called with the completed share, 0..1.
+        reference: Motion with efforts, without the payload.
+        loaded: The same motion with the payload.
+        model: Model of the arm without the payload. It predicts the shape of Coulomb friction, and the effect of small
+            differences between the two motions.
+        links: Names of the links. None means all moving links.
+        progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
         RecordingError: A recording is not a motion of this arm, the recordings are not of the same motion, or they are
@@ -155,24 +155,25 @@ def estimate_payload(
     """
     regressor = model.regressor
     names = [link.link for link in regressor.links]
-    wanted = names if links is None else list(links)
-    check_links(regressor, wanted)
+    tested = names if links is None else list(links)
+    check_links(regressor, tested)
     difference = motion_difference(reference, loaded, model)
     progress(0.2)
     grid = difference.grid
     if np.sqrt(np.mean(difference.tau**2)) < MIN_DIFFERENCE * np.sqrt(np.mean(loaded.measured_effort() ** 2)):
         raise RecordingError(
-            f"{loaded.source or 'recording'}: shows no difference from the reference: they are the same recording"
+            f"{loaded.source or 'recording'}: the efforts equal the efforts of the reference. Use two different "
+            "recordings of the motion."
         )
     Y = regressor.regressor(grid.q, grid.v, grid.vd)
     J_inverse = model.arm.transmission.inverse.matrix
     estimates = []
-    for count, link in enumerate(wanted):
+    for count, link in enumerate(tested):
         k = names.index(link)
         columns = np.einsum("ji,mjp->mip", J_inverse, Y[..., 10 * k : 10 * k + 10])
         estimates.append(_estimate(regressor.links[k], columns, difference))
-        progress(0.2 + 0.8 * (count + 1) / len(wanted))
-    return sorted(estimates, key=lambda payload: payload.left_out)
+        progress(0.2 + 0.8 * (count + 1) / len(tested))
+    return sorted(estimates, key=lambda payload: payload.relative_error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,10 +181,10 @@ class PayloadIdentification:
     """Result of `payload`.
 
     Attributes:
-        payload: Payload on the given link, or on the link that explains the change best.
-        estimates: Payloads on each moving link, best first.
+        payload: Payload on the given link, or else on the link that explains the change best.
+        estimates: Payload on each moving link, best first.
         model: Model of the arm without the payload.
-        warnings: Warnings about links that explain the change better, and about the recordings.
+        warnings: Findings about links that explain the change better, and about the recordings.
         link: Name of the given link, or None.
     """
 
@@ -194,9 +195,9 @@ class PayloadIdentification:
     link: str | None = None
 
     def as_dicts(self) -> list[dict]:
-        """Returns the data of `payload --json`: the payload on the given link, or on every link."""
-        chosen = self.estimates if self.link is None else [self.payload]
-        return [payload.as_dict(self.estimates) for payload in chosen]
+        """Returns the data of `payload --json`: the payload on the given link, or else on every link."""
+        payloads = self.estimates if self.link is None else [self.payload]
+        return [payload.as_dict(self.estimates) for payload in payloads]
 
 
 def payload(
@@ -207,23 +208,23 @@ def payload(
     *,
     progress: Progress | None = None,
 ) -> PayloadIdentification:
-    """Checks two recordings of one motion and estimates the payload of the arm, like `dvrk-drake payload`.
+    """Checks two recordings of one motion and estimates the payload of the arm, as `dvrk-drake payload` does.
 
     Args:
         reference: Motion with efforts (m, n), without the payload.
         loaded: The same motion with the payload.
-        model: Model identified from a motion of the arm without the payload, or the arm. In the latter case the model
-            is identified from `reference`.
+        model: Model identified from a motion of the arm without the payload. If an arm is given instead, the model is
+            identified from `reference`.
         link: SDF link that carries the payload. None selects the link that explains the change best.
-        progress: Function that is called with the step, "checking the recording", "identifying" or "estimating", and
-            its completed share 0..1.
+        progress: Callback that receives the step, "checking the recording", "identifying" or "estimating", and its
+            finished share, 0 to 1.
 
     Returns:
-        Mass [kg] and position [m] with standard errors as `payload`, the same for each link as `estimates`, and
-        `warnings`.
+        Result with mass [kg], position [m] and standard errors as `payload`, the estimates on all links as `estimates`,
+        and `warnings`.
 
     Raises:
-        RecordingError: `check` rejects a recording, or the two are not of one motion. See `findings` of the error.
+        RecordingError: `check` rejects a recording, or the two motions differ. See `findings` of the error.
         ModelError: The model has no dynamics, or the link does not exist.
         IdentificationError: The model of the arm is not identifiable from `reference`.
 
@@ -246,60 +247,61 @@ def payload(
     """
     arm = model if isinstance(model, Arm) else model.arm
     check_links(DynamicRegressor(arm), [] if link is None else [link])
-    found: tuple[Finding, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     for recording in (reference, loaded):
         report = require_usable(recording, arm, progress)
-        found += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
+        warnings += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
     if isinstance(model, Arm):
         model = identify_dynamic(reference, arm, step_progress(progress, "identifying")).model
     estimates = estimate_payload(reference, loaded, model.dynamic_model, progress=step_progress(progress, "estimating"))
-    chosen = estimates[0] if link is None else next(p for p in estimates if p.link == link)
-    found = (*better_link_warnings(chosen, estimates), *found)
-    return PayloadIdentification(chosen, estimates, model, found, link)
+    result = estimates[0] if link is None else next(p for p in estimates if p.link == link)
+    warnings = (*better_link_warnings(result, estimates), *warnings)
+    return PayloadIdentification(result, estimates, model, warnings, link)
 
 
 def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
-    """Raises ModelError if a link does not move or does not exist. Called before a model is identified."""
+    """Raises ModelError if a link does not exist or does not move."""
     names = [link.link for link in regressor.links]
     if unknown := [link for link in links if link not in names]:
-        raise ModelError(f'unknown link "{unknown[0]}"; links of {regressor.arm.name} that move: {", ".join(names)}')
+        raise ModelError(f'unknown link "{unknown[0]}". Moving links of {regressor.arm.name}: {", ".join(names)}')
 
 
-def as_good(estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the links that explain the change as well as the best one."""
-    return [payload for payload in estimates if payload.left_out <= SAME_ERROR * estimates[0].left_out]
+def equally_good_links(estimates: Sequence[Payload]) -> list[Payload]:
+    """Returns the payloads on links that explain the change as well as the best link."""
+    return [payload for payload in estimates if payload.relative_error <= SAME_ERROR * estimates[0].relative_error]
 
 
 def better_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the links that explain the change clearly better than `payload`, best first."""
-    return [other for other in estimates if SAME_ERROR * other.left_out < payload.left_out]
+    """Returns the payloads on other links that explain the change clearly better, best first."""
+    return [other for other in estimates if SAME_ERROR * other.relative_error < payload.relative_error]
 
 
 def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tuple[Finding, ...]:
-    """Returns a warning with the links that explain the change better than that of `payload`, if there are any."""
+    """Returns a warning if other links explain the change clearly better, otherwise an empty tuple."""
     better = better_links(payload, estimates)
     if not better:
         return ()
     first = better[0]
-    same = [other.link for other in as_good(estimates)]
-    mass = f", {first.body.mass:.3g} +- {first.mass_error:.2g} kg" if first.found else ""
+    same = [other.link for other in equally_good_links(estimates)]
+    mass = f" ({first.body.mass:.3g} +- {first.mass_error:.2g} kg)" if first.found else ""
     what = (
-        f"does not explain the change best: left-out error {payload.left_out:.1%}, but {first.left_out:.1%} with a "
-        f"payload on {' or '.join(same)}{mass}"
+        f"a payload on {' or '.join(same)}{mass} explains the change better (cross-validated error "
+        f"{100 * first.relative_error:.1f} % instead of {100 * payload.relative_error:.1f} %)"
     )
-    advice = f"use this result only if the payload is certainly on {payload.link}; else repeat with --link {first.link}"
+    advice = f"Unless the payload is certainly on {payload.link}, run again with --link {first.link}."
     return (Finding("warning", "other link", payload.link, what, advice),)
 
 
-def shown_elsewhere(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the links that contradict the absence of a payload on the link of `payload`, best first.
+def contradicting_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
+    """Returns the payloads on other links that may explain the change, best first.
 
-    These links explain the change clearly better, or their estimated mass predicts phases that were not used for its
-    fit.
+    These links explain the change clearly better, or a payload was found on them and reduces the cross-validated error.
     """
     better = better_links(payload, estimates)
     return [
-        other for other in estimates if other in better or (other is not payload and other.found and other.left_out < 1)
+        other
+        for other in estimates
+        if other in better or (other is not payload and other.found and other.relative_error < 1)
     ]
 
 
@@ -308,43 +310,49 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
     plain, problem = problems.plain, problems.whitened
     folds = range(problem.equations.folds)
     body, weights, errors = problem.fit()
-    parts = [problem.without_fold(fold, weights, body) for fold in folds]
-    spread = _jackknife([[part.mass, *part.place] for part in parts], errors)
+    bodies = [problem.without_fold(fold, weights, body) for fold in folds]
+    standard_errors = _jackknife([[body.mass, *body.position] for body in bodies], errors)
     at_com, at_com_error = problem.mass_at_com(weights)
-    at_com_spread = _jackknife([[problem.mass_at_com(weights, fold)[0]] for fold in folds], np.array([at_com_error]))
+    at_com_errors = _jackknife([[problem.mass_at_com(weights, fold)[0]] for fold in folds], np.array([at_com_error]))
     quantile = float(stdtrit(len(folds) - 1, (1 + CONFIDENCE) / 2))
     rows, arm = len(difference.tau), difference.grid.arm
     rms = np.sqrt(np.stack(plain.budget(body, problems.plain_weights)) / rows)
     actuators = [
-        PayloadActuator(name, change, own, left, 1 - (left / change) ** 2 if own > MIN_LOAD * change else None)
-        for name, (change, own, left) in zip(arm.joint_names, rms.T.tolist(), strict=True)
+        PayloadActuator(name, change, load, left, 1 - (left / change) ** 2 if load > MIN_LOAD * change else None)
+        for name, (change, load, left) in zip(arm.joint_names, rms.T.tolist(), strict=True)
     ]
-    with_it, without = (
+    with_payload, without = (
         np.maximum(np.sum([problem.fold_errors(fold, weights, start) for fold in folds], axis=0), 1e-30)
         for start in (body, None)
     )
     return Payload(
         link=link.link,
         body=body,
-        mass_error=float(spread[0]),
-        place_error=np.where(body.determined, spread[1:], np.nan),
+        mass_error=float(standard_errors[0]),
+        position_error=np.where(body.determined, standard_errors[1:], np.nan),
         quantile=quantile,
-        largest_at_com=max(at_com, 0.0) + quantile * float(at_com_spread[0]),
-        place_in_base=_in_base(arm, link.link, body.place),
-        left_out=float(np.exp(np.mean(np.log(with_it / without)) / 2)),
+        largest_at_com=max(at_com, 0.0) + quantile * float(at_com_errors[0]),
+        position_in_base=_in_base(arm, link.link, body.position),
+        relative_error=float(np.exp(np.mean(np.log(with_payload / without)) / 2)),
         actuators=actuators,
         shift=difference.shift,
     )
 
 
-def _jackknife(parts: list[list[float]], least: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns standard errors (k,), at least `least`, from estimates (folds, k) that each exclude one fold."""
-    return np.maximum(np.sqrt((len(parts) - 1) * np.var(np.array(parts), axis=0)), least)
+def _jackknife(estimates: list[list[float]], min_errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the standard errors (k,), at least `min_errors`, from estimates (folds, k) that exclude one fold each."""
+    return np.maximum(np.sqrt((len(estimates) - 1) * np.var(np.array(estimates), axis=0)), min_errors)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problems:
-    """Least-squares problems of one link: original, weighted by actuator, and whitened by the residuals."""
+    """Least-squares problems of one link.
+
+    Attributes:
+        plain: Problem without whitening.
+        plain_weights: Weights (n,) of the actuators in `plain`.
+        whitened: Problem with whitened residuals.
+    """
 
     plain: PointMassProblem
     plain_weights: NDArray[np.float64]
@@ -352,43 +360,45 @@ class _Problems:
 
     @classmethod
     def of(cls, link: LinkInertia, columns: NDArray[np.float64], difference: MotionDifference) -> _Problems:
-        """Creates the problems. The autoregression is fitted to the unwhitened residuals, then once more."""
+        """Creates the problems for the ten regressor columns (m, n, 10) of the link on the grid of the motion."""
         grid, n = difference.grid, difference.grid.arm.num_joints
         at_rows = np.stack([grid.at_rows(columns[:, i], i) for i in range(n)], axis=1)
-        filtered = grid.behind_filter(at_rows)[difference.rows]
-        both = [np.hstack([filtered[:, i], difference.changes[:, i]]) for i in range(n)]
-        problem = plain = _problem(link, both, difference, Whitening.none(n))
+        filtered = grid.filter_efforts(at_rows)[difference.rows]
+        actuator_columns = [np.hstack([filtered[:, i], difference.changes[:, i]]) for i in range(n)]
+        problem = plain = _problem(link, actuator_columns, difference, Whitening.none(n))
         body, plain_weights, _ = plain.fit()
         weights = plain_weights
-        for again in range(WHITENED):
+        for iteration in range(NUM_WHITENING_ITERATIONS):
             phi, x = body.parameters, problem.nuisances(body, weights)
-            left = difference.tau - np.column_stack([both[i] @ np.concatenate([phi, x[i]]) for i in range(n)])
-            whitening = Whitening.of(left, AUTOREGRESSION, grid.rate, grid.settings.effort_cut_off)
-            problem = _problem(link, both, difference, whitening)
-            if again < WHITENED - 1:
+            residual = difference.tau - np.column_stack(
+                [actuator_columns[i] @ np.concatenate([phi, x[i]]) for i in range(n)]
+            )
+            whitening = Whitening.of(residual, AUTOREGRESSION_ORDER, grid.rate, grid.settings.effort_cut_off)
+            problem = _problem(link, actuator_columns, difference, whitening)
+            if iteration < NUM_WHITENING_ITERATIONS - 1:
                 body, weights, _ = problem.fit(body)
         return cls(plain, plain_weights, problem)
 
 
 def _problem(
-    link: LinkInertia, both: list[NDArray[np.float64]], difference: MotionDifference, whitening: Whitening
+    link: LinkInertia, actuator_columns: list[NDArray[np.float64]], difference: MotionDifference, whitening: Whitening
 ) -> PointMassProblem:
-    grid, rows = difference.grid, np.flatnonzero(difference.rows)[whitening.lost :]
+    grid, rows = difference.grid, np.flatnonzero(difference.rows)[whitening.num_removed :]
     fold, edge = phase_folds(grid, difference.period)
     tau = np.column_stack([whitening(x, i) for i, x in enumerate(difference.tau.T)])
-    size = both[0].shape[1]
-    columns = ((np.arange(size), whitening(x, i)) for i, x in enumerate(both))
+    size = actuator_columns[0].shape[1]
+    columns = ((np.arange(size), whitening(x, i)) for i, x in enumerate(actuator_columns))
     equations = NormalEquations.of(columns, size, tau, fold[rows], edge[rows])
     # A low-pass filtered effort has two independent values per period of the cut-off frequency. Errors that repeat with
-    # the motion have fewer, which the jackknife over the phases takes into account.
+    # the motion have fewer independent values, so the standard errors are computed by a jackknife over the phases.
     independent = 2 * grid.settings.effort_cut_off / grid.rate
     com = link.parameters[1:4] / link.parameters[0]
     precision = np.mean(difference.changes**2, axis=0) / difference.deviation**2
     return PointMassProblem(equations, min(independent, 1.0), com, precision, len(tau))
 
 
-def _in_base(arm: Arm, link: str, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns a point (3,) of a link in the base frame with all joints at 0."""
+def _in_base(arm: Arm, link: str, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the position (3,) in the base frame of a point in the link frame, with all joints at 0 [m]."""
     plant = shared_plant(arm)
     context = plant.CreateDefaultContext()
     for name, x in zip(arm.tree_joint_names, arm.linkage.position(np.zeros(arm.num_joints)), strict=True):
@@ -398,4 +408,4 @@ def _in_base(arm: Arm, link: str, place: NDArray[np.float64]) -> NDArray[np.floa
         positions[start] = x
         plant.SetPositions(context, positions)
     X_BL = plant.CalcRelativeTransform(context, plant.GetFrameByName("base_link"), plant.GetFrameByName(link))
-    return np.asarray(X_BL @ place, dtype=float)
+    return np.asarray(X_BL @ position, dtype=float)

@@ -1,4 +1,4 @@
-"""Computes the efforts that a model predicts over a motion, with friction separated from all other efforts."""
+"""Predicts the efforts of a motion with a model, with friction separated from all other efforts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
 FrictionPart = Literal["dry", "viscous"]
-#: Friction kinds and their part. The kinds of one part change together with temperature or lubrication.
+#: Part of the friction, dry or viscous, for each friction kind. The kinds of one part change together, for example with
+#: temperature or lubrication.
 FRICTION_PARTS: dict[str, FrictionPart] = {
     **dict.fromkeys(("coulomb", "load coulomb", "stribeck", "presliding"), "dry"),
     "viscous": "viscous",
@@ -23,11 +24,11 @@ FRICTION_PARTS: dict[str, FrictionPart] = {
 
 @dataclass(frozen=True, eq=False)
 class DriveEfforts:
-    """Efforts of the actuators (r, n) [N m, N] at the rows of a motion after low-pass filtering, without the ends.
+    """Predicted actuator efforts at the rows of a motion, after low-pass filtering and without the ends.
 
     Attributes:
-        other: Efforts of the rigid bodies and of all effects except friction.
-        friction: Dry and viscous friction of each coordinate.
+        other: Efforts (r, n) of the rigid bodies and of all effects except friction [N m, N].
+        friction: Actuator efforts (r, n) for each coordinate and part of the friction [N m, N].
     """
 
     other: NDArray[np.float64]
@@ -38,7 +39,7 @@ class DriveEfforts:
         return self.other + sum(self.friction.values(), np.zeros_like(self.other))
 
     def friction_part(self, part: FrictionPart) -> NDArray[np.float64]:
-        """Returns one part of the friction (r, n), summed over all coordinates."""
+        """Returns the actuator efforts (r, n) of one part of the friction, summed over all coordinates."""
         return sum((x for (_, own), x in self.friction.items() if own == part), np.zeros_like(self.other))
 
 
@@ -58,35 +59,35 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
         else:
             other = other + effort
     return DriveEfforts(
-        grid.behind_filter(grid.efforts_at_rows(other)),
-        {key: grid.behind_filter(grid.efforts_at_rows(x)) for key, x in friction.items()},
+        grid.filter_efforts(grid.efforts_at_rows(other)),
+        {key: grid.filter_efforts(grid.efforts_at_rows(x)) for key, x in friction.items()},
     )
 
 
-#: Efforts whose correlation with the model is below this have the opposite sign. For a random sign it is near 0.
-OPPOSITE = -0.3
+#: Largest correlation between measured and predicted efforts that indicates a wrong sign of the effort.
+MAX_OPPOSITE_CORRELATION = -0.3
 
 
 def refuse_opposite_efforts(
     recording: Recording, names: tuple[str, ...], tau: NDArray[np.float64], expected: NDArray[np.float64]
 ) -> None:
-    """Compares the sign of measured and expected efforts, without their offsets.
+    """Rejects measured efforts with the opposite sign of the predicted efforts, ignoring offsets.
 
     Args:
-        recording: Recording that the message names.
+        recording: Recording of the efforts, for the message.
         names: Names of the n joints of the actuators.
-        tau: (r, n) measured efforts of the actuators after low-pass filtering [N m, N].
-        expected: (r, n) expected efforts after the same filter [N m, N].
+        tau: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
+        expected: Predicted efforts (r, n) after the same filter [N m, N].
 
     Raises:
-        RecordingError: The efforts of an actuator are opposite to those of the model.
+        RecordingError: The measured efforts of an actuator are opposite to the predicted efforts.
     """
     x, y = tau - np.mean(tau, axis=0), expected - np.mean(expected, axis=0)
     size = np.sqrt(np.sum(x**2, axis=0) * np.sum(y**2, axis=0))
     correlation = np.sum(x * y, axis=0) / np.maximum(size, np.finfo(float).tiny)
-    if len(wrong := np.flatnonzero(correlation < OPPOSITE)):
+    if len(wrong := np.flatnonzero(correlation < MAX_OPPOSITE_CORRELATION)):
         which = ", ".join(f"{names[j]} ({correlation[j]:.2f})" for j in wrong)
         raise RecordingError(
-            f"{recording.source or 'recording'}: efforts go against the model's (correlation): {which}; tau or the "
-            "direction of q has the wrong sign there, or it is another arm: efforts are positive towards +q"
+            f"{recording.source or 'recording'}: efforts are opposite to the efforts of the model (correlation): "
+            f"{which}. Check the signs of tau and q (efforts are positive in the direction of +q), and check the arm."
         )

@@ -12,28 +12,31 @@ from dvrk_drake.analysis.signals.motion_grid import MotionSignals
 
 #: Cut-off of the low-pass filter for efforts and regressor columns [Hz].
 CUT_OFF = 20.0
-#: Largest delay that is tried, and the step [s].
+#: Largest tested delay and step between tested delays [s].
 MAX_LAG, LAG_STEP = 0.04, 0.0025
-#: Omitted at each end because of filter transients [s].
+#: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
-#: Width of the smoothed Coulomb friction, as a share of the RMS speed.
+#: Width of the smoothed sign function for Coulomb friction, as a share of the RMS velocity.
 SMOOTHING = 0.1
-#: Parts of the motion from which the standard errors are estimated.
-PARTS = 5
-#: Least ratio of the residual variances, and least number of standard errors, for a delay to be significant.
+#: Number of segments of the motion from which the standard errors are estimated.
+NUM_SEGMENTS = 5
+#: Smallest ratio of the residual variances without and with a significant delay, and smallest ratio of the delay to its
+#: standard error.
 MIN_GAIN, MIN_ERRORS = 1.12, 5.0
 
 
 class EffortLag(NamedTuple):
-    """Delay of tau relative to the motion, and Coulomb friction; (n,) each.
+    """Delay of tau relative to the motion, and Coulomb friction. All arrays have shape (n,).
 
     Attributes:
-        lag: Delay with the least residual variance [s], at most `MAX_LAG`; nan if the joint or its effort is constant.
-        standard_error: Standard error of the delay, from `PARTS` parts of the motion [s].
-        gain: Residual variance without a delay, divided by that with it [1].
-        determined: True if the delay is significant: large gain, and many standard errors.
-        coulomb: Coulomb friction [N m, N]; negative if the effort has the wrong sign.
-        coulomb_error: Standard error of the Coulomb friction, from `PARTS` parts of the motion.
+        lag: Delay with the smallest residual variance [s], at most `MAX_LAG`; nan if the joint or its effort is
+            constant.
+        standard_error: Standard error of the delay, from `NUM_SEGMENTS` segments of the motion [s].
+        gain: Ratio of the residual variances without and with the delay [1].
+        determined: True if the delay is significant, see `MIN_GAIN` and `MIN_ERRORS`.
+        coulomb: Coulomb friction [N m, N], negative if the effort has the wrong sign.
+        coulomb_error: Standard error of the Coulomb friction, from `NUM_SEGMENTS` segments of the motion
+            [N m, N].
     """
 
     lag: NDArray[np.float64]
@@ -45,15 +48,14 @@ class EffortLag(NamedTuple):
 
 
 def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
-    """Estimates the delay of each effort by a fit with delays of up to 40 ms in both directions.
+    """Estimates the delay of each effort by fits with delays between -`MAX_LAG` and `MAX_LAG`.
 
     The regressors are the actuator's Coulomb and viscous friction, all accelerations, and sine and cosine of all
-    positions. Presliding friction, which builds up after a reversal, resembles a delay. One motion cannot separate the
-    two.
+    positions. Presliding friction has a similar effect as a delay and is not identifiable separately in one motion.
 
     Args:
-        signals: Signals of the actuators, because friction acts there.
-        moving: (n,) mask of the actuators that move.
+        signals: Signals in actuator coordinates.
+        moving: Mask (n,) of the actuators that move.
     """
     rate = signals.rate
     start = max(int(ENDS * rate), int(MAX_LAG * rate))
@@ -75,30 +77,30 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
 
 
 def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[float, float]:
-    """Returns the coefficient of the first column and its standard error."""
-    parts = zip(np.array_split(columns, PARTS), np.array_split(tau, PARTS), strict=True)
-    estimates = [np.linalg.lstsq(A, b, rcond=None)[0][0] for A, b in parts]
-    whole = np.linalg.lstsq(columns, tau, rcond=None)[0][0]
-    return float(whole), float(np.std(estimates, ddof=1) / np.sqrt(PARTS))
+    """Returns the coefficient of the first column (Coulomb friction) and its standard error."""
+    segments = zip(np.array_split(columns, NUM_SEGMENTS), np.array_split(tau, NUM_SEGMENTS), strict=True)
+    estimates = [np.linalg.lstsq(A, b, rcond=None)[0][0] for A, b in segments]
+    coefficient = np.linalg.lstsq(columns, tau, rcond=None)[0][0]
+    return float(coefficient), float(np.std(estimates, ddof=1) / np.sqrt(NUM_SEGMENTS))
 
 
 def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: float) -> tuple[float, float, float]:
-    """Returns the lag [s], its standard error [s] and its gain for the column space of Q."""
+    """Returns the lag [s], its standard error [s] and its gain, for regressors with orthonormal basis Q."""
     step = max(round(LAG_STEP * rate), 1)
     shifts = np.arange(-(inner.start // step), inner.start // step + 1) * step
     shifts = shifts[np.abs(shifts) <= MAX_LAG * rate]
     shifted = np.column_stack([tau[inner.start + s : inner.stop + s] for s in shifts])
     squares = (shifted - Q @ (Q.T @ shifted)) ** 2
-    left = np.sum(squares, axis=0)
-    parts = [_least(shifts, np.sum(part, axis=0)) for part in np.array_split(squares, PARTS)]
-    error = float(np.std(parts, ddof=1)) / np.sqrt(PARTS)
-    return _least(shifts, left) / rate, error / rate, float(left[len(shifts) // 2] / np.min(left))
+    totals = np.sum(squares, axis=0)
+    lags = [_minimiser(shifts, np.sum(segment, axis=0)) for segment in np.array_split(squares, NUM_SEGMENTS)]
+    error = float(np.std(lags, ddof=1)) / np.sqrt(NUM_SEGMENTS)
+    return _minimiser(shifts, totals) / rate, error / rate, float(totals[len(shifts) // 2] / np.min(totals))
 
 
-def _least(at: NDArray[np.int_], values: NDArray[np.float64]) -> float:
-    """Returns the minimiser of a sampled curve, with parabolic interpolation."""
+def _minimiser(x: NDArray[np.int_], values: NDArray[np.float64]) -> float:
+    """Returns the minimiser of a curve with values at equidistant x, with parabolic interpolation."""
     i = int(np.clip(np.argmin(values), 1, len(values) - 2))
-    before, here, after = values[i - 1 : i + 2]
-    curvature = before - 2 * here + after
+    before, minimum, after = values[i - 1 : i + 2]
+    curvature = before - 2 * minimum + after
     offset = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
-    return float(at[i] + np.clip(offset, -1, 1) * (at[1] - at[0]))
+    return float(x[i] + np.clip(offset, -1, 1) * (x[1] - x[0]))

@@ -1,7 +1,7 @@
 """Zero-phase filters, differentiation, resampling and correlation.
 
-scipy.signal has these filters too. They are compiled here for speed: importing scipy.signal is slow compared with an
-identification, and its filter processes one column at a time. Tests compare the results with those of scipy.
+The filters are compiled here, because importing scipy.signal is slow compared with an identification. Tests compare the
+results with scipy.signal.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int
     """Applies a zero-phase Butterworth low-pass filter along axis 0, forwards and backwards as scipy's `sosfiltfilt`.
 
     Args:
-        x: (m,) or (m, n) samples at a constant rate.
+        x: Samples (m,) or (m, n) at a constant rate.
         rate: Sampling rate [Hz].
-        cut_off: Frequency at which the amplitude is halved [Hz], a scalar or (n,) for one per column. At half the
-            sampling rate or above, a column is not changed.
+        cut_off: Frequency at which the amplitude is halved [Hz], a scalar or one value (n,) per column. A column with a
+            cut-off of half the sampling rate or more is not changed.
         order: Order of the filter in each direction, even.
     """
     columns = np.asarray(x, dtype=np.float64).reshape(len(x), -1)
     filtered = np.empty(columns.shape)
     cut_offs = np.broadcast_to(cut_off, columns.shape[1])
     for value in np.unique(cut_offs):
-        chosen = cut_offs == value
-        filtered[:, chosen] = _forwards_and_backwards(columns[:, chosen], value / rate, order)
+        selected = cut_offs == value
+        filtered[:, selected] = _forwards_and_backwards(columns[:, selected], value / rate, order)
     return filtered.reshape(x.shape)
 
 
@@ -42,12 +42,12 @@ def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) 
     sos = butterworth(order, cut_off)
     edge = 3 * (order + 1)
     if len(x) <= edge:
-        raise ValueError(f"the filter needs more than {edge} rows, got {len(x)}")
+        raise ValueError(f"the filter requires more than {edge} rows, got {len(x)}")
     y = np.concatenate([2 * x[0] - x[edge:0:-1], x, 2 * x[-1] - x[-2 : -edge - 2 : -1]])
-    # State (s, 2, 1) of each section in steady state for a constant input of 1, which it passes unchanged.
-    at_one = np.stack([1 - sos[:, 0], sos[:, 2] - sos[:, 5]], axis=1)[:, :, None]
+    # Steady state (s, 2, 1) of each section for a constant input of 1, which has the constant output 1.
+    steady_state = np.stack([1 - sos[:, 0], sos[:, 2] - sos[:, 5]], axis=1)[:, :, None]
     for _ in ("forwards", "backwards"):
-        _filter(sos, at_one * y[0], y)
+        _filter(sos, steady_state * y[0], y)
         y = y[::-1].copy()
     return y[edge:-edge]
 
@@ -82,7 +82,7 @@ def _filter(sos, state, x):  # pragma: no cover - compiled
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the correlation (2 m - 1,), the sum over t of a(t + lag) b(t) of a, b (m,), for lags 1 - m .. m - 1."""
+    """Returns the cross-correlation (2 m - 1,) of a and b (m,): sum_t a(t + lag) b(t) for lags 1 - m .. m - 1."""
     count = len(a)
     size = 1 << (2 * count - 1).bit_length()
     circular = np.fft.irfft(np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size)), size)

@@ -1,4 +1,4 @@
-"""Resamples a recorded motion to an even grid of its true times and filters it without delay."""
+"""Resamples a recorded motion at a constant rate and applies zero-phase low-pass filters."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
-#: Rate of the grid [Hz], high enough to resolve hysteresis at reversals of a joint.
+#: Rate of the grid [Hz], high enough to resolve hysteresis when a joint reverses its direction.
 GRID_RATE = 400.0
-#: Omitted at each end because of filter transients [s].
+#: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
-#: Shortest motion [s] and least row rate [Hz] that are accepted.
+#: Smallest accepted duration [s] and rate of the rows [Hz].
 MIN_DURATION, MIN_RATE = 5.0, 50.0
 
 
 @dataclass(frozen=True, eq=False)
 class MotionSignals:
-    """Signals of a motion at a constant rate, in the coordinates of its recording. SI units and radians.
+    """Signals of a motion at a constant rate, in the coordinates of the recording.
 
     Attributes:
-        t: (m,) times, evenly spaced [s].
-        q: (m, n) positions, low-pass filtered.
-        v: (m, n) velocities, low-pass filtered.
-        vd: (m, n) accelerations, low-pass filtered.
-        tau: (m, n) efforts, not filtered. Apply the same filter to them and to their regressors, see `low_pass`.
-        rows: (k,) rows of the recording that are used. The others repeat the row before them.
-        row_times: (k,) time of each of these rows, on the same clock as `t`.
-        differentiated: (n,) True where v is dq/dt because the recorded qd is missing or inconsistent with it.
+        t: Times (m,) at a constant rate [s].
+        q: Positions (m, n), low-pass filtered [rad, m].
+        v: Velocities (m, n), low-pass filtered [rad/s, m/s].
+        vd: Accelerations (m, n), low-pass filtered [rad/s^2, m/s^2].
+        tau: Efforts (m, n), not filtered [N m, N]. Use the same filter for efforts and regressors, see `low_pass`.
+        rows: Indices (k,) of the rows of the recording that are used. Rows that repeat the previous row are not used.
+        row_times: True times (k,) of these rows [s].
+        differentiated: Mask (n,) of the joints whose v is dq/dt, because qd is missing or disagrees with dq/dt.
     """
 
     t: NDArray[np.float64]
@@ -55,15 +55,16 @@ class MotionSignals:
 def motion_signals(
     recording: Recording, acceleration_cut_off: ArrayLike, *, cut_off: float = 50.0, rate: float = GRID_RATE
 ) -> MotionSignals:
-    """Resamples a motion to an even grid of its true times and differentiates it.
+    """Resamples a motion at a constant rate and computes velocities and accelerations.
 
-    Rows that repeat the row before are omitted, and the times of the others are corrected (`true_time`). The signals
-    are then interpolated at `rate`, and q and v are filtered at `cut_off`. The acceleration vd is the central
+    Rows that repeat the previous row are omitted, and the times of the other rows are corrected (`true_time`). The
+    signals are then interpolated at `rate`, and q and v are filtered at `cut_off`. The acceleration vd is the central
     difference of v, filtered at `acceleration_cut_off`.
 
     Args:
-        recording: Motion with t and tau, in the coordinates that the signals shall have.
-        acceleration_cut_off: Cut-off of the zero-phase low-pass filter for vd [Hz], a scalar or (n,) for one per joint.
+        recording: Motion with t and tau, in the coordinates of the result.
+        acceleration_cut_off: Cut-off of the zero-phase low-pass filter for vd [Hz], a scalar or one value (n,) per
+            joint.
         cut_off: Cut-off of the filter for q and v [Hz].
         rate: Rate of the grid [Hz].
 
@@ -90,18 +91,18 @@ def _even_times(clock: TrueTime, rate: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class MotionGrid:
-    """Motion of an arm's joints, resampled and low-pass filtered according to `settings`.
+    """Motion of an arm, resampled and low-pass filtered according to `settings`.
 
     Attributes:
-        arm: Arm that moves.
+        arm: Arm that was recorded.
         settings: Cut-offs of the filters and delays of the efforts.
-        t: (m,) evenly spaced times at `GRID_RATE` [s].
-        q: (m, n) positions of the joints.
-        v: (m, n) velocities of the joints.
-        vd: (m, n) accelerations of the joints.
-        row_times: (r,) true time of every row of the recording, on the clock of t.
+        t: Times (m,) at the constant rate `GRID_RATE` [s].
+        q: Positions (m, n) of the joints [rad, m].
+        v: Velocities (m, n) of the joints [rad/s, m/s].
+        vd: Accelerations (m, n) of the joints [rad/s^2, m/s^2].
+        row_times: True times (r,) of all rows of the recording [s].
         rate: Mean rate of the rows [Hz].
-        clock: True times of the rows that do not repeat the row before.
+        clock: True times of the rows that do not repeat the previous row.
     """
 
     arm: Arm
@@ -116,24 +117,24 @@ class MotionGrid:
 
     @property
     def inner(self) -> slice:
-        """Rows without `ENDS`."""
+        """Slice of the rows without `ENDS` at both ends."""
         ends = round(ENDS * self.rate)
         return slice(ends, len(self.row_times) - ends)
 
     def at_rows(self, x: NDArray[np.float64], actuator: int) -> NDArray[np.float64]:
-        """Interpolates x (m, ...) on the grid at the rows (r, ...), delayed by the delay of the actuator's effort."""
-        place = (self.row_times - self.settings.effort_delay[actuator] - self.t[0]) * GRID_RATE
-        before = np.clip(np.floor(place).astype(int), 0, len(x) - 2)
-        share = np.clip(place - before, 0.0, 1.0).reshape(-1, *[1] * (x.ndim - 1))
+        """Interpolates x (m, ...) from the grid to the rows (r, ...), with the delay of the actuator's effort."""
+        index = (self.row_times - self.settings.effort_delay[actuator] - self.t[0]) * GRID_RATE
+        before = np.clip(np.floor(index).astype(int), 0, len(x) - 2)
+        share = np.clip(index - before, 0.0, 1.0).reshape(-1, *[1] * (x.ndim - 1))
         return (1 - share) * x[before] + share * x[before + 1]
 
-    def behind_filter(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Applies the low-pass filter of the efforts to x (r, ...) and omits the ends."""
+    def filter_efforts(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Applies the low-pass filter of the efforts to x (r, ...) and removes `ENDS` at both ends."""
         flat = low_pass(x.reshape(len(x), -1), self.rate, self.settings.effort_cut_off)
         return flat.reshape(x.shape)[self.inner]
 
     def efforts_at_rows(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Interpolates efforts (m, n) of the actuators on the grid at the rows (r, n)."""
+        """Interpolates efforts (m, n) of the actuators from the grid to the rows (r, n), with their delays."""
         return np.column_stack([self.at_rows(tau[:, i], i) for i in range(tau.shape[1])])
 
 
@@ -148,19 +149,19 @@ def default_settings(arm: Arm) -> SignalSettings:
 
 
 def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock: TrueTime | None = None) -> MotionGrid:
-    """Resamples a motion in joint or actuator coordinates to the grid.
+    """Resamples a motion to the grid.
 
-    The positions of each actuator are differentiated, because each has its own encoder and cut-off. Recorded velocities
-    are used only for the times, see `true_time`.
+    Actuator positions are filtered and differentiated, because each actuator has its own encoder and cut-off. Recorded
+    velocities are used only for the times, see `true_time`.
 
     Args:
-        recording: Motion with t and efforts.
-        arm: Arm that moves.
+        recording: Motion with t and efforts, in joint or actuator coordinates.
+        arm: Arm that was recorded.
         settings: Cut-offs of the filters and delays of the efforts.
-        clock: `true_time` of the recording in actuator coordinates, if already computed.
+        clock: Result of `true_time` for the recording in actuator coordinates. None computes it.
 
     Raises:
-        RecordingError: The recording does not fit the arm, has no times, or is too short or too coarse.
+        RecordingError: The recording does not match the arm, has no times, is too short, or its rate is too low.
     """
     recording.check_fits(arm)
     recording = recording.in_actuator_coordinates(arm)
@@ -169,8 +170,8 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
     rate = (len(recording) - 1) / duration
     if duration < MIN_DURATION or rate < MIN_RATE:
         raise RecordingError(
-            f"{recording.source or 'recording'}: {duration:.1f} s at {rate:.0f} Hz; a dynamic model needs a motion of "
-            f"at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz"
+            f"{recording.source or 'recording'}: the motion has {duration:.1f} s at {rate:.0f} Hz. A dynamic model "
+            f"requires at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         )
     t = _even_times(clock, GRID_RATE)
     raw = resample(clock.t, recording.q[clock.rows], t)

@@ -8,20 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-#: Length of the segments for averaged periodograms [s]. Its reciprocal is the resolution [Hz].
-PIECE = 2.56
-#: Lowest cut-off that is proposed [Hz].
+#: Duration of the segments for averaged periodograms [s]. The frequency resolution [Hz] is its reciprocal.
+SEGMENT_DURATION = 2.56
+#: Smallest cut-off frequency [Hz].
 MIN_CUT_OFF = 2.0
-#: Least ratio of the noise in a narrow band to the noise on both sides.
+#: Smallest ratio of the peak of a narrow band to the median noise below and above the band.
 PEAK = 4.0
-#: Noise at the edges of a band as a share of its peak, and largest width of a band [octaves].
-EDGE, WIDEST = 0.15, 2.0
-#: Least RMS of a narrow band that is reported, as a share of the signal's RMS.
+#: Noise at the edges of a narrow band as a share of its peak, and largest width of a narrow band [octaves].
+EDGE, MAX_OCTAVES = 0.15, 2.0
+#: Smallest reported RMS of a narrow band, as a share of the RMS of signal and noise.
 MIN_SHARE = 0.03
 
 
 class Spectra(NamedTuple):
-    """Power spectral densities over frequency, (k,) and (k, n)."""
+    """Power spectral densities of n joints.
+
+    Attributes:
+        frequency: Frequencies (k,) [Hz].
+        signal: Power spectral densities (k, n) of the repeating part.
+        noise: Power spectral densities (k, n) of the noise.
+    """
 
     frequency: NDArray[np.float64]
     signal: NDArray[np.float64]
@@ -29,7 +35,13 @@ class Spectra(NamedTuple):
 
 
 class Band(NamedTuple):
-    """Noise between two frequencies [Hz], with the ratio of its RMS to that of the signal [1]."""
+    """Noise in a narrow band.
+
+    Attributes:
+        lower: Lower frequency [Hz].
+        upper: Upper frequency [Hz].
+        share: RMS of the noise in the band divided by the RMS of signal and noise [1].
+    """
 
     lower: float
     upper: float
@@ -37,19 +49,19 @@ class Band(NamedTuple):
 
 
 def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectra:
-    """Computes the spectra of the repeating part (signal) and of the rest (noise).
+    """Computes the spectra of signal and noise.
 
-    With a period T, the noise is (x(t) - x(t + T)) / sqrt(2), and the signal is the remaining power of x. Without a
-    period, the noise is assumed white: the median density above a quarter of the sampling rate.
+    For a period T, the noise is (x(t) - x(t + T)) / sqrt(2), and the signal is the remaining power of x. Without a
+    period, white noise is assumed. Its density is the median above a quarter of the sampling rate.
 
     Args:
-        x: (m, n) samples at a constant rate.
+        x: Samples (m, n) at a constant rate.
         rate: Sampling rate [Hz].
-        period: Period of the motion [s], or None.
+        period: Period of the motion [s], or None if it does not repeat.
     """
     from scipy.signal import welch  # takes 0.3 s, see `low_pass`
 
-    length = min(int(PIECE * rate), len(x) // 4)
+    length = min(int(SEGMENT_DURATION * rate), len(x) // 4)
     frequency, power = welch(x, rate, nperseg=length, axis=0)
     if period is None:
         noise = np.tile(np.median(power[frequency > rate / 4], axis=0), (len(frequency), 1))
@@ -60,24 +72,24 @@ def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectr
     return Spectra(frequency, np.maximum(power - noise, 0), noise)
 
 
-def cut_offs(of: Spectra) -> NDArray[np.float64]:
-    """Returns the lowest frequencies (n,) above which the signal is below the noise [Hz], at least `MIN_CUT_OFF`.
+def cut_offs(densities: Spectra) -> NDArray[np.float64]:
+    """Returns the lowest frequency (n,) at which the noise exceeds the signal [Hz], at least `MIN_CUT_OFF`.
 
-    Both spectra are smoothed over five lines. If the signal exceeds the noise at all frequencies, the result is half
-    the sampling rate.
+    Both spectra are smoothed over five frequencies. If the signal exceeds the noise at all frequencies, the result is
+    half the sampling rate.
     """
     kernel = np.ones(5) / 5
     result = []
-    for signal, noise in zip(of.signal.T, of.noise.T, strict=True):
-        under = np.convolve(signal, kernel, "same") < np.convolve(noise, kernel, "same")
-        under &= of.frequency >= MIN_CUT_OFF
-        result.append(of.frequency[np.argmax(under)] if np.any(under) else of.frequency[-1])
+    for signal, noise in zip(densities.signal.T, densities.noise.T, strict=True):
+        noisy = np.convolve(signal, kernel, "same") < np.convolve(noise, kernel, "same")
+        noisy &= densities.frequency >= MIN_CUT_OFF
+        result.append(densities.frequency[np.argmax(noisy)] if np.any(noisy) else densities.frequency[-1])
     return np.array(result)
 
 
-def narrow_band(of: Spectra, joint: int) -> Band | None:
+def narrow_band(densities: Spectra, joint: int) -> Band | None:
     """Returns the strongest narrow band of one joint's noise, or None if no band is significant."""
-    noise = median_filter(of.noise[:, joint], 3)
+    noise = median_filter(densities.noise[:, joint], 3)
     noise[0] = noise[1]
     peak = int(np.argmax(noise))
     inside = noise > EDGE * noise[peak]
@@ -89,9 +101,9 @@ def narrow_band(of: Spectra, joint: int) -> Band | None:
     below, above = noise[:lower], noise[upper + 1 :]
     if lower < 2 or len(above) < 2 or noise[peak] < PEAK * max(np.median(below), np.median(above)):
         return None
-    f, step = of.frequency, of.frequency[1]
-    total = np.sum(of.signal[:, joint] + of.noise[:, joint])
-    share = float(np.sqrt(np.sum(of.noise[lower : upper + 1, joint]) / total))
-    if share < MIN_SHARE or f[upper] > f[lower] * 2**WIDEST:
+    f, step = densities.frequency, densities.frequency[1]
+    total = np.sum(densities.signal[:, joint] + densities.noise[:, joint])
+    share = float(np.sqrt(np.sum(densities.noise[lower : upper + 1, joint]) / total))
+    if share < MIN_SHARE or f[upper] > f[lower] * 2**MAX_OCTAVES:
         return None
     return Band(float(f[lower] - step / 2), float(f[upper] + step / 2), share)

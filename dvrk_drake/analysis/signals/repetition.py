@@ -8,27 +8,27 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.analysis.signals.low_pass import correlation, low_pass
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
 
-#: A motion repeats if, one period later, its positions differ by less than this share of their standard deviation
+#: Largest difference of the positions one period later if the motion repeats, as a share of their standard deviation
 #: (RMS over the joints that move).
 SAME_MOTION = 0.1
-#: Least share of the period that the second pass must cover.
+#: Smallest duration of the second period, as a share of the period.
 MIN_OVERLAP = 0.25
-#: Omitted at each end because of filter transients [s].
+#: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
 
 
 def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     """Returns the period of a motion [s], or None if it does not repeat.
 
-    The period is the least local minimum, at most `SAME_MOTION`, of
+    The period is the smallest local minimum, at most `SAME_MOTION`, of
 
         D(T)^2 = mean_j mean_t (q_j(t) - q_j(t + T))^2 / (2 var(q_j))
 
-    over the joints j that move, refined by a parabola. D is 0 for an exact repetition, and 1 for positions that are
-    uncorrelated with those T later.
+    over the joints j that move, refined by parabolic interpolation. D is 0 for an exact repetition and 1 for
+    uncorrelated positions.
 
     Args:
-        q: (m, n) positions at a constant rate.
+        q: Positions (m, n) at a constant rate [rad, m].
         rate: Sampling rate [Hz].
     """
     deviation = np.std(q, axis=0)
@@ -48,7 +48,7 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     is_minimum = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] < inner[2:]) & (inner[1:-1] < SAME_MOTION**2)
     if not np.any(is_minimum):
         return None
-    # Fast joints cause minima beside the true one. The least minimum near the shortest candidate is used.
+    # Fast joints cause more minima near the true minimum. The smallest minimum near the shortest candidate is used.
     candidates = np.flatnonzero(is_minimum) + 2
     near = candidates[candidates < 1.5 * candidates[0]]
     lag = int(near[np.argmin(difference[near])])
@@ -60,22 +60,22 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
 def repeatability_floor(
     tau: NDArray[np.float64], rate: float, period: float, cut_off: ArrayLike
 ) -> NDArray[np.float64]:
-    """Computes the relative difference of efforts between periods [1].
+    """Computes the repeatability of efforts: their relative RMS difference between periods [1].
 
-    It approximates the least relative error of any model that is a function of q, v and vd:
+    It approximates the smallest relative error of a model that is a function of q, v and vd:
 
         floor_j = rms(tau_j(t) - tau_j(t + T)) / sqrt(2) / rms(tau_j)
 
-    The efforts are filtered with the zero-phase low-pass filter, and `ENDS` are omitted.
+    The efforts are filtered with a zero-phase low-pass filter, and `ENDS` are omitted.
 
     Args:
-        tau: (m, n) efforts of the actuators at a constant rate. Sums at the joints would hide shared errors.
+        tau: Efforts (m, n) of the actuators at a constant rate [N m, N].
         rate: Sampling rate [Hz].
-        period: Period of the motion [s], rounded to whole samples.
-        cut_off: Cut-off of the low-pass filter [Hz]. The result depends on it.
+        period: Period T of the motion [s], rounded to whole samples.
+        cut_off: Cut-off of the low-pass filter [Hz].
 
     Returns:
-        (n,) relative differences, nan where tau is always 0.
+        Relative differences (n,), nan for an effort that is always 0.
     """
     ends = int(ENDS * rate)
     filtered = low_pass(tau, rate, cut_off)[ends : len(tau) - ends]
@@ -86,8 +86,9 @@ def repeatability_floor(
         return np.asarray(np.sqrt(np.mean(difference**2, axis=0) / 2) / size)
 
 
+#: Number of folds for cross-validation.
 FOLDS = 12
-#: Rows closer than this to the held-out fold are not used for fitting, because of the length of the filters [s].
+#: Duration next to a held-out fold that is not used for fitting, because of the length of the filters [s].
 GAP = 0.1
 
 
@@ -99,18 +100,22 @@ def period_of(grid: MotionGrid) -> float | None:
 def phase_folds(
     grid: MotionGrid, period: float | None, folds: int = FOLDS
 ) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
-    """Assigns each inner row to a fold and marks the rows at its edges.
+    """Assigns each inner row to a fold and marks the rows at the edges of the folds.
 
-    A periodic motion is divided by its phase. If it were divided by time, each fold would be predicted from its own
-    repetition.
+    A periodic motion is divided by its phase. Otherwise each fold would be predicted from its own repetition.
+
+    Args:
+        grid: Resampled motion.
+        period: Period of the motion [s], or None if it does not repeat.
+        folds: Number of folds.
 
     Returns:
-        fold: (r,) index of the fold, 0 to folds - 1.
-        edge: (r, 2) True within `GAP` of the preceding fold, and of the following fold.
+        fold: Index (r,) of the fold of each row, 0 to folds - 1.
+        edge: Mask (r, 2) of the rows within `GAP` of the preceding fold, and of the following fold.
     """
     t = grid.row_times[grid.inner]
     length = period if period is not None else float(t[-1] - t[0]) * (1 + 1e-9)
-    part = ((t - t[0]) % length) / length * folds
-    fold = np.minimum(part.astype(int), folds - 1)
+    phase = ((t - t[0]) % length) / length * folds
+    fold = np.minimum(phase.astype(int), folds - 1)
     gap = GAP * folds / length
-    return fold, np.column_stack([part - fold < gap, part - fold > 1 - gap])
+    return fold, np.column_stack([phase - fold < gap, phase - fold > 1 - gap])

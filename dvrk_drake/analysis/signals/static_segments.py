@@ -1,4 +1,4 @@
-"""Extracts static poses from a recording: rests of a motion, or its low-speed segments."""
+"""Extracts static poses or low-speed segments from a motion."""
 
 from __future__ import annotations
 
@@ -15,24 +15,26 @@ from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Recording
 
-#: Cut-off of the zero-phase low-pass filter for speeds [Hz], at most half the rate of a motion, and its order.
+#: Cut-off of the zero-phase low-pass filter for velocities [Hz], and its order.
 CUT_OFF, ORDER = 10.0, 4
-#: Rest: largest speed of all joints [rad/s], [m/s], least duration [s], largest distance from its start [rad], [m].
+#: Limits of a static segment: largest speed of each joint [rad/s], [m/s], smallest duration [s], and largest distance
+#: of each joint from the start of the segment [rad], [m].
 MAX_REST_SPEED, MIN_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
 
 
 def static_poses(recording: Recording, arm: Arm) -> Recording | None:
-    """Extracts one row per pose at which the arm rests for 0.3 s, averaged over the settled second half.
+    """Extracts the static poses of a motion, at which the arm rests for at least `MIN_REST`.
 
-    Rests at the same pose are averaged. A gap in the times ends a rest, because the motion in the gap is unknown.
+    Each static segment is averaged over its second half. Segments at the same pose are averaged. A gap in the times
+    ends a segment, because the motion in the gap is unknown.
 
     Args:
-        recording: Motion. Its speeds are qd, or the derivative of q.
+        recording: Motion with efforts. If it has no qd, the positions are differentiated.
         arm: Arm that was recorded.
 
     Returns:
-        The rests in joint coordinates and without time, possibly with no rows. None if `recording` is not a motion: its
-        times do not increase by less than 0.05 s, or it has fewer than 100 rows.
+        One row per static pose, in joint coordinates and without times. There may be no rows. None if `recording` is
+        not a motion (`Recording.is_motion`), or its times do not increase.
 
     Raises:
         RecordingError: The recording has no efforts, or is of another arm.
@@ -45,22 +47,22 @@ def static_poses(recording: Recording, arm: Arm) -> Recording | None:
     v = smooth_velocity(moving)
     still = np.all(np.abs(v) < arm.per_joint(*MAX_REST_SPEED), axis=1)
     still &= np.diff(t, append=t[-1]) < MAX_PERIOD
-    least = round(MIN_REST / float(np.median(np.diff(t))))
-    runs = list(stationary_runs(still, moving.q, arm.per_joint(*SAME_REST), least))
-    later = [run[len(run) // 2 :] for run in runs]
-    rests = replace(
+    min_rows = round(MIN_REST / float(np.median(np.diff(t))))
+    runs = list(stationary_runs(still, moving.q, arm.per_joint(*SAME_REST), min_rows))
+    second_halves = [run[len(run) // 2 :] for run in runs]
+    poses = replace(
         moving,
-        q=np.array([moving.q[rows].mean(axis=0) for rows in later]).reshape(-1, arm.num_joints),
-        tau=np.array([tau[rows].mean(axis=0) for rows in later]).reshape(-1, arm.num_joints),
+        q=np.array([moving.q[rows].mean(axis=0) for rows in second_halves]).reshape(-1, arm.num_joints),
+        tau=np.array([tau[rows].mean(axis=0) for rows in second_halves]).reshape(-1, arm.num_joints),
         qd=None,
         t=None,
-        lines=None if moving.lines is None else moving.lines[[rows[0] for rows in later]],
+        lines=None if moving.lines is None else moving.lines[[rows[0] for rows in second_halves]],
     )
-    return average_repeated_poses(rests, arm)
+    return average_repeated_poses(poses, arm)
 
 
 def smooth_velocity(recording: Recording) -> NDArray[np.float64]:
-    """Returns the velocities (m, n) of a motion, low-pass filtered without delay."""
+    """Returns the velocities (m, n) of a motion after a zero-phase low-pass filter [rad/s, m/s]."""
     t = np.asarray(recording.t)
     qd = np.gradient(recording.q, t, axis=0) if recording.qd is None else recording.qd
     rate = 1 / float(np.median(np.diff(t)))
@@ -68,40 +70,46 @@ def smooth_velocity(recording: Recording) -> NDArray[np.float64]:
 
 
 def stationary_runs(
-    still: NDArray[np.bool_], q: NDArray[np.float64], same: NDArray[np.float64], least: int
+    still: NDArray[np.bool_], q: NDArray[np.float64], max_distance: NDArray[np.float64], min_rows: int
 ) -> Iterator[NDArray[np.int_]]:
-    """Yields runs of `least` or more rows with `still` (m,) True and q (m, n) within `same` (n,) of its start.
+    """Yields the rows of each segment in which the arm rests.
 
-    A run ends where q leaves this range, and the next run begins there.
+    A segment ends where q leaves its range, and the next segment begins there.
+
+    Args:
+        still: Mask (m,) of the rows with low speed.
+        q: Positions (m, n) [rad, m].
+        max_distance: Largest distance (n,) of q from the start of a segment [rad, m].
+        min_rows: Smallest number of rows of a segment.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     for first, end in edges.reshape(-1, 2):
         start = first
-        while end - start >= least:
-            away = np.any(np.abs(q[start:end] - q[start]) > same, axis=1)
-            stop = start + int(np.argmax(away)) if np.any(away) else end
-            if stop - start >= least:
+        while end - start >= min_rows:
+            outside = np.any(np.abs(q[start:end] - q[start]) > max_distance, axis=1)
+            stop = start + int(np.argmax(outside)) if np.any(outside) else end
+            if stop - start >= min_rows:
                 yield np.arange(start, stop)
             start = stop
 
 
 #: Largest speed and acceleration in a low-speed segment, as shares of the joint's largest values.
 SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2
-#: Rows with shorter intervals than this are averaged [s].
+#: Smallest interval of the rows [s]. Rows with shorter intervals are averaged.
 MIN_PERIOD = 0.005
-#: Fewest consecutive samples of a low-speed segment.
+#: Smallest number of rows of a low-speed segment.
 MIN_SAMPLES = 3
-#: Largest distance of any joint from the start of a low-speed segment [rad], [m]. Segments of one joint whose poses
-#: agree within it are repetitions.
-SAME_PART = 0.05, 0.005
+#: Largest distance of each joint from the start of a low-speed segment [rad], [m]. Segments whose mean poses agree
+#: within this distance are repetitions.
+SAME_SEGMENT = 0.05, 0.005
 
 
 class LowSpeedSegments(NamedTuple):
-    """Low-speed segments of a motion, one row each.
+    """Low-speed segments of a motion.
 
     Attributes:
-        recording: Mean poses and torques of the segments, in joint coordinates, without time.
-        measured: (m, n) True at the one joint that is slow. Only its torque is a holding torque.
+        recording: Mean poses and efforts of the segments, one row each, in joint coordinates and without times.
+        measured: Mask (m, n) of the efforts that are holding torques: in each row, the effort of the slow joint.
     """
 
     recording: Recording
@@ -109,54 +117,53 @@ class LowSpeedSegments(NamedTuple):
 
 
 def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
-    """Extracts low-speed segments of a motion as static poses, per joint, averaged with their repetitions.
+    """Extracts the low-speed segments of each joint as static poses, and averages repetitions.
 
-    The torques contain two errors: inertial torques from the motion of other joints, and dry friction of either sign.
-    If possible, use dynamic identification for a motion, or poses at which the whole arm rests (`static_poses`).
+    The efforts contain two errors: inertial efforts due to the motion of other joints, and dry friction of either sign.
+    Dynamic identification, or static poses of the whole arm (`static_poses`), are more accurate.
 
     Raises:
         RecordingError: The recording has no efforts, or is of another arm.
-        IdentificationError: The recording has no times or speeds, or no low-speed segments.
+        IdentificationError: The recording has no times or velocities, or no low-speed segments.
     """
     moving = recording.in_joint_coordinates(arm)
     moving.measured_effort()
     where = recording.source or "recording"
     if moving.qd is None or not (moving.is_motion and moving.has_increasing_times):
         raise IdentificationError(
-            f"{where}: slow parts need a motion: qd1..qd{arm.num_joints}, and t that increases by less than "
-            f"{MAX_PERIOD} s, over {MIN_ROWS} rows or more"
+            f"{where}: the recording is not a motion, so it has no low-speed segments. Low-speed segments require the "
+            f"columns qd1..qd{arm.num_joints}, times t that increase by less than {MAX_PERIOD} s, and at least "
+            f"{MIN_ROWS} rows."
         )
-    moving = _thinned(moving)
+    moving = _downsampled(moving)
     tau, t = moving.measured_effort(), np.asarray(moving.t)
     v = smooth_velocity(moving)
     vd = np.gradient(v, t, axis=0)
-    # Use the 99 % quantile instead of the maximum, so that one spike does not classify all other rows as slow.
+    # The 99 % quantile is robust to spikes, unlike the maximum.
     is_slow = np.abs(v) < SLOW_SPEED * np.quantile(np.abs(v), 0.99, axis=0)
     is_slow &= np.diff(t, append=t[-1])[:, None] < MAX_PERIOD
     is_slow &= np.abs(vd) < SLOW_ACCELERATION * np.quantile(np.abs(vd), 0.99, axis=0)
-    parts = [
-        (joint, rows) for joint in range(arm.num_joints) for rows in _parts_of(is_slow[:, joint], joint, moving, arm)
-    ]
-    if not parts:
+    segments = [(j, rows) for j in range(arm.num_joints) for rows in _segments_of(is_slow[:, j], j, moving, arm)]
+    if not segments:
         raise IdentificationError(
-            f"{where}: no joint is slow (below {SLOW_SPEED:.0%} of its speed and {SLOW_ACCELERATION:.0%} of its "
-            "acceleration) anywhere; record poses at rest"
+            f"{where}: the motion has no low-speed segments (below {100 * SLOW_SPEED:.0f} % of the largest speed and "
+            f"{100 * SLOW_ACCELERATION:.0f} % of the largest acceleration of a joint). Record poses at rest."
         )
-    measured = np.zeros((len(parts), arm.num_joints), dtype=bool)
-    measured[range(len(parts)), [joint for joint, _ in parts]] = True
+    measured = np.zeros((len(segments), arm.num_joints), dtype=bool)
+    measured[range(len(segments)), [joint for joint, _ in segments]] = True
     means = replace(
         moving,
-        q=np.array([moving.q[rows].mean(axis=0) for _, rows in parts]),
-        tau=np.array([tau[rows].mean(axis=0) for _, rows in parts]),
+        q=np.array([moving.q[rows].mean(axis=0) for _, rows in segments]),
+        tau=np.array([tau[rows].mean(axis=0) for _, rows in segments]),
         qd=None,
         t=None,
-        lines=None if moving.lines is None else moving.lines[[rows[0] for _, rows in parts]],
+        lines=None if moving.lines is None else moving.lines[[rows[0] for _, rows in segments]],
     )
     return LowSpeedSegments(means, measured)
 
 
-def _thinned(recording: Recording) -> Recording:
-    """Averages blocks of rows to about 200 rows per second, because the low-pass filter removes faster changes."""
+def _downsampled(recording: Recording) -> Recording:
+    """Averages blocks of rows, to a rate of at most 1 / `MIN_PERIOD`. The low-pass filter removes faster changes."""
     t, qd, tau = recording.t, recording.qd, recording.measured_effort()
     if t is None or qd is None:
         return recording
@@ -173,9 +180,9 @@ def _thinned(recording: Recording) -> Recording:
 
 
 def _longest_of_each_pass(runs: Iterable[NDArray[np.int_]]) -> Iterator[NDArray[np.int_]]:
-    """Yields the longest of each series of adjacent runs.
+    """Yields the longest run of each series of adjacent runs.
 
-    Friction is the same in all runs of a series. They are not independent, so cross-validation requires one of them.
+    The friction is the same in all runs of a series. The runs are not independent, so cross-validation uses only one.
     """
     longest: NDArray[np.int_] | None = None
     last = -2
@@ -190,31 +197,31 @@ def _longest_of_each_pass(runs: Iterable[NDArray[np.int_]]) -> Iterator[NDArray[
         yield longest
 
 
-def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Arm) -> list[NDArray[np.int_]]:
-    """Returns the rows of each low-speed segment of one joint, with repetitions joined.
+def _segments_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Arm) -> list[NDArray[np.int_]]:
+    """Returns the rows of each low-speed segment of one joint. Repetitions of a segment are merged.
 
-    The other joints stay within `SAME_PART` in each segment.
+    All joints stay within `SAME_SEGMENT` in each segment.
     """
-    same = arm.per_joint(*SAME_PART)
-    parts: list[NDArray[np.int_]] = []
+    max_distance = arm.per_joint(*SAME_SEGMENT)
+    segments: list[NDArray[np.int_]] = []
     means = np.empty((0, arm.num_joints))
-    for run in _longest_of_each_pass(stationary_runs(is_slow, moving.q, same, MIN_SAMPLES)):
+    for run in _longest_of_each_pass(stationary_runs(is_slow, moving.q, max_distance, MIN_SAMPLES)):
         q = moving.q[run].mean(axis=0)
-        alike = np.flatnonzero(np.all(np.abs(means - q) < same, axis=1))
-        if len(alike):
-            part = alike[0]
-            parts[part] = np.concatenate([parts[part], run])
-            means[part] = moving.q[parts[part]].mean(axis=0)
+        repetitions = np.flatnonzero(np.all(np.abs(means - q) < max_distance, axis=1))
+        if len(repetitions):
+            k = repetitions[0]
+            segments[k] = np.concatenate([segments[k], run])
+            means[k] = moving.q[segments[k]].mean(axis=0)
         else:
-            parts.append(run)
+            segments.append(run)
             means = np.vstack([means, q])
-    return parts
+    return segments
 
 
-#: Note on models that are identified from low-speed segments.
+#: Note for models identified from low-speed segments.
 LOW_SPEED_NOTE = (
-    "low-speed segments are treated as static poses; their torques contain friction, and other joints may move: judge "
-    "the model by its cross-validated errors and by another recording, not by the errors of the fit"
+    "Low-speed segments are treated as static poses. Their torques contain friction, and other joints may move. Use "
+    "the cross-validated errors or another recording to evaluate the model, not the errors of the fit."
 )
 
 
@@ -222,10 +229,11 @@ class Poses(NamedTuple):
     """Result of `find_poses`.
 
     Attributes:
-        recording: One row per pose, or the unchanged recording.
-        measured: (m, n) True where an effort is a holding torque. None if all are.
-        note: Origin of the poses, or "".
-        moves: True if the arm moves all the time. There are no poses then, but a dynamic model can be identified.
+        recording: Recording with one row per extracted pose, or the unchanged recording.
+        measured: Mask (m, n) of the efforts that are holding torques, None if all are.
+        note: Note on how poses were extracted from a motion, or "".
+        moves: True if the recording is a motion without enough static poses, from which a dynamic model can be
+            identified.
     """
 
     recording: Recording
@@ -235,35 +243,35 @@ class Poses(NamedTuple):
 
 
 def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = False) -> Poses:
-    """Returns the rests of a motion if there are `MIN_POSES`, or its low-speed segments, or the unchanged recording.
+    """Extracts the static poses of a motion if it has at least `MIN_POSES`, otherwise returns the recording unchanged.
 
     Args:
         recording: Poses or a motion, in joint or actuator coordinates.
         arm: Arm that was recorded.
-        with_low_speed_segments: Use low-speed segments if a motion has too few rests, see `low_speed_segments`.
+        with_low_speed_segments: True to extract low-speed segments if a motion has too few static poses.
 
     Raises:
-        RecordingError: The recording does not fit the arm, has no efforts, or is a motion with decreasing times.
-        IdentificationError: Low-speed segments are requested, and there are none.
+        RecordingError: The recording does not match the arm, has no efforts, or is a motion with decreasing times.
+        IdentificationError: Low-speed segments are requested, but there are none.
     """
     recording.check_fits(arm)
     _check_times(recording, arm)
-    rests = static_poses(recording, arm)
-    if rests is not None and len(rests) >= MIN_POSES:
-        return Poses(rests, None, f"{len(rests)} poses at which the arm rests are taken; {len(recording)} rows")
+    poses = static_poses(recording, arm)
+    if poses is not None and len(poses) >= MIN_POSES:
+        return Poses(poses, None, f"Static poses found in the motion: {len(poses)}, in {len(recording)} rows.")
     if with_low_speed_segments:
         return Poses(*low_speed_segments(recording, arm), note=LOW_SPEED_NOTE)
-    return Poses(recording, None, "", moves=rests is not None and bool(recording.motion(arm)))
+    return Poses(recording, None, "", moves=poses is not None and bool(recording.motion(arm)))
 
 
 def _check_times(recording: Recording, arm: Arm) -> None:
-    """Rejects a motion whose times do not increase, because it would be treated as poses."""
+    """Rejects a motion whose times do not increase. Otherwise, it would be treated as poses."""
     t = recording.t
     if t is None or len(t) < MIN_ROWS or recording.has_increasing_times:
         return
     if recording.is_motion or recording.motion(arm):
         row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
         raise RecordingError(
-            f"{recording.where(row)}: time t does not increase; rows of a motion must follow in time: sort them, and "
-            "write one clock's times [s]"
+            f"{recording.where(row)}: time t does not increase. Sort the rows by time, and use the times of one clock "
+            "[s]."
         )

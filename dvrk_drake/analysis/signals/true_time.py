@@ -1,6 +1,6 @@
-"""Estimates the true times of a motion's rows from displacements and velocities.
+"""Estimates the true times of the rows of a motion from positions and velocities.
 
-Recorded velocities are used only if they agree with the derivatives of the recorded positions in gain and lag.
+Recorded velocities are used only if their gain and lag agree with the derivatives of the recorded positions.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from dvrk_drake.analysis.signals.low_pass import central_difference, low_pass, r
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
-#: Velocities are compared below this frequency [Hz]. Motions are slower, and most timing jitter is faster.
+#: Largest frequency for comparing velocities [Hz]. Motions are slower, and most timing jitter is faster.
 CUT_OFF = 10.0
 #: Largest deviation of the gain from 1, and largest lag [s], of velocities that agree.
 GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
-#: Least RMS speed for a comparison [rad/s, m/s].
+#: Smallest RMS speed for a comparison [rad/s, m/s].
 MIN_SPEED = 1e-3
-#: Omitted at each end because of filter transients [s], at most a tenth of the motion.
+#: Duration that is omitted at each end because of filter transients [s], at most a tenth of the motion.
 ENDS = 0.5
 _FIT_ITERATIONS = 5
 
 
 class VelocityAgreement(NamedTuple):
-    """Fit of qd(t) = gain * dq/dt(t - lag) by least squares below `CUT_OFF`; (n,) each.
+    """Least-squares fit of qd(t) = gain * dq/dt(t - lag) below `CUT_OFF`. All arrays have shape (n,).
 
     Attributes:
-        gain: Gain, 1 if both agree; nan if the joint rests.
-        lag: Delay of qd [s].
-        mismatch: RMS residual of the fit, as a share of the RMS of qd.
+        gain: Gain [1], nan if the joint does not move.
+        lag: Lag of qd [s], nan if the joint does not move.
+        mismatch: RMS residual of the fit divided by the RMS of qd [1].
         agrees: True if the gain is within `GAIN_TOLERANCE` of 1 and the lag is within `LAG_TOLERANCE`.
     """
 
@@ -45,8 +45,8 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
     """Compares qd with the time derivative of q.
 
     Args:
-        q: (m, n) positions at a constant rate. Jitter of the times averages out below `CUT_OFF`.
-        qd: (m, n) velocities at the same rate.
+        q: Positions (m, n) at a constant rate. Jitter of the times averages out below `CUT_OFF`.
+        qd: Velocities (m, n) at the same rate.
         rate: Sampling rate [Hz].
     """
     v, qd = (low_pass(x, rate, min(CUT_OFF, 0.2 * rate), order=4) for x in (central_difference(q, rate), qd))
@@ -58,7 +58,7 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
 
 
 def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple[float, float, float]:
-    """Returns gain, lag [samples] and mismatch by Gauss-Newton iterations, starting without lag."""
+    """Returns gain, lag [samples] and mismatch of one joint, by Gauss-Newton iterations."""
     size = float(np.sqrt(np.mean(qd[inner] ** 2)))
     if float(np.sqrt(np.mean(v[inner] ** 2))) < MIN_SPEED:
         return np.nan, np.nan, np.nan
@@ -73,20 +73,20 @@ def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple
         if gain == 0.0:
             break
         lag += float(np.clip(slope / gain, -3, 3))
-    left = (qd - gain * np.interp(index - lag, index, v))[inner]
-    return float(gain), lag, float(np.sqrt(np.mean(left**2))) / size
+    residual = (qd - gain * np.interp(index - lag, index, v))[inner]
+    return float(gain), lag, float(np.sqrt(np.mean(residual**2))) / size
 
 
-#: Largest difference of equal values, as a share of the channel's RMS. Conversions of coordinates cause rounding.
+#: Largest difference of equal values, as a share of the channel's RMS, because conversions of coordinates round.
 SAME_VALUE = 1e-9
-#: Fewest rows, and fewest joints with consistent qd and dq/dt, for reconstructing times.
+#: Smallest number of rows, and of joints whose qd agrees with dq/dt, for reconstructing times.
 MIN_ROWS, MIN_JOINTS = 100, 2
-#: Least ratio of the residual variances of recorded and reconstructed times for replacing the recorded times.
-WORSE = 3.0
-#: Below this frequency the reconstructed times follow the recorded times [Hz].
+#: Smallest ratio of the residual variances with recorded and reconstructed times for replacing the recorded times.
+MIN_VARIANCE_RATIO = 3.0
+#: Frequency below which the reconstructed times follow the recorded times [Hz].
 DRIFT = 0.3
-#: Shortest interval between two distinct rows, as a share of the mean interval.
-MIN_LENGTH = 0.02
+#: Smallest interval between two distinct rows, as a share of the mean interval.
+MIN_INTERVAL = 0.02
 _ITERATIONS = 8
 
 
@@ -94,10 +94,10 @@ class TrueTime(NamedTuple):
     """True times of the rows of a motion.
 
     Attributes:
-        rows: (k,) rows that do not repeat the row before.
-        t: (k,) their times [s], increasing. These are the recorded times unless they jitter.
-        jitter: Standard deviation of the difference between true and recorded intervals, as a share of the mean
-            interval; 0 if the recorded times are kept.
+        rows: Indices (k,) of the rows that do not repeat the previous row.
+        t: Times (k,) of these rows, increasing [s]. Recorded times without significant jitter are kept.
+        jitter: Standard deviation of true minus recorded intervals, divided by the mean interval [1]. 0 if the recorded
+            times are kept.
         reconstructed: True if t is reconstructed from q and qd.
     """
 
@@ -108,50 +108,56 @@ class TrueTime(NamedTuple):
 
 
 def true_time(recording: Recording) -> TrueTime:
-    """Returns the times of the distinct rows, reconstructed from q and qd if the recorded times jitter.
+    """Returns the times of the distinct rows, reconstructed from q and qd if the recorded times have jitter.
 
-    The interval dt_i between two rows maximises the posterior of dq_ij = qd_ij dt_i + noise_j over the joints j whose
-    qd agrees with dq/dt (`velocity_agreement`), with the mean interval as the prior:
+    The model is dq_ij = qd_ij dt_i + noise_j, over the joints j whose qd agrees with dq/dt (`velocity_agreement`). The
+    maximum-a-posteriori interval dt_i between two rows, with the mean interval dt_0 as prior mean, is
 
         dt_i = (sum_j dq_ij qd_ij / s_j^2 + dt_0 / s^2) / (sum_j qd_ij^2 / s_j^2 + 1 / s^2)
 
-    Here qd_ij is the mean of both rows. The deviations s_j of the noise and s of the intervals are estimated together
-    with the intervals. The sum of the intervals is scaled to the recorded duration.
+    Here qd_ij is the mean of both rows. The standard deviations s_j of the noise and s of the intervals are estimated
+    together with the intervals. The sum of the intervals is scaled to the recorded duration.
 
     Raises:
         RecordingError: The recording has no times, or they do not increase.
     """
     t = increasing_times(recording)
     rows = np.flatnonzero(~repeated_rows(recording))
-    own = t[rows]
+    recorded = t[rows]
     if recording.qd is None or len(rows) < MIN_ROWS:
-        return TrueTime(rows, own, 0.0, False)
-    q, qd, mean = recording.q[rows], recording.qd[rows], float(np.mean(np.diff(own)))
-    made = own
-    # Jitter first hides the agreement of some joints. It is evaluated again with the times from the other joints.
+        return TrueTime(rows, recorded, 0.0, False)
+    q, qd, mean = recording.q[rows], recording.qd[rows], float(np.mean(np.diff(recorded)))
+    reconstructed = recorded
+    # With jitter, some joints disagree at first. Their agreement is tested again with the reconstructed times.
     for _ in range(2):
-        even = np.linspace(own[0], own[-1], len(own))
-        agrees = velocity_agreement(resample(made, q, even), resample(made, qd, even), 1 / mean).agrees
+        even = np.linspace(recorded[0], recorded[-1], len(recorded))
+        resampled_q, resampled_qd = (resample(reconstructed, x, even) for x in (q, qd))
+        agrees = velocity_agreement(resampled_q, resampled_qd, 1 / mean).agrees
         if np.sum(agrees) < MIN_JOINTS:
-            return TrueTime(rows, own, 0.0, False)
+            return TrueTime(rows, recorded, 0.0, False)
         dq, mean_qd = np.diff(q[:, agrees], axis=0), ((qd[1:] + qd[:-1]) / 2)[:, agrees]
         intervals, noise = _intervals(dq, mean_qd, mean)
-        intervals *= (own[-1] - own[0]) / np.sum(intervals)
-        made = _without_drift(own, own[0] + np.concatenate([[0.0], np.cumsum(intervals)]), mean)
-    if _left(dq, mean_qd, np.diff(own), noise) < WORSE * _left(dq, mean_qd, intervals, noise):
-        return TrueTime(rows, own, 0.0, False)
-    return TrueTime(rows, made, float(np.std(np.diff(made) - np.diff(own))) / mean, True)
+        intervals *= (recorded[-1] - recorded[0]) / np.sum(intervals)
+        integrated = recorded[0] + np.concatenate([[0.0], np.cumsum(intervals)])
+        reconstructed = _without_drift(recorded, integrated, mean)
+    variance = _residual_variance(dq, mean_qd, np.diff(recorded), noise)
+    if variance < MIN_VARIANCE_RATIO * _residual_variance(dq, mean_qd, intervals, noise):
+        return TrueTime(rows, recorded, 0.0, False)
+    jitter = float(np.std(np.diff(reconstructed) - np.diff(recorded))) / mean
+    return TrueTime(rows, reconstructed, jitter, True)
 
 
-def _without_drift(own: NDArray[np.float64], made: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
-    """Removes the slow drift of the reconstructed times. An error of 1 % in qd causes a drift of milliseconds."""
-    lead = made - own
-    intervals = np.diff(own + lead - low_pass(lead, 1 / mean, DRIFT))
-    return own[0] + np.concatenate([[0.0], np.cumsum(np.maximum(intervals, MIN_LENGTH * mean))])
+def _without_drift(
+    recorded: NDArray[np.float64], reconstructed: NDArray[np.float64], mean: float
+) -> NDArray[np.float64]:
+    """Removes the drift of the reconstructed times below `DRIFT`, which is caused by small errors of qd."""
+    difference = reconstructed - recorded
+    intervals = np.diff(recorded + difference - low_pass(difference, 1 / mean, DRIFT))
+    return recorded[0] + np.concatenate([[0.0], np.cumsum(np.maximum(intervals, MIN_INTERVAL * mean))])
 
 
 def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
-    """Returns a mask (m,) of moving rows in which q, qd and tau repeat the row before, because of too fast polling."""
+    """Returns a mask (m,) of the rows in motion whose q, qd and tau repeat the previous row."""
     blocks = [block for block in (recording.q, recording.qd, recording.tau) if block is not None]
     repeats = np.all([repeated_block(block) for block in blocks], axis=0)
     moves = np.any(np.abs(recording.qd) > 0, axis=1) if recording.qd is not None else np.ones(len(recording), bool)
@@ -159,7 +165,7 @@ def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
 
 
 def repeated_block(block: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Returns a mask (m,) of the rows of a block (m, n) that repeat the row before in all columns."""
+    """Returns a mask (m,) of the rows of a block (m, n) that repeat the previous row in all columns."""
     same = SAME_VALUE * np.sqrt(np.mean(block**2, axis=0))
     return np.concatenate([[False], np.all(np.abs(np.diff(block, axis=0)) <= same, axis=1)])
 
@@ -171,13 +177,13 @@ def increasing_times(recording: Recording) -> NDArray[np.float64]:
         RecordingError: There are no times, or they do not increase.
     """
     if recording.t is None:
-        raise RecordingError(f"{recording.source or 'recording'}: has no times; a motion needs a column t [s]")
-    back = np.flatnonzero(np.diff(recording.t) <= 0)
-    if len(back):
-        row = int(back[0]) + 1
+        raise RecordingError(f"{recording.source or 'recording'}: the recording has no times. Add a column t [s].")
+    decreasing = np.flatnonzero(np.diff(recording.t) <= 0)
+    if len(decreasing):
+        row = int(decreasing[0]) + 1
         raise RecordingError(
             f"{recording.where(row)}: t = {recording.t[row]:g} s does not increase, after {recording.t[row - 1]:g} s "
-            "in the row before; rows must follow in time"
+            "in the previous row. Sort the rows by time."
         )
     return recording.t
 
@@ -185,7 +191,16 @@ def increasing_times(recording: Recording) -> NDArray[np.float64]:
 def _intervals(
     dq: NDArray[np.float64], qd: NDArray[np.float64], mean: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns intervals (k - 1,) [s] and the noise variance of each joint for dq and qd (k - 1, joints)."""
+    """Estimates the intervals between rows, see `true_time`.
+
+    Args:
+        dq: Position increments (k - 1, j) of j joints [rad, m].
+        qd: Mean velocities (k - 1, j) of both rows [rad/s, m/s].
+        mean: Mean interval [s].
+
+    Returns:
+        Intervals (k - 1,) [s], and noise variances (j,) of the position increments [rad^2, m^2].
+    """
     tiny = np.finfo(float).tiny
     noise = np.var(dq - qd * mean, axis=0) + tiny
     spread = (0.5 * mean) ** 2
@@ -195,11 +210,11 @@ def _intervals(
         # Expectation maximisation: the uncertainty of an interval contributes to both variances.
         noise = np.mean((dq - qd * intervals[:, None]) ** 2 + qd**2 / precision[:, None], axis=0) + tiny
         spread = float(np.mean((intervals - mean) ** 2 + 1 / precision))
-    return np.maximum(intervals, MIN_LENGTH * mean), noise
+    return np.maximum(intervals, MIN_INTERVAL * mean), noise
 
 
-def _left(
+def _residual_variance(
     dq: NDArray[np.float64], qd: NDArray[np.float64], intervals: NDArray[np.float64], noise: NDArray[np.float64]
 ) -> float:
-    """Returns the median over rows of the squared residual of dq - qd dt in units of the noise, robust to spikes."""
+    """Returns the median over the rows of the squared residual dq - qd dt in units of the noise variance."""
     return float(np.median(np.sum((dq - qd * intervals[:, None]) ** 2 / noise, axis=1)))

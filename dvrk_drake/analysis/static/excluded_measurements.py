@@ -1,4 +1,4 @@
-"""Finds measurements that are not holding torques: poses at a joint stop, and torques beyond the effort limit."""
+"""Finds the measurements to exclude: poses at a joint stop, efforts beyond their limit, and outliers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ STOP_MARGIN = 0.01, 0.002
 
 @dataclass(frozen=True)
 class ExcludedMeasurement:
-    """Measurement that is not used, with the name of the pose in `where` and a readable `reason`."""
+    """Efforts of one pose that are excluded.
+
+    Attributes:
+        row: Row of the recording.
+        joints: Indices of the joints whose efforts are excluded, starting at 0.
+        where: File and line of the pose.
+        reason: Reason as text.
+    """
 
     row: int
     joints: tuple[int, ...]
@@ -28,32 +35,35 @@ class ExcludedMeasurement:
 def find_excluded(
     recording: Recording, arm: Arm, measured: NDArray[np.bool_] | None = None
 ) -> list[ExcludedMeasurement]:
-    """Returns the measurements to exclude before any fit.
+    """Returns the measurements to exclude before any fit: poses at a joint stop and efforts beyond their limit.
 
-    A stop carries load, so the torques of its joints are not holding torques.
+    A stop carries part of the load, so the torques of its joints are not holding torques.
 
     Args:
         recording: Recording in joint coordinates, with efforts.
         arm: Arm with the limits.
-        measured: (m, n) False where an effort is not a holding torque and need not be excluded. By default all are.
+        measured: Mask (m, n) of the efforts that are holding torques. Other efforts are not listed. None means all.
     """
     excluded = []
     A, lower, upper = arm.limit_matrix()
     names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
     values = recording.q @ A.T
-    # A coupled limit is the position at first contact, and its stop is soft. It has no margin.
+    # A coupled limit has no margin, because its value is the position at first contact with a soft stop.
     margin = np.concatenate([arm.per_joint(*STOP_MARGIN), np.zeros(len(arm.coupled_limits))])
     at_stop = (values < lower + margin) | (values > upper - margin)
     for row, limit in np.argwhere(at_stop):
         joints = tuple(int(j) for j in np.flatnonzero(A[limit]))
         stop = lower[limit] if values[row, limit] < (lower[limit] + upper[limit]) / 2 else upper[limit]
-        reason = f"{names[limit]} at {values[row, limit]:.3f} rests on its stop ({stop:.3f})"
+        unit = "m" if limit < arm.num_joints and arm.prismatic[limit] else "rad"
+        reason = f"{names[limit]} at {values[row, limit]:.3f} {unit} is at its stop ({stop:.3f} {unit})"
         excluded.append(ExcludedMeasurement(int(row), joints, recording.where(int(row)), reason))
     tau = recording.measured_effort()
     usable = usable_measurements(tau.shape, excluded)
     for row, joint in np.argwhere((np.abs(tau) > arm.effort_limits) & usable):
+        unit = _effort_unit(arm, joint)
         reason = (
-            f"{arm.joint_names[joint]} effort {tau[row, joint]:.3g} exceeds its limit {arm.effort_limits[joint]:.3g}"
+            f"{arm.joint_names[joint]} effort {tau[row, joint]:.3g} {unit} exceeds its limit of "
+            f"{arm.effort_limits[joint]:.3g} {unit}"
         )
         excluded.append(ExcludedMeasurement(int(row), (int(joint),), recording.where(int(row)), reason))
     if measured is not None:
@@ -65,34 +75,40 @@ def find_excluded(
 
 
 def check_effort_unit(recording: Recording, arm: Arm) -> None:
-    """Rejects efforts beyond the capability of the motors, which indicate another unit.
+    """Rejects efforts that are probably in another unit.
 
     Raises:
-        RecordingError: Most efforts of a joint exceed its limit.
+        RecordingError: The median absolute effort of a joint exceeds its limit.
     """
     typical = np.median(np.abs(recording.measured_effort()), axis=0)
     if np.any(typical > arm.effort_limits):
         joint = int(np.argmax(typical / arm.effort_limits))
-        unit = "N" if arm.prismatic[joint] else "N m"
+        unit = _effort_unit(arm, joint)
         raise RecordingError(
-            f"{recording.source}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its limit of "
-            f"{arm.effort_limits[joint]:.3g} {unit}; are they in N m (N on a prismatic joint), and of this joint?"
+            f"{recording.source or 'recording'}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its "
+            f"limit of {arm.effort_limits[joint]:.3g} {unit}. Check the unit (N m, or N if prismatic) and the joint of "
+            "this column."
         )
 
 
 def exclude_outliers(
     recording: Recording, arm: Arm, outliers: NDArray[np.bool_], residuals: NDArray[np.float64]
 ) -> list[ExcludedMeasurement]:
-    """Returns the measurements that a robust fit rejected, for masks and residuals (m, n)."""
+    """Returns the outliers of a robust fit, for a mask (m, n) and residuals (m, n) [N m, N]."""
     return [
         ExcludedMeasurement(
             int(row),
             (int(joint),),
             recording.where(int(row)),
-            f"{arm.joint_names[joint]} effort is {residuals[row, joint]:+.2g} away from what all other poses say",
+            f"{arm.joint_names[joint]} effort is an outlier (residual {residuals[row, joint]:+.2g} "
+            f"{_effort_unit(arm, joint)})",
         )
         for row, joint in np.argwhere(outliers)
     ]
+
+
+def _effort_unit(arm: Arm, joint: int) -> str:
+    return "N" if arm.prismatic[joint] else "N m"
 
 
 def usable_measurements(shape: tuple[int, int], excluded: list[ExcludedMeasurement]) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Weighted least squares over poses, with shrinkage, robust weights and closed-form leave-one-pose-out residuals."""
+"""Weighted least squares over poses, with Gaussian priors, robust weights and closed-form leave-one-out residuals."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: Residuals beyond the first number of robust standard deviations have less weight (Huber), beyond the second none.
+#: Residuals above these numbers of robust standard deviations get a smaller weight (Huber), and a weight of zero.
 HUBER_LIMIT, REJECTION_LIMIT = 3.0, 6.0
 
 
@@ -16,10 +16,10 @@ class LinearFit:
     """Fit of tau = X theta over m poses of n joints.
 
     Attributes:
-        theta: (p,) estimates.
-        covariance: (p, p) covariance of theta, for unit variance of the weighted residuals.
-        residuals: (m, n) measured minus fitted values of all measurements, including those with zero weight.
-        leave_one_out_residuals: (m, n) measured values minus predictions of a fit to all other poses.
+        theta: Estimates (p,) of the parameters.
+        covariance: Covariance (p, p) of theta, for unit variance of the weighted residuals.
+        residuals: Measured minus fitted values (m, n) of all measurements, including measurements with zero weight.
+        leave_one_out_residuals: Measured values minus predictions (m, n) of a fit to all other poses.
     """
 
     theta: NDArray[np.float64]
@@ -34,8 +34,8 @@ class RobustFit:
 
     Attributes:
         fit: Last weighted fit.
-        sigma: (n,) standard deviation of each joint's residual.
-        outliers: (m, n) mask of the rejected measurements.
+        sigma: Standard deviations (n,) of the residuals of each joint.
+        outliers: Mask (m, n) of the rejected measurements.
     """
 
     fit: LinearFit
@@ -51,27 +51,27 @@ def weighted_fit(
 ) -> LinearFit:
     """Minimizes sum(weights (tau - X theta)^2) + sum(prior_precision theta^2).
 
-    The leave-one-out residuals are exact. For pose i with hat block H_i = X_i A^-1 X_i' W_i they are (I - H_i)^-1 e_i.
+    The leave-one-out residuals of pose i are exactly (I - H_i)^-1 e_i, with the hat block H_i = X_i A^-1 X_i' W_i.
 
     Args:
-        X: (m, n, p) regressor.
-        tau: (m, n) measured torques.
-        weights: (m, n) inverse variances; 0 excludes a measurement.
-        prior_precision: (p,) inverse variance of each parameter about zero; 0 for no shrinkage.
+        X: Regressor (m, n, p).
+        tau: Measured torques (m, n).
+        weights: Inverse variances (m, n); 0 excludes a measurement.
+        prior_precision: Inverse prior variances (p,) of the parameters about zero; 0 means no prior.
 
     Raises:
-        numpy.linalg.LinAlgError: The data and the prior together do not determine theta.
+        numpy.linalg.LinAlgError: Theta is not identifiable from the data and the prior.
     """
     WX = weights[..., None] * X
     A = np.einsum("mnp,mnr->pr", X, WX) + np.diag(prior_precision)
-    # Scale to a unit diagonal, because parameters range over decades (kg m at the shoulder, g mm at the handle).
+    # The matrix is scaled to a unit diagonal, because the parameters differ by orders of magnitude.
     scale = 1 / np.sqrt(np.diag(A))
     covariance = np.linalg.inv(A * np.outer(scale, scale)) * np.outer(scale, scale)
     theta = covariance @ np.einsum("mnp,mn->p", WX, tau)
     residuals = tau - X @ theta
     hat = np.einsum("mip,pr,mjr->mij", X, covariance, WX, optimize=True)
-    left_out = np.linalg.solve(np.eye(tau.shape[1]) - hat, residuals[..., None])[..., 0]
-    return LinearFit(theta, covariance, residuals, left_out)
+    leave_one_out = np.linalg.solve(np.eye(tau.shape[1]) - hat, residuals[..., None])[..., 0]
+    return LinearFit(theta, covariance, residuals, leave_one_out)
 
 
 def robust_fit(
@@ -86,13 +86,13 @@ def robust_fit(
     """Fits by iteratively reweighted least squares, with one variance per joint and reduced weights for outliers.
 
     Args:
-        X: (m, n, p) regressor.
-        tau: (m, n) measured torques.
-        usable: (m, n) False excludes a measurement.
-        prior_precision: (p,) prior precision, as in `weighted_fit`.
-        sigma_floor: (n,) least standard deviation to assume for each joint.
+        X: Regressor (m, n, p).
+        tau: Measured torques (m, n).
+        usable: Mask (m, n) of the measurements that are not excluded.
+        prior_precision: Inverse prior variances (p,), see `weighted_fit`.
+        sigma_floor: Smallest standard deviations (n,) of the joints.
         iterations: Number of reweighting iterations.
-        start: (n,) initial standard deviations. By default they are the spread of tau.
+        start: Initial standard deviations (n,). None uses robust standard deviations of tau.
     """
     sigma = np.maximum(_spread(tau, usable) if start is None else start, sigma_floor)
     weights = usable.astype(float)
@@ -114,10 +114,10 @@ def rms(values: NDArray[np.float64]) -> float:
 
 
 def _spread(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Returns a robust standard deviation about zero of each column: 1.4826 median |x|, with a lower limit.
+    """Returns a robust standard deviation (n,) about zero of each column: 1.4826 median |x|, with a lower limit.
 
-    The lower limit is half of the estimate from the 90 % quantile. Friction keeps many torques of a wrist near zero, so
-    the median alone may be 0.
+    The lower limit is half of the estimate from the 90 % quantile. The median alone may be 0, because friction keeps
+    many torques of a wrist near zero.
     """
     masked = np.where(usable, np.abs(values), np.nan)
     enough = usable.sum(axis=0) >= 3

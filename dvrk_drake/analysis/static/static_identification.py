@@ -1,4 +1,4 @@
-"""Identifies the static model from recorded poses and holding torques (paper, III.I, with extensions)."""
+"""Identifies the static model from poses and holding torques (Rutfield et al., 2015, III.I, with extensions)."""
 
 from __future__ import annotations
 
@@ -34,17 +34,19 @@ from dvrk_drake.recordings.recording import REST_SPEED, SAME_POSE, Recording
 
 Method = Literal["robust", "paper"]
 
-#: Fewest distinct poses for an identification.
+#: Smallest number of distinct poses for an identification.
 MIN_POSES = 8
-#: Least measured torque of a joint, as a share of its effort limit, for using its model. A joint below it is used only
-#: if its leave-one-out error is below the second share of its torque.
-MIN_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
-#: Least travel of a joint, as a share of its range, for using its model. Elsewhere its torque would be extrapolated.
+#: A joint with an RMS torque below the first number, as a share of its effort limit, gets a feedforward only if the
+#: ratio of its leave-one-out error to its RMS torque is at most the second number.
+MIN_TORQUE, MAX_SMALL_TORQUE_RATIO = 0.02, 0.5
+#: Smallest covered range of a joint with a feedforward, as a share of the range between its limits. Over a smaller
+#: range, most torques would be extrapolated.
 MIN_MOTION = 0.02
-#: Least travel for low-speed segments of a motion. Over less travel, friction has the same direction in all of them.
+#: Smallest covered range for low-speed segments. Over a smaller range, friction has the same sign in all segments.
 MIN_SEGMENT_MOTION = 0.05
-#: Largest ratio of the leave-one-out RMS error to that of zero torque. Above it the feedforward scale is reduced.
-MIN_GAIN_RATIO = 0.98
+#: Largest ratio of the leave-one-out error to the RMS torque for a feedforward scale of 1.
+MAX_ERROR_RATIO = 0.98
+#: Number of folds for cross-validation.
 FOLDS = 10
 
 
@@ -53,10 +55,10 @@ class StaticIdentification(Identification):
     """Model identified from poses.
 
     Attributes:
-        excluded: Measurements that were excluded, with reasons.
-        residuals: (m, n) measured minus fitted efforts [N m; N].
-        leave_one_out_residuals: (m, n) measured efforts minus predictions from all other poses [N m; N].
-        measured: (m, n) False where an effort is not a holding torque.
+        excluded: Excluded measurements, with reasons.
+        residuals: Measured minus fitted efforts (m, n) [N m; N].
+        leave_one_out_residuals: Measured efforts minus predictions from all other poses (m, n) [N m; N].
+        measured: Mask (m, n) of the efforts that are holding torques.
     """
 
     excluded: list[ExcludedMeasurement]
@@ -77,22 +79,22 @@ def identify_static(
     Method "paper" is unweighted least squares on the base parameters, eq. 9-10 of the paper.
 
     Method "robust" (default) weights each joint by its residual variance. It excludes measurements at joint stops and
-    outliers. Effects are chosen by leave-one-out cross-validation. A prior from the effort limits shrinks all
-    parameters toward zero. The feedforward scale of a joint is reduced if its leave-one-out error is no better than
-    that of zero torque, or if the joint hardly moved. Repeated samples of one pose are not independent, so they are
-    averaged first.
+    outliers. Effects are selected by leave-one-out cross-validation. A prior from the effort limits shrinks all
+    parameters towards zero. The feedforward scale of a joint is reduced if its leave-one-out error is not smaller than
+    the error of zero torque, or if the joint hardly moved. Repeated samples of one pose are averaged first, because
+    they are not independent.
 
     Args:
         recording: Poses with efforts, in joint or actuator coordinates.
         arm: Arm that was recorded.
         method: "robust" or "paper".
         progress: Callback that receives the finished share, 0 to 1.
-        measured: (m, n) False where an effort is not a holding torque, from `low_speed_segments`. By default all are.
+        measured: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None means all.
 
     Raises:
-        RecordingError: The recording does not fit the arm or has no efforts.
-        IdentificationError: There are too few poses, the recording is a motion, or (method "paper") the rank is too
-            low.
+        RecordingError: The recording does not match the arm or has no efforts.
+        IdentificationError: There are too few poses, the recording is a motion, or with the method "paper" the base
+            parameters are not identifiable.
     """
     from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
 
@@ -114,11 +116,11 @@ def identify_static(
     if method == "paper":
         if rank < Y.shape[2]:
             raise IdentificationError(
-                f"{recording.source}: {len(recording)} poses determine only {rank} of {Y.shape[2]} base parameters; "
-                "least squares has no unique answer: record more varied poses or use --method robust"
+                f"{recording.source or 'recording'}: {len(recording)} poses determine only {rank} of {Y.shape[2]} base "
+                "parameters, so least squares has no unique solution. Record more varied poses, or use --method robust."
             )
         fit = weighted_fit(Y, tau, measured.astype(float), np.zeros(Y.shape[2]))
-        # With unit weights, the covariance is scaled by the residual variance, as in textbooks.
+        # The weights are 1, so the covariance is multiplied by the residual variance.
         variance = np.sum(fit.residuals[measured] ** 2) / (np.sum(measured) - Y.shape[2])
         validated, sd = fit.leave_one_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
     else:
@@ -167,10 +169,10 @@ def identify_static(
 
 
 def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recording:
-    """Returns the poses in joint coordinates, with repeated poses averaged if `averaged`.
+    """Returns the poses in joint coordinates. Repeated poses are averaged if `averaged` is True.
 
     Raises:
-        RecordingError: The recording does not fit the arm or has no efforts.
+        RecordingError: The recording does not match the arm or has no efforts.
         IdentificationError: There are too few poses, or the recording is a motion.
     """
     recording.check_fits(arm)
@@ -184,11 +186,11 @@ def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recor
 
 
 def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
-    """Averages repeated poses, whose joints agree with the first row within `SAME_POSE`, to one row per pose."""
-    same = arm.per_joint(*SAME_POSE)
+    """Averages repeated poses to one row per pose. All joints of repeated poses agree within `SAME_POSE`."""
+    tolerance = arm.per_joint(*SAME_POSE)
     groups: list[list[int]] = []
     for row, q in enumerate(recording.q):
-        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < same)), None)
+        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < tolerance)), None)
         if group is None:
             groups.append([row])
         else:
@@ -209,35 +211,41 @@ def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
 def _check_rest(recording: Recording, arm: Arm) -> None:
     if motion := recording.motion(arm):
         raise IdentificationError(
-            f"{recording.source}: the arm moves ({motion}); static identification needs poses at rest, below "
-            f"{REST_SPEED[0]} rad/s, or the slow parts of a motion (--low-speed-segments)"
+            f"{recording.source or 'recording'}: the arm moves ({motion}). Static identification requires poses at "
+            f"rest (below {REST_SPEED[0]} rad/s) or the low-speed segments of a motion (--low-speed-segments)."
         )
 
 
 def _check_poses(recording: Recording, arm: Arm) -> None:
     if len(recording) < MIN_POSES:
         raise IdentificationError(
-            f"{recording.source}: has {len(recording)} distinct pose{'s' * (len(recording) != 1)}, too few to identify "
-            f"from; at least {MIN_POSES}, better 40 or more that cover the arm's range"
+            f"{recording.source or 'recording'}: {len(recording)} distinct pose{'s' * (len(recording) != 1)} found. "
+            f"Identification requires at least {MIN_POSES}. Record 40 or more poses that cover the range of the arm."
         )
     check_effort_unit(recording, arm)
 
 
 def _feedforward_scales(
-    problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]
+    problem: StaticProblem, leave_one_out: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Returns the feedforward scale (n,) of each joint: 1 unless leave-one-out is no better than zero torque."""
+    """Returns the feedforward scale (n,) of each joint, below 1 if the model is not better than zero torque.
+
+    Args:
+        problem: Problem with the poses and torques.
+        leave_one_out: Leave-one-out residuals (m, n) [N m, N].
+        usable: Mask (m, n) of the measurements that are not excluded.
+    """
     arm = problem.arm
-    least_motion = MIN_MOTION * (arm.position_upper - arm.position_lower)
+    min_motion = MIN_MOTION * (arm.position_upper - arm.position_lower)
     feedforward_scale = np.ones(arm.num_joints)
     for j in range(arm.num_joints):
         use = usable[:, j]
-        measured, predicted = problem.tau[use, j], (problem.tau - left_out)[use, j]
+        measured, predicted = problem.tau[use, j], (problem.tau - leave_one_out)[use, j]
         ratio = rms(measured - predicted) / max(rms(measured), 1e-12)
         small = rms(measured) < MIN_TORQUE * arm.effort_limits[j]
-        if not np.any(use) or np.ptp(problem.q[use, j]) <= least_motion[j] or (small and ratio > CLEAR_GAIN_RATIO):
+        if not np.any(use) or np.ptp(problem.q[use, j]) <= min_motion[j] or (small and ratio > MAX_SMALL_TORQUE_RATIO):
             feedforward_scale[j] = 0.0
-        elif ratio > MIN_GAIN_RATIO:
+        elif ratio > MAX_ERROR_RATIO:
             power = np.sum(predicted**2)
             feedforward_scale[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
     return feedforward_scale
@@ -246,41 +254,41 @@ def _feedforward_scales(
 def _segments_support(
     problem: StaticProblem, validated: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Returns (n,) whether low-speed segments of a motion support a torque on each joint.
+    """Returns a mask (n,) of the joints that may get a feedforward from low-speed segments.
 
-    Few segments or a short travel cannot separate gravity from friction, which leave-one-out does not show: the
-    left-out segment and its neighbours have the same friction. A joint needs `MIN_POSES` segments over
-    `MIN_SEGMENT_MOTION` of its range, and a cross-validated error below that of zero torque.
+    Few segments or a small range cannot separate gravity from friction. Leave-one-out cross-validation does not detect
+    this, because neighbouring segments have the same friction. A joint therefore requires `MIN_POSES` segments over
+    `MIN_SEGMENT_MOTION` of its range, and a cross-validated error below the error of zero torque.
     """
     arm = problem.arm
     supported = np.zeros(arm.num_joints, dtype=bool)
-    for j, travel in enumerate(MIN_SEGMENT_MOTION * (arm.position_upper - arm.position_lower)):
+    for j, min_range in enumerate(MIN_SEGMENT_MOTION * (arm.position_upper - arm.position_lower)):
         use = usable[:, j]
-        if np.sum(use) >= MIN_POSES and np.ptp(problem.q[use, j]) >= travel:
-            supported[j] = rms(validated[use, j]) < MIN_GAIN_RATIO * rms(problem.tau[use, j])
+        if np.sum(use) >= MIN_POSES and np.ptp(problem.q[use, j]) >= min_range:
+            supported[j] = rms(validated[use, j]) < MAX_ERROR_RATIO * rms(problem.tau[use, j])
     return supported
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
-    """Returns the residuals (m, n) of ten-fold cross-validation, with a new selection and fit in every fold."""
+    """Returns the residuals (m, n) of a 10-fold cross-validation, with a new selection and fit for each fold."""
     poses = len(problem.q)
     folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
     residuals = np.empty_like(problem.tau)
     for fold in range(folds.max() + 1):
-        rest = problem.subset(folds != fold)
-        effects = select_effects(rest)
-        robust = rest.fit(effects)
-        feedforward_scale = _feedforward_scales(
-            rest, robust.fit.leave_one_out_residuals, rest.usable & ~robust.outliers
-        )
-        out = problem.subset(folds == fold)
-        residuals[folds == fold] = out.tau - feedforward_scale * (out.regressor(effects) @ robust.fit.theta)
+        training = problem.subset(folds != fold)
+        effects = select_effects(training)
+        robust = training.fit(effects)
+        usable = training.usable & ~robust.outliers
+        feedforward_scale = _feedforward_scales(training, robust.fit.leave_one_out_residuals, usable)
+        held_out = problem.subset(folds == fold)
+        predicted = feedforward_scale * (held_out.regressor(effects) @ robust.fit.theta)
+        residuals[folds == fold] = held_out.tau - predicted
         progress((fold + 2) / (FOLDS + 1))
     return residuals
 
 
 def _scaled(fit: LinearFit, tau: NDArray[np.float64], feedforward_scale: NDArray[np.float64]) -> LinearFit:
-    """Returns the fit with residuals of the scaled predictions."""
+    """Returns the fit with the residuals for predictions multiplied by the feedforward scale (n,)."""
     return LinearFit(
         fit.theta,
         fit.covariance,

@@ -23,11 +23,20 @@ from dvrk_drake.recordings.recording import Recording
 
 @dataclass(frozen=True)
 class JointError:
-    """Error of one joint over a recording, RMS in N m (N if prismatic), in the coordinates of the recording.
+    """RMS torque error of one joint over a recording, in the coordinates of the recording.
 
-    `rms_torque` is the error of commanding zero torque. `relative_error` is rms_error / rms_torque, None if nothing was
-    measured. The fields `_included` omit `num_excluded` measurements of poses at a joint stop or beyond the effort
-    limit. `verdict` refers to the included measurements, see `judge`.
+    Attributes with the suffix `_included` omit the excluded measurements.
+
+    Attributes:
+        name: Name of the joint.
+        rms_torque: RMS measured torque, which is the error of zero torque [N m, N if prismatic].
+        rms_error: RMS of measured minus predicted torque [N m, N if prismatic].
+        relative_error: rms_error / rms_torque [1], None if the torque is 0.
+        rms_torque_included: RMS measured torque of the included measurements [N m, N if prismatic].
+        rms_error_included: RMS error of the included measurements [N m, N if prismatic].
+        relative_error_included: Relative error of the included measurements [1], None if their torque is 0.
+        num_excluded: Number of excluded measurements, at a joint stop or beyond the effort limit.
+        verdict: Verdict from the included measurements, see `judge`.
     """
 
     name: str
@@ -48,9 +57,9 @@ class StaticValidation(Validation):
     Attributes:
         joints: Errors of the joints, in the arm's order.
         poses: Number of poses.
-        residuals: (m, n) measured minus predicted efforts, in the recording's coordinates [N m; N].
-        excluded: Measurements that the verdicts omit, with reasons.
-        measured: (m, n) False where an effort is not a holding torque.
+        residuals: Measured minus predicted efforts (m, n), in the coordinates of the recording [N m; N].
+        excluded: Measurements that are excluded from the verdicts, with reasons.
+        measured: Mask (m, n) of the efforts that are holding torques.
     """
 
     joints: list[JointError]
@@ -70,7 +79,7 @@ class StaticValidation(Validation):
         return {joint.name: joint.relative_error_included for joint in self.joints}
 
     def as_dict(self) -> dict:
-        """Returns what `validate --json` writes."""
+        """Returns the data of `validate --json`."""
         return {
             "verdict": self.verdict,
             "rule": rule_text(in_motion=False),
@@ -81,7 +90,7 @@ class StaticValidation(Validation):
 
 
 def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
-    """Predicts the holding torques (m, n) at the recording's poses, in the recording's coordinates.
+    """Returns the predicted holding torques (m, n) at the poses of a recording, in its coordinates [N m, N].
 
     Raises:
         RecordingError: The recording does not fit the model's arm.
@@ -103,8 +112,7 @@ def validate_static(
     Args:
         model: Identified model.
         recording: Poses with efforts, in joint or actuator coordinates.
-        measured_joints: (m, n) False where an effort is not a holding torque, from `low_speed_segments`. By default all
-            are True.
+        measured_joints: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None means all.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or has no efforts.

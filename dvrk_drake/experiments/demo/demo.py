@@ -1,4 +1,4 @@
-"""Complete workflow on a simulated arm: collect, identify, validate, release, hold. Writes results to one folder."""
+"""Runs the complete workflow on a simulated arm: collection, identification, validation, release and step response."""
 
 from __future__ import annotations
 
@@ -31,34 +31,36 @@ from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+#: Numbers of poses for identification and for validation.
 POSES, FRESH_POSES = 40, 15
 #: Effort noise of one sample, as a share of the effort limit.
 EFFORT_NOISE = 0.01
-#: Maximum displacement of the true centres of mass along each axis [m].
+#: Maximum displacement of the ground-truth arm's centres of mass along each axis [m].
 MAX_SHIFT = 0.002
-#: End times of the phases of the release: pose held, arm released, arm driven home [s].
+#: End times of the segments of the release: regulated pose, released arm, motion to the home pose [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
+#: Duration of the step response [s].
 STEP_DURATION = 4.0
-#: Sample period of a motion [s].
+#: Sample period of the motions [s].
 SAMPLE_PERIOD = 0.01
 #: Note on the interpretation of the drift.
 NO_DRY_FRICTION = (
-    "Dry friction is not simulated here: every error of the model moves the released arm. On a real arm dry friction "
-    "resists this drift."
+    "The simulation has no dry friction, so every model error moves the released arm. On a real arm, dry friction "
+    "reduces this drift."
 )
 
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """Plan of the demo for one type of arm, with poses in rad and m.
+    """Effects, poses and settings of the demo for one type of arm.
 
     Attributes:
-        effects: Effects of the ground-truth arm that the nominal model does not have [N m].
-        release: Pose in which the arm is held and then released.
-        step: Start pose of the step to `home`.
-        home: Final pose of the release and of the step.
+        effects: Effects of the ground-truth arm that are not in the nominal model [N m].
+        release: Pose (n,) of the release [rad, m].
+        step: Start pose (n,) of the step to `home` [rad, m].
+        home: Final pose (n,) of the release and of the step [rad, m].
         step_title: Title of the plot of the step.
-        closure: Method that closes the loops of the ground-truth arm's linkage, see `add_arm`.
+        closure: Method for closing the loops of the ground-truth arm's linkage, see `add_arm`.
     """
 
     effects: tuple[DriveEffect, ...]
@@ -76,7 +78,7 @@ MTM_PLAN = DemoPlan(
         DriveEffect("joint.wrist_pitch", "cable sine", 1.0, -0.03),
     ),
     release=(0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5),
-    # Start pose of the paper's Fig. 7. Its q2 + q3 is beyond the stop of a real linkage.
+    # Start pose of the paper's Fig. 7. The sum q2 + q3 exceeds the limit of the real linkage.
     step=(0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0),
     home=(0.0,) * 7,
     step_title="Step of the paper's Fig. 7 to zero, gravity + PID",
@@ -106,15 +108,15 @@ class DemoResult:
     Attributes:
         arm: Arm of the demo.
         identification: Identification from the collected poses.
-        fresh: Errors of the identified model at poses that were not used for identification.
-        fresh_paper: Errors of the paper's least-squares method at the same poses.
+        fresh: Errors of the identified model at new poses, which are not used for identification.
+        fresh_paper: Errors of the paper's least-squares method at these new poses.
         release_time: Times (m,) of the release [s].
-        released: Positions (m, n) after the release with the identified model [rad, m].
-        released_nominal: Positions (m, n) after the release with the nominal model of the SDF [rad, m].
-        drift: Largest distance (n,) from the pose of the release, by model.
+        released: Positions (m, n) with the identified model [rad, m].
+        released_nominal: Positions (m, n) with the nominal model, which is that of the SDF [rad, m].
+        drift: Largest distance (n,) from the release pose [rad, m], by name of the model: "identified", "nominal".
         step_time: Times (k,) of the step [s].
-        step: Positions (k, n) of the step to home [rad, m].
-        step_error: Final distance (n,) from home [rad, m].
+        step: Positions (k, n) of the step to the home pose [rad, m].
+        step_error: Final distance (n,) from the home pose [rad, m].
     """
 
     arm: Arm
@@ -139,7 +141,7 @@ def run_demo(
     """Runs the demo and writes its results to an existing folder.
 
     Args:
-        output: Folder for model.yaml, poses.csv, fresh_poses.csv and arm.html, a Meshcat recording. `plot_demo` adds
+        output: Folder for model.yaml, poses.csv, fresh_poses.csv and arm.html (Meshcat animation). `plot_demo` adds the
             plots.
         arm_name: Name of the arm.
         seed: Seed of the ground-truth arm, the poses and the noise.
@@ -149,7 +151,7 @@ def run_demo(
         ArmError: The demo has no plan for this arm.
     """
     if arm_name not in PLANS:
-        raise ArmError(f'the demo has no plan for "{arm_name}"; it has for {", ".join(PLANS)}')
+        raise ArmError(f'the demo does not support the arm "{arm_name}"; allowed: {", ".join(PLANS)}')
     with TemporaryDirectory() as folder:
         return _run_demo(output, Path(folder) / "ground_truth_arm.sdf", arm_name, seed, progress)
 
@@ -159,14 +161,14 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     arm, plan = load_arm(arm_name), PLANS[arm_name]
     nominal = IdentifiedModel.from_arm(arm)
     links = perturbed_links(arm, generator, shift=MAX_SHIFT)
-    ground_truth_arm = with_links(arm, links, true_sdf, "no arm: drawn at random")
+    ground_truth_arm = with_links(arm, links, true_sdf, "a simulated arm with random link inertias")
 
     def station(meshcat: Meshcat | None = None) -> ArmStation:
         return damped_station(arm, ground_truth_arm, ArmEffects(cables=list(plan.effects)), plan.closure, meshcat)
 
-    def collect(count: int, what: str) -> Recording:
+    def collect(count: int, step: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)
-        # A person turns the platform and the handle (or the roll joint) within the range of a wrist, not by full turns.
+        # An operator rotates the platform and the handle (or the roll joint) only within the range of a wrist.
         poses[:, [3, 6]] = np.clip(poses[:, [3, 6]], -1.5, 1.5)
         return collect_static_poses(
             station(),
@@ -174,7 +176,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
             poses,
             effort_noise=EFFORT_NOISE,
             generator=generator,
-            progress=lambda share: progress(what, share),
+            progress=lambda share: progress(step, share),
         )
 
     poses = collect(POSES, "collecting poses")
@@ -190,7 +192,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     fresh_paper = validate_static(paper_model, fresh_poses)
 
     def third(index: int) -> Callable[[float], object]:
-        return lambda share: progress("releasing and holding", (index + share) / 3)
+        return lambda share: progress("simulating release and step", (index + share) / 3)
 
     meshcat = start_meshcat(arm)
     t, released = _release(station(meshcat), model, plan, meshcat, third(0))
@@ -202,7 +204,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     window = (t >= HELD_UNTIL) & (t <= RELEASED_UNTIL)
     drift = {
         label: np.abs(q[window] - q[window][0]).max(axis=0)
-        for label, q in (("identified", released), ("as drawn", with_nominal))
+        for label, q in (("identified", released), ("nominal", with_nominal))
     }
     return DemoResult(
         arm,
@@ -222,7 +224,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
 def _closed_loop(
     station: ArmStation, model: IdentifiedModel, q_start: Sequence[float]
 ) -> tuple[Simulator, VectorLogSink, GravityPidController, ConstantVectorSource]:
-    """Returns a simulator of the arm at q_start, the log of its state, its controller, and the desired state."""
+    """Returns a simulator of the arm at q_start, the log of its state, its controller, and its desired state."""
     controller = GravityPidController(model)
     desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()
@@ -245,7 +247,7 @@ def _release(
     meshcat: Meshcat | None,
     progress: Callable[[float], object],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Holds a pose, releases the arm under gravity compensation, drives it home; returns t (m,) and q (m, n)."""
+    """Simulates regulation, release with gravity compensation, and motion home; returns t (m,) and q (m, n)."""
     simulator, log, controller, desired = _closed_loop(station, model, plan.release)
     root = simulator.get_mutable_context()
     settings = controller.GetMyMutableContextFromRoot(root)
@@ -264,7 +266,7 @@ def _release(
 def _step(
     station: ArmStation, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], object]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Simulates the step to home with gravity compensation and PID control; returns t (m,) and q (m, n)."""
+    """Simulates the step to the home pose with gravity compensation and PID; returns t (m,) [s] and q (m, n)."""
     simulator, log, _, desired = _closed_loop(station, model, plan.step)
     root = simulator.get_mutable_context()
     desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))

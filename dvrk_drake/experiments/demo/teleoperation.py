@@ -1,4 +1,4 @@
-"""Teleoperation of a PSM by a master arm in one Meshcat scene, with a simulated hand or with live controls."""
+"""Teleoperation of a PSM by a master arm in a Meshcat scene, with a simulated hand or with live controls."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
+#: Ratio of the motion of the tip to that of the handle.
 SCALE = 0.4
 #: Start poses of the arms [rad, m]: the handle in front of the operator, the instrument in the middle of its range.
 START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
 START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
-#: Positions of the bases [m], with equal orientation. The arms face each other, with handle and tip side by side.
-PLACES = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
+#: Positions of the bases in the world frame [m]. The orientations are equal.
+BASE_POSITIONS = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
 CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
-#: Intervals of the simulated motion in which the clutch is closed [s].
+#: Time intervals of the simulated motion in which the clutch is closed [s].
 ENGAGED = ((0.5, 9.7), (11.2, 16.0))
 DURATION = 16.0
 PERIOD = 0.02
@@ -47,8 +48,7 @@ class TeleoperationResult:
         handle_path: Length of the handle's path with a closed clutch [m].
         rms_position_error, max_position_error: RMS and maximum position error [m].
         rms_rotation_error, max_rotation_error: RMS and maximum rotation error [rad].
-        max_motion_held: Maximum distance of the tip from its position at the opening of the clutch, while it is open
-            [m].
+        max_motion_held: Maximum motion of the tip while the clutch is open [m].
     """
 
     handle_path: float
@@ -61,7 +61,13 @@ class TeleoperationResult:
 
 @dataclass(frozen=True)
 class _Samples:
-    """Samples at every `PERIOD`: whether the follower is active, and the poses of handle and tip in their bases."""
+    """Samples at every `PERIOD`.
+
+    Attributes:
+        following: Whether the follower is active.
+        X_MG: Poses of the handle in the base frame of the master.
+        X_FT: Poses of the tip in the base frame of the follower.
+    """
 
     following: list[bool]
     X_MG: list[RigidTransform]
@@ -71,10 +77,12 @@ class _Samples:
 def play_teleoperation(
     meshcat: Meshcat | None = None, duration: float = DURATION, progress: Callable[[float], object] = lambda share: None
 ) -> TeleoperationResult:
-    """Simulates a hand that draws, turns the handle, opens the clutch, returns and continues; records the animation.
+    """Simulates teleoperation with a prescribed motion of the hand, and records the animation.
+
+    The hand translates and rotates the handle, opens the clutch, moves back, closes the clutch and continues.
 
     Args:
-        meshcat: Meshcat that shows the arms and their paths; see `start_scene`.
+        meshcat: Meshcat that shows the arms and their paths, see `start_scene`. None for no animation.
         duration: Simulated part of the motion [s]. The whole motion takes `DURATION`.
         progress: Function called with the finished share, 0..1.
     """
@@ -108,9 +116,10 @@ def play_teleoperation(
 
 
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
-    """Simulates in real time with Meshcat controls for hand, clutch, jaw and scale, until Stop or `duration` [s].
+    """Simulates teleoperation in real time with controls for hand, clutch, jaw and scale in Meshcat.
 
-    A lamp above the master is green while the follower is active.
+    The simulation ends with the button Stop or after `duration` [s]. A lamp above the master is green while the
+    follower is active.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 
@@ -146,9 +155,9 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
 
 
 def start_scene(port: int | None = None) -> Meshcat:
-    """Starts a Meshcat with the camera on both arms and frames for them; uses a free port unless one is given."""
+    """Starts a Meshcat with the bases of both arms in the scene. Uses a free port if `port` is None."""
     meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
-    for name, p_WB in PLACES.items():
+    for name, p_WB in BASE_POSITIONS.items():
         meshcat.SetTransform(name, RigidTransform(np.array(p_WB)))
     return meshcat
 
@@ -158,7 +167,7 @@ def _make_arms(meshcat: Meshcat | None) -> TeleoperatedArms:
 
 
 def _moved(X: RigidTransform, move: RigidTransform) -> RigidTransform:
-    """Returns X rotated about its own origin and displaced, both along the axes of its base."""
+    """Returns X rotated about its origin and translated, both in the axes of the base frame."""
     return RigidTransform(move.rotation() @ X.rotation(), X.translation() + move.translation())
 
 
@@ -168,7 +177,7 @@ def _ramp(t: float, start: float, end: float) -> float:
 
 
 def _hand_motion(X_MG0: RigidTransform) -> PiecewisePose:
-    """Returns the motion of the handle from its pose X_MG0; the follower is active in the intervals `ENGAGED`."""
+    """Returns the motion of the handle from its start pose X_MG0. The clutch is closed in the intervals `ENGAGED`."""
 
     def move(t: float) -> RigidTransform:
         eight, circle = 2 * np.pi * _ramp(t, 0.7, 4.5), 2 * np.pi * _ramp(t, 11.5, 15.2)
@@ -204,13 +213,16 @@ def _evaluate(samples: _Samples) -> TeleoperationResult:
         G0, T0 = samples.X_MG[segment[0]], samples.X_FT[segment[0]]
         for i in segment:
             G, T = samples.X_MG[i], samples.X_FT[i]
-            way = T.translation() - T0.translation()
+            displacement = T.translation() - T0.translation()
             if not samples.following[i]:
-                held.append(float(np.linalg.norm(way)))
+                held.append(float(np.linalg.norm(displacement)))
                 continue
-            position.append(float(np.linalg.norm(way - SCALE * (G.translation() - G0.translation()))))
-            turned, wanted = T.rotation() @ T0.rotation().inverse(), G.rotation() @ G0.rotation().inverse()
-            rotation.append(_angle(turned @ wanted.inverse()))
+            position.append(float(np.linalg.norm(displacement - SCALE * (G.translation() - G0.translation()))))
+            rotation_tip, rotation_handle = (
+                T.rotation() @ T0.rotation().inverse(),
+                G.rotation() @ G0.rotation().inverse(),
+            )
+            rotation.append(_angle(rotation_tip @ rotation_handle.inverse()))
         if samples.following[segment[0]]:
             path += float(np.linalg.norm(np.diff(_points(samples.X_MG, segment)), axis=0).sum())
     return TeleoperationResult(
@@ -237,7 +249,7 @@ def _points(poses: list[RigidTransform], segment: range) -> NDArray[np.float64]:
 
 
 def _draw_paths(meshcat: Meshcat, samples: _Samples) -> None:
-    """Draws the paths in the arms' bases, blue with a closed clutch and grey with an open one."""
+    """Draws the paths of handle and tip, blue while the clutch is closed and grey while it is open."""
     for k, segment in enumerate(_segments(samples.following)):
         color = BLUE if samples.following[segment[0]] else GREY
         for name, poses in (("mtml", samples.X_MG), ("psm", samples.X_FT)):

@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.simulation import samples
 from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
@@ -27,11 +27,11 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 
 #: Sample period [s].
 SAMPLE_PERIOD = 0.02
-#: Duration of a release [s], and maximum distance from the release pose of an arm that counts as held [rad], [m].
+#: Duration of a release [s]; maximum distance from the release pose at which a joint counts as held [rad], [m].
 DURATION = 10.0
 BAND = 0.015, 0.0015
-#: Approach to the release pose: distance [rad], [m], duration [s], and holding time at the end [s].
-APPROACH, LEADING, RESTING = (0.2, 0.02), 1.0, 1.0
+#: Approach to the release pose: distance [rad], [m], duration [s], and settling time at the release pose [s].
+APPROACH, APPROACH_TIME, SETTLING_TIME = (0.2, 0.02), 1.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +41,12 @@ class Release:
     Attributes:
         arm: Name of the arm in the controller.
         ground_truth_arm: Arm to simulate.
-        parts: Simulated effects of the ground-truth arm, as for `ArmEffects.only`.
-        model: File of the controller's model.
-        start: Release pose (n,) [rad, m], at rest with unloaded friction.
-        led: Whether the arm first approaches the pose from a distance of `APPROACH`, which loads its friction.
+        parts: Names of the simulated effects, see `ArmEffects.only`.
+        model: Path of the controller's model file.
+        start: Release pose (n,) [rad, m]. Without an approach, the friction is unloaded there.
+        with_approach: Whether the arm first moves to the pose from a distance of `APPROACH`, which loads the friction.
         damped: Whether the controller damps the motion in addition to compensating gravity (mode "damped").
-        hysteresis_ratio: Compensated share of the hysteresis that moves an arm back after an approach.
+        hysteresis_ratio: Compensated share of the elastic part of the friction, which moves an arm back.
         duration: Duration [s].
         seed: Seed of the effects' noise.
     """
@@ -57,36 +57,36 @@ class Release:
     model: str
     start: NDArray[np.float64]
     damped: bool = False
-    led: bool = False
+    with_approach: bool = False
     hysteresis_ratio: float = 0.0
     duration: float = DURATION
     seed: int = 0
 
 
 def release(case: Release) -> NDArray[np.float64]:
-    """Simulates a release; returns the true positions (samples, n) at every `SAMPLE_PERIOD` after it."""
+    """Simulates a release; returns the true positions (samples, n) [rad, m] after it, one per `SAMPLE_PERIOD`."""
     arm = load_arm(case.arm)
     name = arm.name.lower()
     effects = case.ground_truth_arm.effects.only(case.parts)
     station = ArmStation(arm, plant_arm=case.ground_truth_arm, effects=effects, seed=case.seed)
     builder = DiagramBuilder()
-    way = _way(case, arm)
-    controller = GravityPidController(_model(case.model), mode="hold" if case.led else _mode(case))
+    trajectory = _approach_trajectory(case, arm)
+    controller = GravityPidController(_model(case.model), mode="hold" if case.with_approach else _mode(case))
     friction = None
     if case.hysteresis_ratio:
         friction = FrictionCompensator(Friction.of_arm(arm), ratio=0.0, hysteresis_ratio=case.hysteresis_ratio)
-    add_closed_loop(builder, station, controller, TrajectorySource(way, output_derivative_order=1), friction)
+    add_closed_loop(builder, station, controller, TrajectorySource(trajectory, output_derivative_order=1), friction)
     log = LogVectorOutput(station.GetOutputPort(f"{name}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
-    station.SetPositions(station.GetMyMutableContextFromRoot(context), way.value(0.0).ravel())
-    before = 0.0
-    if case.led:
-        before = LEADING + RESTING
-        simulator.AdvanceTo(before)
+    station.SetPositions(station.GetMyMutableContextFromRoot(context), trajectory.value(0.0).ravel())
+    start_time = 0.0
+    if case.with_approach:
+        start_time = APPROACH_TIME + SETTLING_TIME
+        simulator.AdvanceTo(start_time)
         controller.SetMode(controller.GetMyMutableContextFromRoot(context), _mode(case))
-    simulator.AdvanceTo(before + case.duration)
-    return samples(log, simulator)[round(before / SAMPLE_PERIOD) :, : arm.num_joints]
+    simulator.AdvanceTo(start_time + case.duration)
+    return samples(log, simulator)[round(start_time / SAMPLE_PERIOD) :, : arm.num_joints]
 
 
 def _mode(case: Release) -> Mode:
@@ -94,14 +94,14 @@ def _mode(case: Release) -> Mode:
     return "damped" if case.damped else "gravity"
 
 
-def _way(case: Release, arm: Arm) -> PiecewisePolynomial:
-    """Returns the trajectory to the release pose, which takes `LEADING`."""
-    q = from_where = np.asarray(case.start, float)
-    if case.led:
+def _approach_trajectory(case: Release, arm: Arm) -> PiecewisePolynomial:
+    """Returns the trajectory of duration `APPROACH_TIME` to the release pose; it is constant without an approach."""
+    q = first = np.asarray(case.start, float)
+    if case.with_approach:
         sides = np.random.default_rng(case.seed).choice([-1.0, 1.0], arm.num_joints)
-        from_where = beside(arm, q, sides * arm.per_joint(*APPROACH))
-    knots = np.column_stack([from_where, q])
-    return PiecewisePolynomial.CubicHermite([0.0, LEADING], knots, np.zeros_like(knots))
+        first = offset_pose(arm, q, sides * arm.per_joint(*APPROACH))
+    knots = np.column_stack([first, q])
+    return PiecewisePolynomial.CubicHermite([0.0, APPROACH_TIME], knots, np.zeros_like(knots))
 
 
 @cache
@@ -112,14 +112,14 @@ def _model(path: str) -> IdentifiedModel:
 def release_all(
     cases: Sequence[Release], executor: Executor, progress: Callable[[float], object] = lambda share: None
 ) -> NDArray[np.float64]:
-    """Simulates all releases; returns positions (cases, samples, n), which do not depend on the executor."""
+    """Simulates all releases; returns the positions (cases, samples, n). They do not depend on the executor."""
     futures = [executor.submit(release, case) for case in cases]
     return np.array(await_results(futures, progress))
 
 
 @dataclass(frozen=True, eq=False)
 class Drifts:
-    """Results of releases: `positions` (cases, samples, n) of `arm`."""
+    """Results of releases of `arm`: `positions` (cases, samples, n) [rad, m]."""
 
     arm: Arm
     positions: NDArray[np.float64]

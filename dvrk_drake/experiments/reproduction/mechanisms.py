@@ -1,4 +1,4 @@
-"""Mechanisms of the simulated arms: DH parameters of the MTM, remote centre and wrist axes of the PSM."""
+"""Evaluates the mechanisms of the simulated arms: DH parameters of the MTM, remote centre and wrist axes of the PSM."""
 
 from __future__ import annotations
 
@@ -18,16 +18,19 @@ POSES = 20
 
 
 def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
-    """Computes the DH table from the motion of the plant, and the largest error of its transforms.
+    """Computes the DH table from the motion of the plant.
 
-    The rows (n, 5) are sign, offset [rad], d [m], alpha [rad], a [m]. The error is in m or an entry of a rotation
-    matrix. The frames `paper_0..7` are fixed to the links, and the plant determines their relative motion. A joint
-    with another axis than that of its row would therefore cause an error.
+    The frames `paper_0..7` are fixed to the links, and the plant determines their relative motion. Therefore a joint
+    whose axis differs from its row causes an error.
+
+    Returns:
+        Table (n, 5) with the columns sign, offset [rad], d [m], alpha [rad], a [m], and the largest error of the
+        entries of its transformation matrices (translations in m).
     """
     plant = make_arm_plant(arm)
     poses = np.vstack([np.zeros(arm.num_joints), arm.sample_poses(POSES, np.random.default_rng(0))])
     links = np.array([_transforms(plant, arm, q) for q in poses])
-    rows, worst = [], 0.0
+    rows, max_error = [], 0.0
     for j in range(arm.num_joints):
         A = links[:, j]
         theta = np.arctan2(A[:, 1, 0], A[:, 0, 0])
@@ -36,29 +39,29 @@ def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
         alpha = float(np.arctan2(A[0, 2, 1], A[0, 2, 2]))
         a = float(A[0, :2, 3] @ [np.cos(theta[0]), np.sin(theta[0])])
         rows.append([sign, offset, float(A[0, 2, 3]), alpha, a])
-        again = np.array([_standard(sign * q + offset, rows[-1][2], alpha, a) for q in poses[:, j]])
-        worst = max(worst, float(np.abs(again - A).max()))
+        recomputed = np.array([_dh_transform(sign * q + offset, rows[-1][2], alpha, a) for q in poses[:, j]])
+        max_error = max(max_error, float(np.abs(recomputed - A).max()))
     table = np.round(rows, 12) + 0.0  # no -0
     table[:, [1, 3]] = np.where(table[:, [1, 3]] == np.round(-np.pi, 12), np.pi, table[:, [1, 3]])
-    return table, worst
+    return table, max_error
 
 
 def _transforms(plant: MultibodyPlant, arm: Arm, q: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Returns the transform (4, 4) of each joint between the frames of the table before and after it."""
+    """Returns the transforms (4, 4) between consecutive frames of the table, one per joint."""
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, q)
     frames = [plant.GetFrameByName(f"paper_{i}") for i in range(arm.num_joints + 1)]
-    return [behind.CalcPose(context, before).GetAsMatrix4() for before, behind in pairwise(frames)]
+    return [child.CalcPose(context, parent).GetAsMatrix4() for parent, child in pairwise(frames)]
 
 
-def _standard(theta: float, d: float, alpha: float, a: float) -> NDArray[np.float64]:
+def _dh_transform(theta: float, d: float, alpha: float, a: float) -> NDArray[np.float64]:
     """Returns the transform Rz(theta) Tz(d) Tx(a) Rx(alpha) (4, 4)."""
     c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
     return np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]])
 
 
 def published_row(row: TableRow) -> NDArray[np.float64]:
-    """Returns sign, offset [rad], d [m], alpha [rad], a [m] (5,) of a row of Table I, with the arm's real lengths."""
+    """Returns a row (5,) of Table I with the real lengths: sign, offset [rad], d [m], alpha [rad], a [m]."""
     d, a = ((-1) ** symbol.startswith("-") * LENGTHS[symbol.lstrip("-")] + 0.0 for symbol in (row.d, row.a))
     return np.array([row.sign, row.offset, d, row.alpha, a])
 
@@ -68,10 +71,11 @@ PSM_POSES = 200
 
 
 def mechanism_errors(arm: Arm) -> tuple[float, float]:
-    """Computes the errors of the PSM's mechanism over random poses.
+    """Evaluates the mechanism of the PSM at random poses.
 
-    These are the maximum distance of the shaft axis from the remote centre [m], and the minimum angle between the axes
-    of wrist pitch and wrist yaw [rad].
+    Returns:
+        Maximum distance of the shaft axis from the remote centre [m], and minimum angle between the axes of wrist pitch
+        and wrist yaw [rad].
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
@@ -86,8 +90,11 @@ def mechanism_errors(arm: Arm) -> tuple[float, float]:
     return remote, angle
 
 
-def _axis(plant: MultibodyPlant, context: Context, joint: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns a point and the direction of a joint axis in the world frame, whose origin is the remote centre."""
-    hinge = plant.GetJointByName(joint)
-    X_WJ = hinge.frame_on_parent().CalcPoseInWorld(context)
-    return X_WJ.translation(), X_WJ.rotation() @ hinge.revolute_axis()
+def _axis(plant: MultibodyPlant, context: Context, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns a point on a joint axis [m] and the direction of the axis, in the world frame.
+
+    The origin of the world frame is the remote centre.
+    """
+    joint = plant.GetJointByName(name)
+    X_WJ = joint.frame_on_parent().CalcPoseInWorld(context)
+    return X_WJ.translation(), X_WJ.rotation() @ joint.revolute_axis()

@@ -1,9 +1,7 @@
-"""The paper's published numbers and its recordings.
-
-`paper_model` converts the paper's twelve parameters to a model for our controller.
+"""Published numbers and recordings of the paper, and conversion of its parameters to a model for our controller.
 
 Source: Rutfield, Zia, Boos, Santoso, Sujumnong, "Gravity Compensation Control of da Vinci Robot", WPI 2015, and the
-team's repository WPI-AIM/dvrk_gravity_comp. Drifts are read off the team's plots.
+team's repository WPI-AIM/dvrk_gravity_comp. Drifts are digitised from the team's plots.
 """
 
 from __future__ import annotations
@@ -30,7 +28,13 @@ LENGTHS = {"0": 0.0, "L1": 0.0, "L2": 0.2794, "L3": 0.3645, "L4": 0.1506}
 
 
 class TableRow(NamedTuple):
-    """Row of Table I: sign and offset [rad] with theta = sign q + offset, then d and a as symbols, and alpha [rad]."""
+    """Row of Table I, the DH table of the MTM.
+
+    Attributes:
+        sign, offset: Sign and offset [rad] of the joint angle theta = sign q + offset.
+        d, a: Names of the lengths along z and x, see `LENGTHS`.
+        alpha: Twist angle [rad].
+    """
 
     sign: int
     offset: float
@@ -52,8 +56,9 @@ TABLE_1 = (
 
 #: The twelve parameters [kg m] in the paper's order, identified with g = 9.9 m/s^2 and used with 9.81.
 PARAMETERS = (0.0414, -0.0192, 0.0328, 0.0095, -0.0033, -0.0003, -0.0071, -0.0188, -0.0015, -0.0003, -0.0001, 0.0005)
-#: Link (from 1) and axis, in its frame of Table I, of the first moment that each parameter is, lumped with others.
-PARAMETER_PLACES = (
+#: First moment that each parameter represents: link (from 1), and axis of its frame in Table I. Each parameter also
+#: contains other moments with the same effect.
+PARAMETER_COMPONENTS = (
     (2, "x"),
     (2, "y"),
     (3, "x"),
@@ -67,7 +72,8 @@ PARAMETER_PLACES = (
     (7, "x"),
     (7, "y"),
 )
-IDENTIFIED_WITH, CONTROLLED_WITH = 9.9, 9.81
+#: Gravitational acceleration in the paper's identification and in its controller [m/s^2].
+IDENTIFICATION_GRAVITY, CONTROL_GRAVITY = 9.9, 9.81
 
 #: Mean squared errors of Fig. 4 over the 72 poses [(N m)^2], J2..J7.
 FIGURE_4_MEANS = (8.14e-3, 7.96e-3, 1.97e-3, 4.62e-4, 3.98e-5, 1.92e-5)
@@ -86,11 +92,11 @@ FIGURE_7_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
 FIGURE_7_MASSES = (0.9, 1.0, 0.9, 0.8, 0.4, 0.2, 0.2, 0.1)
 #: Indices of the joints whose damping term used positions instead of velocities.
 FIGURE_7_FAULTY = (4, 5, 6)
-#: Values read off Fig. 7: period of J2 [s], |J2| after 59 s, amplitude of J6, early and late amplitudes of J7 [rad].
-FIGURE_7_READ = {"J2 period": 22.0, "J2 at 59 s": 0.075, "J6": 0.022, "J7 early": 0.0115, "J7 late": 0.0155}
+#: Values digitised from Fig. 7: period of J2 [s]; |J2| after 59 s, amplitudes of J6 and of J7 (early, late) [rad].
+FIGURE_7_VALUES = {"J2 period": 22.0, "J2 at 59 s": 0.075, "J6": 0.022, "J7 early": 0.0115, "J7 late": 0.0155}
 
 
-#: Number of poses for the conversion to our base parameters; it must exceed the number of parameters.
+#: Number of poses for the conversion to our base parameters, which must exceed the number of parameters.
 _POSES = 40
 
 
@@ -108,17 +114,17 @@ def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETER
     torque = np.zeros(np.shape(q))
     for k, pose in enumerate(np.asarray(q, float)):
         set_arm_positions(plant, context, arm, pose)
-        for value, (link, axis) in zip(parameters, PARAMETER_PLACES, strict=True):
+        for value, (link, axis) in zip(parameters, PARAMETER_COMPONENTS, strict=True):
             frame = plant.GetFrameByName(f"paper_{link}")
             h_W = value * frame.CalcPoseInWorld(context).rotation().matrix()[:, "xyz".index(axis)]
             J = plant.CalcJacobianAngularVelocity(context, JacobianWrtVariable.kV, frame, world, world)
             # The links form a serial chain. Joints of the other bars of the linkage do not rotate them.
-            torque[k] += CONTROLLED_WITH * np.cross(J[:, tree].T, h_W)[:, 2]
+            torque[k] += CONTROL_GRAVITY * np.cross(J[:, tree].T, h_W)[:, 2]
     return torque
 
 
 def paper_model(arm: Arm) -> IdentifiedModel:
-    """Returns a model with the torque `paper_torque` in our base parameters, which span the same torques."""
+    """Returns a model whose torque equals `paper_torque`. Our base parameters span the torques of the paper."""
     q = arm.sample_poses(_POSES, np.random.default_rng(0))
     model = IdentifiedModel.from_arm(arm)
     Y = model.static_model.regressor(q)
@@ -129,38 +135,39 @@ def paper_model(arm: Arm) -> IdentifiedModel:
     return dataclasses.replace(model, base_parameters=parameters)
 
 
-def with_zeroed(model: IdentifiedModel, joints: Sequence[int]) -> IdentifiedModel:
-    """Returns the model with zero torque on `joints` (from 0), as in the paper's Fig. 6."""
+def with_zero_torque(model: IdentifiedModel, joints: Sequence[int]) -> IdentifiedModel:
+    """Returns the model with zero torque for the joints with indices `joints`, as in the paper's Fig. 6."""
     statistics = [
         dataclasses.replace(s, feedforward_scale=0.0) if j in joints else s for j, s in enumerate(model.joints)
     ]
     return dataclasses.replace(model, joints=statistics)
 
 
-#: Files of the paper's identification set and of the squared errors of its Fig. 4 (optional).
+#: Names of the files with the paper's identification poses and with the squared errors of its Fig. 4 (optional).
 STATIC, FIGURE_4 = "mtm_2015_good72.csv", "paper_fig4_squared_errors.csv"
-#: Arm that was recorded. The moment of its wrist brackets shows that it is an MTMR (docs/public_recordings.md).
+#: Recorded arm. The first moment of its wrist brackets shows that it is an MTMR (docs/public_recordings.md).
 PAPER_ARM = "mtmr"
-#: Environment variable with the folder that contains data/mtm_static; the tests use the same variable.
+#: Environment variable with the folder that contains data/mtm_static, also used by the tests.
 VARIABLE = "DVRK_DRAKE_SHARED"
+_INSTRUCTIONS = "To create it from the team's repository, see docs/public_recordings.md."
 
 
 @dataclass(frozen=True)
 class PaperRecordings:
-    """Files of the paper's recordings in `folder`, which is None if there are none."""
+    """Files of the paper's recordings in `folder`; None if the files are not available."""
 
     folder: Path | None
 
     @classmethod
     def find(cls, folder: str | Path | None) -> PaperRecordings:
-        """Finds the files in `folder`, or else below the folder of the environment variable DVRK_DRAKE_SHARED.
+        """Finds the files in `folder`. Default: data/mtm_static in the folder of the environment variable `VARIABLE`.
 
         Raises:
             RecordingError: `folder` was given and does not contain the recording.
         """
         if folder is not None:
             if not (Path(folder) / STATIC).is_file():
-                raise RecordingError(f"{folder}: no {STATIC} there; {_where_from()}")
+                raise RecordingError(f"{folder}: the folder does not contain {STATIC}. {_INSTRUCTIONS}")
             return cls(Path(folder))
         shared = os.environ.get(VARIABLE)
         below = Path(shared) / "data" / "mtm_static" if shared else None
@@ -174,7 +181,7 @@ class PaperRecordings:
             RecordingError: The recording does not exist.
         """
         if self.folder is None:
-            raise RecordingError(f"needs {STATIC}: name its folder with --data; {_where_from()}")
+            raise RecordingError(f"{STATIC} is required. Give its folder with --data. {_INSTRUCTIONS}")
         return read_recording(self.folder / STATIC)
 
     @property
@@ -191,9 +198,7 @@ class PaperRecordings:
         except ValueError as error:
             raise RecordingError(f"{path}: {error}") from error
         if table.shape != (72, 7):
-            raise RecordingError(f"{path}: must be 72 rows of pose, J2..J7; it is {table.shape}")
+            raise RecordingError(
+                f"{path}: the table must have 72 rows and 7 columns (pose, J2..J7); its shape is {table.shape}"
+            )
         return np.asarray(table[:, 1:])
-
-
-def _where_from() -> str:
-    return "docs/public_recordings.md says how to make it from the team's repository"

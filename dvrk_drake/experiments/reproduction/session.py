@@ -22,7 +22,7 @@ from dvrk_drake.experiments.reproduction.published import (
     PAPER_ARM,
     PaperRecordings,
     paper_model,
-    with_zeroed,
+    with_zero_torque,
 )
 from dvrk_drake.experiments.transparency import Compensation, OperatorForces, random_path, simulate_operator
 from dvrk_drake.models.arm import Arm, load_arm
@@ -36,10 +36,10 @@ class SampleSizes:
 
     Attributes:
         collected: Number of poses for the identification of an arm.
-        releases: Number of random release poses with our model.
-        paper_releases: Number of these poses for the paper's parameters.
-        hand_guided_releases: Number of these poses for our model with a previous approach.
-        psm_releases: Number of release poses of the PSM.
+        releases: Number of random release poses for our model.
+        paper_releases: Number of the first of these poses that are used for the paper's parameters.
+        hand_guided_releases: Number of the first of these poses that are used for our model after an approach.
+        psm_releases: Number of random release poses of the PSM.
         path_poses: Number of poses on the path of an operator.
         duration: Duration of a release [s].
     """
@@ -54,8 +54,15 @@ class SampleSizes:
 
 
 @dataclass(frozen=True, eq=False)
-class Identified:
-    """Ground-truth arm, poses collected on it, and the model identified from them, with its file."""
+class IdentifiedArm:
+    """Ground-truth arm and its identified model.
+
+    Attributes:
+        truth: Ground-truth arm.
+        poses: Static poses collected on the ground-truth arm.
+        model: Model identified from the poses.
+        file: Path of the model file.
+    """
 
     truth: GroundTruth
     poses: Recording
@@ -84,23 +91,26 @@ class ReproductionSession:
     seed: int = 0
 
     @cached_property
-    def mtm(self) -> Identified:
+    def mtm(self) -> IdentifiedArm:
         """Identified MTM: the paper's arm if its recording is available, else a perturbed ground-truth arm."""
-        self.progress("finding the true MTM", 0.0)
+        self.progress("making the ground-truth MTM", 0.0)
         if self.recordings.folder is None:
             truth = perturbed_ground_truth(PAPER_ARM, self.folder, self.seed)
         else:
             truth = paper_arm(self.recordings.poses, self.folder)
-        return self._identified(truth, PAPER_ARM)
+        return self._identify(truth, PAPER_ARM)
 
     @cached_property
-    def psm(self) -> Identified:
+    def psm(self) -> IdentifiedArm:
         """Identified PSM, a perturbed ground-truth arm."""
-        return self._identified(perturbed_ground_truth("psm", self.folder, self.seed), "psm")
+        return self._identify(perturbed_ground_truth("psm", self.folder, self.seed), "psm")
 
     @cached_property
     def paper_file(self) -> Path:
-        """File of the paper's parameters. On another arm, the paper's method is applied to the same poses."""
+        """Path of the model file with the paper's parameters.
+
+        For a perturbed ground-truth arm, the model is identified with the paper's method from the same poses as ours.
+        """
         mtm, path = self.mtm, self.folder / "paper_model.yaml"
         if mtm.truth.is_paper_arm:
             paper_model(load_arm(PAPER_ARM)).save(path)
@@ -114,59 +124,84 @@ class ReproductionSession:
         truth: GroundTruth,
         model: Path,
         poses: NDArray[np.float64],
-        what: str,
+        label: str,
         parts: Sequence[str] = ("all",),
         damped: bool = False,
-        led: bool = False,
+        with_approach: bool = False,
         hysteresis_ratio: float = 0.0,
-        longest: float = DURATION,
+        max_duration: float = DURATION,
     ) -> Drifts:
-        """Releases the arm `name` at `poses` (m, n) with the model of a file for at most `longest` [s].
+        """Simulates releases of an arm at several poses.
 
-        See `Release` for `parts`, `damped`, `led` and `hysteresis_ratio`.
+        Args:
+            name: Name of the arm.
+            truth: Ground-truth arm to simulate.
+            model: Path of the controller's model file.
+            poses: Release poses (m, n) [rad, m].
+            label: Name of the step for `progress`.
+            parts, damped, with_approach, hysteresis_ratio: See `Release`.
+            max_duration: Maximum duration of each release [s]. `sample_sizes` can reduce it.
         """
-        duration = min(self.sample_sizes.duration, longest)
-        every = Release(
-            name, truth.arm, tuple(parts), str(model), poses[0], damped, led, hysteresis_ratio, duration, self.seed
+        duration = min(self.sample_sizes.duration, max_duration)
+        template = Release(
+            name,
+            truth.arm,
+            tuple(parts),
+            str(model),
+            poses[0],
+            damped,
+            with_approach,
+            hysteresis_ratio,
+            duration,
+            self.seed,
         )
-        cases = [dataclasses.replace(every, start=pose, seed=self.seed + i) for i, pose in enumerate(poses)]
-        positions = release_all(cases, self.executor, lambda share: self.progress(what, share))
+        cases = [dataclasses.replace(template, start=pose, seed=self.seed + i) for i, pose in enumerate(poses)]
+        positions = release_all(cases, self.executor, lambda share: self.progress(label, share))
         return Drifts(truth.arm, positions)
 
     def random_poses(self, name: str, count: int) -> NDArray[np.float64]:
-        """Returns random poses (count, n) inside the limits. The first ones do not depend on the count."""
+        """Returns random poses (count, n) inside the limits. Pose i depends on the seed and i, but not on the count."""
         poses = [load_arm(name).sample_poses(1, np.random.default_rng([self.seed, i]))[0] for i in range(count)]
         return np.array(poses)
 
-    def zeroed(self, model: Path) -> Path:
-        """Returns the file of the same model without torque on joints 5-7."""
+    def without_wrist_torque(self, model: Path) -> Path:
+        """Writes a model file with zero torque on joints 5 to 7; returns its path."""
         path = model.with_stem(model.stem + "_zeroed")
-        with_zeroed(IdentifiedModel.load(model), FIGURE_7_FAULTY).save(path)
+        with_zero_torque(IdentifiedModel.load(model), FIGURE_7_FAULTY).save(path)
         return path
 
-    def _identified(self, truth: GroundTruth, name: str) -> Identified:
-        label = name.upper()
+    def _identify(self, truth: GroundTruth, name: str) -> IdentifiedArm:
+        arm_name = name.upper()
         poses = collect(
             truth,
             name,
             self.sample_sizes.collected,
             self.seed,
             self.executor,
-            lambda share: self.progress(f"collecting poses of the {label}", share),
+            lambda share: self.progress(f"collecting poses of the {arm_name}", share),
         )
         recording, file = self.folder / f"{name}_poses.csv", self.folder / f"{name}_model.yaml"
         write_recording(poses, recording)
         identification = identify_static(
-            poses, load_arm(name), progress=lambda share: self.progress(f"identifying the {label}", share)
+            poses, load_arm(name), progress=lambda share: self.progress(f"identifying the {arm_name}", share)
         )
         identification.model.provenance.recording = recording.name
         identification.model.save(file)
-        return Identified(truth, poses, identification.model, file)
+        return IdentifiedArm(truth, poses, identification.model, file)
 
 
 @dataclass(frozen=True, eq=False)
-class Lead:
-    """Picklable description of an operator who moves an arm; `model` is a file, or "" for unpowered motors."""
+class OperatorCase:
+    """Picklable arguments of `simulate_case`.
+
+    Attributes:
+        name: Name of the compensation.
+        arm: Arm to simulate.
+        model: Path of the controller's model file, or "" for unpowered motors.
+        friction_ratio: Compensated share of the friction.
+        poses: Number of random poses on the path.
+        seed: Seed of the path and of the effects' noise.
+    """
 
     name: str
     arm: Arm
@@ -176,11 +211,11 @@ class Lead:
     seed: int
 
 
-def led(lead: Lead) -> OperatorForces:
-    """Simulates the interaction forces along a path through random poses."""
-    model = IdentifiedModel.load(lead.model) if lead.model else None
+def simulate_case(case: OperatorCase) -> OperatorForces:
+    """Simulates an operator who moves an arm along a path through random poses."""
+    model = IdentifiedModel.load(case.model) if case.model else None
     # The controller uses the friction of the arm files, but an identified gravity model.
     friction = Friction.of_arm(load_arm(PAPER_ARM))
-    compensation = Compensation(lead.name, model, lead.friction_ratio, friction)
-    path = random_path(lead.arm, lead.poses, seed=lead.seed)
-    return simulate_operator(lead.arm, path, compensation, effects=lead.arm.effects, seed=lead.seed)
+    compensation = Compensation(case.name, model, case.friction_ratio, friction)
+    path = random_path(case.arm, case.poses, seed=case.seed)
+    return simulate_operator(case.arm, path, compensation, effects=case.arm.effects, seed=case.seed)

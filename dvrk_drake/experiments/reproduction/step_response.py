@@ -1,4 +1,4 @@
-"""Step response of a simulated MTM to zero, with the paper's controller and with ours (Fig. 7)."""
+"""Step responses of a simulated MTM with the paper's controller and with ours (Fig. 7)."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-#: Durations of the simulation with the paper's controller and with ours [s].
+#: Duration of the simulations with the paper's controller and with ours [s].
 DURATION, OUR_DURATION = 60.0, 10.0
-#: Period of the paper's controller, and sample period of all results [s].
+#: Period of the paper's controller and sample period of all results [s].
 PERIOD = 0.01
-#: Inertia of each link about each axis in the paper's model [kg m^2], from its PSM file and from the period of J2.
+#: Inertia of each link about each axis in the paper's model [kg m^2], from its PSM file and the period of J2.
 LINK_INERTIA = 1.0
-#: Mass and inertia of bars and rotors of the linkage [kg, kg m^2], which the paper's model does not have.
-_NOTHING = 1e-6
+#: Mass [kg] and inertia [kg m^2] of linkage bars and rotors, which the paper's model does not have.
+_NEGLIGIBLE = 1e-6
 
 
 def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
-    """Returns the arm with the paper's point masses at the joints; writes its SDF."""
+    """Returns the arm with the paper's point masses at the joints; writes its SDF to `path`."""
     plant = make_arm_plant(arm)
-    carried = [plant.GetJointByName(name).child_body().name() for name in arm.joint_names]
+    driven_links = [plant.GetJointByName(name).child_body().name() for name in arm.joint_names]
     links = []
     for link in link_inertias(arm):
-        mass, inertia = _NOTHING, _NOTHING
-        if link.link in carried:
-            mass, inertia = published.FIGURE_7_MASSES[1 + carried.index(link.link)], LINK_INERTIA
+        mass, inertia = _NEGLIGIBLE, _NEGLIGIBLE
+        if link.link in driven_links:
+            mass, inertia = published.FIGURE_7_MASSES[1 + driven_links.index(link.link)], LINK_INERTIA
         links.append(LinkInertia(link.link, np.array([mass, 0, 0, 0, inertia, inertia, inertia, 0, 0, 0])))
     with atomic_write(path) as stream:
         stream.write(to_text(with_inertias(arm, links), "The paper's simulated MTM: point masses at the joints."))
@@ -54,10 +54,19 @@ def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
 def simulate_paper_controller(
     arm: Arm, duration: float, faulty: bool, progress: Callable[[float], object] = lambda share: None
 ) -> NDArray[np.float64]:
-    """Simulates the paper's equation 11, with or without the fault of its node; returns q (samples, n) per `PERIOD`.
+    """Simulates the paper's controller (equation 11).
 
-    Joints 6 and 7 start at their published amplitudes. The published start pose lies in a plane and does not excite
-    them. In Gazebo an unknown disturbance excited them.
+    Joints 6 and 7 start at their published amplitudes, since the published start pose does not excite them. In the
+    paper's Gazebo simulation an unknown disturbance excited them.
+
+    Args:
+        arm: Arm of `paper_simulated_arm`.
+        duration: Duration [s].
+        faulty: Whether the damping terms of some joints use positions instead of velocities, as in the paper's node.
+        progress: Function called with the finished share, 0..1.
+
+    Returns:
+        Positions (samples, n) [rad], one row per `PERIOD`.
     """
     plant = make_arm_plant(arm)
     simulator = Simulator(plant)
@@ -65,10 +74,10 @@ def simulate_paper_controller(
     tree = tree_selector(plant, arm)
     own = tree[[arm.tree_joint_names.index(name) for name in arm.joint_names]]
     kp, kv, ki = map(np.array, (published.FIGURE_7_KP, published.FIGURE_7_KV, published.FIGURE_7_KI))
-    total, force = np.zeros(arm.num_joints), np.zeros(plant.num_velocities())
+    integral, force = np.zeros(arm.num_joints), np.zeros(plant.num_velocities())
     port = plant.get_applied_generalized_force_input_port()
     start = np.array(published.FIGURE_7_START)
-    start[5:] = published.FIGURE_7_READ["J6"], published.FIGURE_7_READ["J7 early"]
+    start[5:] = published.FIGURE_7_VALUES["J6"], published.FIGURE_7_VALUES["J7 early"]
     set_arm_positions(plant, context, arm, start)
     samples = round(duration / PERIOD) + 1
     q = np.empty((samples, arm.num_joints))
@@ -77,8 +86,8 @@ def simulate_paper_controller(
         v = plant.GetVelocities(context)[own]
         if faulty:
             v[list(published.FIGURE_7_FAULTY)] = q[k, list(published.FIGURE_7_FAULTY)]
-        total -= q[k]
-        force[own] = _gravity(plant, simulator, arm) - kp * q[k] - kv * v + ki * total
+        integral -= q[k]
+        force[own] = _gravity(plant, simulator, arm) - kp * q[k] - kv * v + ki * integral
         port.FixValue(context, force)
         if k + 1 < samples:
             simulator.AdvanceTo((k + 1) * PERIOD)
@@ -88,7 +97,7 @@ def simulate_paper_controller(
 
 
 def simulate_ours(ground_truth_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
-    """Simulates gravity compensation and PID with all effects except the stops; returns q (samples, n) per `PERIOD`."""
+    """Simulates our controller with all effects except the stops; returns q (samples, n) [rad], one per `PERIOD`."""
     arm = load_arm(PAPER_ARM)
     station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects.without("stops"))
     builder = DiagramBuilder()
@@ -106,10 +115,12 @@ def _gravity(plant: MultibodyPlant, simulator: Simulator, arm: Arm) -> NDArray[n
     return holding_torque(plant, simulator.get_context(), arm)
 
 
-def swings(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+def oscillation_modes(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Computes the oscillation modes of the arm about zero with the paper's gains, without the integral term.
 
-    With `faulty`, the damping terms have the fault of the paper's node. Otherwise they use velocities.
+    Args:
+        arm: Arm of `paper_simulated_arm`.
+        faulty: See `simulate_paper_controller`.
 
     Returns:
         Eigenvalues (k,) [1/s] with positive imaginary part, and the joint components (n, k) of their eigenvectors.
@@ -130,8 +141,8 @@ def swings(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], NDArray[np.c
     return values[use], vectors[: len(M), use]
 
 
-def slowest_swing(arm: Arm) -> float:
-    """Returns the longest period of the modes that move joint 2, with the fault [s]."""
-    values, vectors = swings(arm, faulty=True)
-    moves = np.abs(vectors[1]) > 0.1 * np.abs(vectors).max(axis=0)
-    return float(2 * np.pi / values.imag[moves].min())
+def longest_period(arm: Arm) -> float:
+    """Returns the longest period of the modes that move joint 2, with the faulty damping terms [s]."""
+    values, vectors = oscillation_modes(arm, faulty=True)
+    moves_joint_2 = np.abs(vectors[1]) > 0.1 * np.abs(vectors).max(axis=0)
+    return float(2 * np.pi / values.imag[moves_joint_2].min())

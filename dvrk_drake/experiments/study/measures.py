@@ -1,4 +1,4 @@
-"""Measures of a simulated run: numbers such as settling time and drift, and criteria such as a held pose.
+"""Measures of a simulated run: numbers, e.g. settling time, and boolean criteria, e.g. whether the pose is held.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -24,7 +24,7 @@ class Measure:
     Attributes:
         kind: Kind of the measure, one of `KINDS`.
         name: Column in the results. Default: the kind.
-        band: Tolerance band [rad; m for a prismatic joint]. Default: that of the kind.
+        band: Tolerance band [rad, m]. Default: that of the kind.
         time: Duration [s]. Default: that of the kind.
         joints: Names of the evaluated joints. Default: all.
     """
@@ -42,12 +42,12 @@ class Measure:
 
     @property
     def unit(self) -> str:
-        """Unit of the values; "" for a share and for a boolean measure."""
+        """Unit of the values; "" for shares and boolean measures."""
         return KINDS[self.kind].unit
 
     @property
-    def is_answer(self) -> bool:
-        """Returns whether the measure is boolean, not a number."""
+    def is_boolean(self) -> bool:
+        """Returns whether the measure is boolean."""
         return isinstance(self.worst, bool)
 
     @property
@@ -69,41 +69,42 @@ class Measure:
         for name, default in (("band", kind.band), ("time", kind.time)):
             value = getattr(self, name)
             if value is not None and default is None:
-                raise StudyError(f"{self.kind} has no {name}")
+                raise StudyError(f"{name} is not a setting of {self.kind}. Remove it.")
         if unknown := sorted(set(self.joints) - set(scenario.mounted_arm.joint_names)):
             raise StudyError(
-                f"joints of {self.column}: unknown {', '.join(unknown)}; {scenario.mounted_arm.name} has "
+                f"joints of {self.column}: unknown joint {', '.join(unknown)}; joints of {scenario.mounted_arm.name}: "
                 f"{', '.join(scenario.mounted_arm.joint_names)}"
             )
         rest = scenario.duration - _arrival(scenario)
         if kind.time is not None and not 2 * scenario.sample_period <= self._time <= rest + 1e-9:
             raise StudyError(
-                f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s, from "
-                "two samples to what is left of the scenario after start, last target and hand"
+                f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s. The "
+                "minimum is two sample periods. The maximum is the time left after the last target and the release "
+                "by the hand."
             )
         if self.kind == "overshoot" and not scenario.targets:
-            raise StudyError("overshoot needs a scenario with targets")
+            raise StudyError("overshoot requires a scenario with targets")
 
     def __call__(self, scenario: Scenario, simulation: Simulation) -> float | bool:
-        """Computes the measure of a run: the worst value of its joints."""
+        """Computes the measure of a run: the worst value over the evaluated joints."""
         arm = scenario.mounted_arm
         columns = [arm.joint_names.index(name) for name in self.joints or arm.joint_names]
         times, poses = scenario.knots()
         arrival, desired = _arrival(scenario), simulation.desired
-        free = simulation.time >= (arrival - 1e-9 if desired is None else 0.0)
-        q = simulation.state_true[free, : arm.num_joints]
+        evaluated = simulation.time >= (arrival - 1e-9 if desired is None else 0.0)
+        q = simulation.state_true[evaluated, : arm.num_joints]
         reference = np.broadcast_to(q[0], q.shape) if desired is None else desired
         run = _Run(
-            t=simulation.time[free],
+            t=simulation.time[evaluated],
             q=q[:, columns],
             error=(q - reference)[:, columns],
-            effort_share=(np.abs(simulation.recording.measured_effort()[free]) / arm.effort_limits)[:, columns],
+            effort_share=(np.abs(simulation.recording.measured_effort()[evaluated]) / arm.effort_limits)[:, columns],
             departure=float(times[-2]) if len(times) > 1 else 0.0,
             arrival=arrival,
-            way=(poses[-1] - poses[-2])[columns] if len(poses) > 1 else np.zeros(len(columns)),
+            displacement=(poses[-1] - poses[-2])[columns] if len(poses) > 1 else np.zeros(len(columns)),
             goal=reference[-1, columns],
         )
-        return KINDS[self.kind].of(run, self._band, self._time)
+        return KINDS[self.kind].compute(run, self._band, self._time)
 
     @property
     def _band(self) -> float:
@@ -117,9 +118,15 @@ class Measure:
 class _Run(NamedTuple):
     """Data of a run for the k evaluated joints.
 
-    These are t (m,), and q, the error from the desired pose and effort_share (m, k), and `way` and goal (k,).
-    `arrival` [s] is the time of the last target, or of the release by the hand if that is later. The last motion
-    starts at `departure` and has the displacement `way`.
+    Attributes:
+        t: Times (m,) [s].
+        q: True positions (m, k) [rad, m].
+        error: Differences (m, k) between the true and the desired positions [rad, m].
+        effort_share: Absolute measured efforts (m, k), divided by the effort limits.
+        departure: Start time of the motion to the last target [s].
+        arrival: Later of the time of the last target and the time of the release by the hand [s].
+        displacement: Displacement (k,) of the motion to the last target [rad, m].
+        goal: Final desired positions (k,) [rad, m].
     """
 
     t: NDArray[np.float64]
@@ -128,16 +135,16 @@ class _Run(NamedTuple):
     effort_share: NDArray[np.float64]
     departure: float
     arrival: float
-    way: NDArray[np.float64]
+    displacement: NDArray[np.float64]
     goal: NDArray[np.float64]
 
     def last(self, time: float) -> NDArray[np.bool_]:
-        """Returns a mask (m,) of the samples in the last `time` [s]."""
+        """Returns the mask (m,) of the samples in the last `time` [s]."""
         return self.t >= self.t[-1] - time - 1e-9
 
 
 def _arrival(scenario: Scenario) -> float:
-    """Returns the time of the last target, or of the release by the hand if that is later [s]."""
+    """Returns the later of the time of the last target and the time of the release by the hand [s]."""
     return max(float(scenario.knots()[0][-1]), *(point.time for point in scenario.hand.path), 0.0)
 
 
@@ -152,7 +159,7 @@ def _settling_time(run: _Run, band: float, time: float) -> float:
 
 def _overshoot(run: _Run, band: float, time: float) -> float:
     q = run.q[run.t >= run.departure - 1e-9]
-    return max(0.0, float(np.max(np.sign(run.way) * (q - run.goal))))
+    return max(0.0, float(np.max(np.sign(run.displacement) * (q - run.goal))))
 
 
 def _steady_error(run: _Run, band: float, time: float) -> float:
@@ -173,19 +180,27 @@ def _effort_share(run: _Run, band: float, time: float) -> float:
     return float(np.max(run.effort_share))
 
 
-def _held(run: _Run, band: float, time: float) -> bool:
-    during = (run.t >= run.arrival - 1e-9) & (run.t <= run.arrival + time + 1e-9)
-    return bool(np.all(np.abs(run.error[during]) <= band))
+def _stays_in_band(run: _Run, band: float, time: float) -> bool:
+    interval = (run.t >= run.arrival - 1e-9) & (run.t <= run.arrival + time + 1e-9)
+    return bool(np.all(np.abs(run.error[interval]) <= band))
 
 
-def _ran_away(run: _Run, band: float, time: float) -> bool:
+def _leaves_band(run: _Run, band: float, time: float) -> bool:
     return bool(np.any(np.abs(run.error) > band))
 
 
 class Kind(NamedTuple):
-    """Function that computes a measure from a run, band and time, with the defaults; None if a value is not used."""
+    """Kind of a measure.
 
-    of: Callable[[_Run, float, float], float | bool]
+    Attributes:
+        compute: Function that computes the measure from a run, band and time.
+        unit: Unit of the value, "" for shares and boolean measures.
+        band: Default tolerance band [rad, m]; None if the kind has no band.
+        time: Default duration [s]; None if the kind has no duration.
+        worst: Value for a run that failed.
+    """
+
+    compute: Callable[[_Run, float, float], float | bool]
     unit: str
     band: float | None
     time: float | None
@@ -193,18 +208,18 @@ class Kind(NamedTuple):
 
 
 #: Kinds of measures. They are computed from the true positions and the measured efforts of the evaluated joints at the
-#: recorded times. The desired pose is that of the controller. In modes other than "hold" it is the pose at the release
-#: (at the start, or when the hand releases the arm), and earlier samples are excluded.
+#: recorded times. In mode "hold" the desired pose is that of the controller. In other modes it is the pose at the
+#: start, or at the release by the hand, and earlier samples are excluded.
 #:
 #: settling_time: Time from the last target until all joints stay within `band` of the final desired pose; infinite if
-#: they do not.
-#: overshoot: Distance beyond the last target, in the direction of the motion to it.
-#: steady_error: Distance from the desired pose, mean over the last `time`.
-#: drift: Largest distance in the last `time` from the pose at the start of this interval.
-#: drift_rate: Slope of a line fitted to the last `time`.
-#: effort_share: Largest effort divided by the joint's limit.
+#: they do not settle.
+#: overshoot: Maximum distance beyond the last target, in the direction of the motion to this target.
+#: steady_error: Absolute mean error over the last `time`.
+#: drift: Maximum distance, in the last `time`, from the pose at the start of this interval.
+#: drift_rate: Absolute slope of a line fitted to the last `time`.
+#: effort_share: Maximum effort divided by the joint's limit.
 #: held: Whether the arm stays within `band` of the desired pose for `time` after the last target or the release.
-#: ran_away: Whether the arm is ever further than `band` from the desired pose.
+#: ran_away: Whether the distance from the desired pose ever exceeds `band`.
 KINDS = {
     "settling_time": Kind(_settling_time, "s", 1e-3, None, math.inf),
     "overshoot": Kind(_overshoot, "rad", None, None, math.inf),
@@ -212,6 +227,6 @@ KINDS = {
     "drift": Kind(_drift, "rad", None, 5.0, math.inf),
     "drift_rate": Kind(_drift_rate, "rad/s", None, 5.0, math.inf),
     "effort_share": Kind(_effort_share, "", None, None, math.inf),
-    "held": Kind(_held, "", 0.015, 10.0, False),
-    "ran_away": Kind(_ran_away, "", 0.5, None, True),
+    "held": Kind(_stays_in_band, "", 0.015, 10.0, False),
+    "ran_away": Kind(_leaves_band, "", 0.5, None, True),
 }

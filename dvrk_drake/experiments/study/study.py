@@ -41,18 +41,17 @@ def run_study(
 
     Args:
         study: Study to run.
-        executor: Standard executor: threads, processes, or a Dask client's `get_executor(pure=False)`. Its workers
-            need this package and the files that the scenario names.
-        output: CSV file or `.parquet`, see `StudyTable`. Existing rows of the same study are kept.
-        progress: Function called at the start and for each row.
+        executor: Executor of threads or processes, or a Dask client's `get_executor(pure=False)`. Its workers need
+            this package and the files of the scenario.
+        output: Path of a CSV or Parquet file, see `StudyTable`. Existing rows of the same study are kept.
+        progress: Function called at the start and after each run.
 
     Returns:
-        All rows by the number of their case.
+        All rows, by the number of the case.
 
     Raises:
-        StudyError: The study or the output is invalid, or some cases failed because workers were lost. In the latter
-            case the output contains the finished cases, the same call continues with the others, and the cause of the
-            error is the first loss.
+        StudyError: The study or the output is invalid, or workers were lost. After a loss, the output contains the
+            finished cases, and the same call runs the missing cases. The cause of the error is the first loss.
         ScenarioError, ArmError, ModelError: The scenario or one of its variations is invalid.
     """
     study.check()
@@ -60,10 +59,10 @@ def run_study(
     futures: dict[Future[Row], Case] = {}
     losses: list[tuple[Case, BaseException]] = []
     with table_type(output, study) as table:
-        todo = [case for case in study.cases if case.index not in table.rows]
+        missing = [case for case in study.cases if case.index not in table.rows]
         progress(len(table.rows), len(study.cases))
         try:
-            for case in todo:
+            for case in missing:
                 futures[executor.submit(run_case, study.scenario_of(case), study.measures)] = case
             for future in as_completed(list(futures)):
                 case = futures.pop(future)
@@ -80,8 +79,9 @@ def run_study(
         if losses:
             case, error = losses[0]
             raise StudyError(
-                f"{len(study.cases) - len(table.rows)} of {len(study.cases)} cases are missing: case {case.index}: "
-                f"{type(error).__name__}: {error}; the others are in {output}; the same command goes on"
+                f"{len(study.cases) - len(table.rows)} of {len(study.cases)} cases are missing (case {case.index}: "
+                f"{type(error).__name__}: {error}). {output} contains the finished cases. Repeat the command to run "
+                "the missing ones."
             ) from error
         table.sort()
         return table.rows
@@ -92,27 +92,29 @@ def _loss(future: Future[Row]) -> BaseException | None:
 
 
 def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
-    """Simulates a scenario and computes its measures. The row of a diverging simulation contains the error."""
+    """Simulates a scenario and computes its measures. If the simulation fails, the row contains the error."""
     try:
         simulation = simulate(scenario)
     except (RuntimeError, ArithmeticError, ValueError) as error:  # errors raised by Drake and NumPy
         return Row({}, " ".join(f"{type(error).__name__}: {error}".split()))
-    lost = ~np.all(np.isfinite(np.hstack([simulation.state_true, simulation.recording.measured_effort()])), axis=1)
-    if np.any(lost):
-        return Row({}, f"diverged: not finite from {simulation.time[np.argmax(lost)]:g} s on")
+    not_finite = ~np.all(
+        np.isfinite(np.hstack([simulation.state_true, simulation.recording.measured_effort()])), axis=1
+    )
+    if np.any(not_finite):
+        return Row({}, f"diverged: not finite from {simulation.time[np.argmax(not_finite)]:g} s on")
     return Row({measure.column: measure(scenario, simulation) for measure in measures})
 
 
-#: Maximum number of pools: a pool is replaced when a worker was killed, e.g. by the system for lack of memory.
+#: Maximum number of process pools. A pool is replaced if a worker was killed, e.g. for lack of memory.
 MAX_POOLS = 3
-#: Google's allocator, from the package libtcmalloc-minimal4 (Debian, Ubuntu) or gperftools-libs (Fedora).
+#: Faster memory allocator, from the package libtcmalloc-minimal4 (Debian, Ubuntu) or gperftools-libs (Fedora).
 TCMALLOC = "libtcmalloc_minimal.so.4"
-#: Maximum time for a scheduler to answer and to get its first worker [s].
+#: Timeout of the connection to a scheduler, and of waiting for its first worker [s].
 TIMEOUT = 10
 
 
 def run_study_locally(study: Study, output: str | Path, workers: int | None, progress: Progress) -> dict[int, Row]:
-    """Runs a study like `run_study` on this computer. If a worker is killed, a new pool runs the remaining cases.
+    """Runs a study on this computer, see `run_study`. If a worker is killed, a new pool runs the missing cases.
 
     Raises:
         StudyError: As for `run_study`, or `MAX_POOLS` pools lost a worker.
@@ -131,10 +133,10 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
     """Provides worker processes on this computer, by default one per core.
 
-    The workers end with the block, immediately if it is left by an error, and also when this process is killed. They
-    are spawned, not forked. A script that uses this function needs `if __name__ == "__main__":`.
+    The workers end with the block, immediately after an error, and also if this process is killed. They are spawned, so
+    a script that uses this function needs `if __name__ == "__main__":`.
     """
-    # Workers read these variables at their start. BLAS threads in each worker would only compete for the cores.
+    # Workers read these variables at their start. More BLAS threads per worker would compete for the cores.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     os.environ.update(_allocator_environment())
@@ -151,7 +153,7 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 
 
 def await_results(futures: Sequence[Future[Result]], progress: Callable[[float], object]) -> list[Result]:
-    """Returns the results of all futures in their order; raises the first error. Reports the finished share."""
+    """Returns the results of all futures in order, or raises the first error; reports the finished share."""
     for done, future in enumerate(as_completed(futures), start=1):
         future.result()
         progress(done / len(futures))
@@ -161,9 +163,8 @@ def await_results(futures: Sequence[Future[Result]], progress: Callable[[float],
 def _allocator_environment() -> dict[str, str]:
     """Returns environment variables that select a faster memory allocator for new processes.
 
-    There are none if an allocator is already selected, or on other systems. Drake's solver allocates some thousand
-    small blocks in every step, which takes a third of the step with glibc's default settings. It is faster with
-    tcmalloc, and with glibc if more than 7 blocks per size are cached.
+    There are none if the user has already selected an allocator, or on systems other than Linux. Drake's solver
+    allocates thousands of small blocks per step. tcmalloc or a larger cache of glibc makes the allocations faster.
     """
     if sys.platform != "linux" or {"LD_PRELOAD", "GLIBC_TUNABLES"} & set(os.environ):
         return {}
@@ -180,32 +181,34 @@ def _library_folders() -> list[Path]:
 def dask_executor(address: str) -> Iterator[Executor]:
     """Connects to the workers of a Dask scheduler, e.g. "tcp://192.168.0.5:8786". Requires the extra `dask`.
 
-    The workers need the same versions of this package, and the files that the scenario names at the same paths. One
-    thread per worker is best (`dask worker --nthreads 1`), since simulations in one process block each other. The log
-    of the client is disabled; errors are raised as StudyError.
+    The workers need the same software versions, and the files of the scenario at the same paths. Use one thread per
+    worker (`dask worker --nthreads 1`), since simulations in one process block each other. The log of the client is
+    disabled.
 
     Raises:
         StudyError: distributed is not installed, the scheduler does not answer, or it has no suitable workers.
     """
     if not re.fullmatch(r"tcp://\S+:\d+", address):
-        raise StudyError(f'"{address}" is no address of a scheduler; allowed: tcp://HOST:PORT')
+        raise StudyError(f'"{address}" is not the address of a scheduler; allowed: tcp://HOST:PORT')
     try:
         from distributed import Client
     except ImportError as error:
-        raise StudyError("--scheduler needs distributed: pip install 'dvrk-drake[dask]'") from error
+        raise StudyError("--scheduler requires the package distributed. Run: pip install 'dvrk-drake[dask]'") from error
     for logger in ("distributed", "distributed.client"):
         logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        raise StudyError(f"{address}: no Dask scheduler answers there: {error}") from error
+        raise StudyError(f"{address}: no Dask scheduler answers at this address: {error}") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=TIMEOUT)
         except TimeoutError as error:
-            raise StudyError(f"{address}: the scheduler has no workers; start some: dask worker {address}") from error
+            raise StudyError(
+                f"{address}: the scheduler has no workers. Start workers: dask worker {address}"
+            ) from error
         _check_workers(client)
-        # The cluster would cache the results of pure functions and share them between studies.
+        # Dask would cache the results of pure functions and share them between studies.
         yield client.get_executor(pure=False)
 
 
@@ -214,13 +217,16 @@ def _check_workers(client: Client) -> None:
         found = client.run(versions)
     except ImportError as error:
         raise StudyError(f"the Dask workers cannot import dvrk_drake: {error}") from error
-    for worker, theirs in found.items():
-        if theirs != versions():
-            raise StudyError(f"{worker}: has {theirs}, here is {versions()}; results would differ: install the same")
+    for worker, worker_versions in found.items():
+        if worker_versions != versions():
+            raise StudyError(
+                f"{worker}: the worker has {worker_versions}, this computer has {versions()}. Install the same "
+                "versions."
+            )
 
 
 class _SpawningExecutor(ProcessPoolExecutor):
-    """Process pool whose workers ignore Ctrl-C. The parent process ends them, so they print no tracebacks."""
+    """Process pool whose workers ignore Ctrl-C. Only the parent process ends them, so they print no tracebacks."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit the signal mask

@@ -1,4 +1,4 @@
-"""Schema and strict reader of study files, and the cases of a study.
+"""Schema and reader of study files, and cases of a study.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -31,7 +31,13 @@ RESERVED = ("study", "case", "variation", "pose", "seed", "error")
 
 @dataclass
 class RandomPoses:
-    """Number `count` of random poses, uniform in the joint box and inside the coupled limits (`Arm.sample_poses`)."""
+    """Random poses, uniform in the joint box and inside the coupled limits, see `Arm.sample_poses`.
+
+    Attributes:
+        count: Number of poses.
+        seed: Seed of the random numbers.
+        margin: Minimum distance from the limits, as a share of each joint range.
+    """
 
     count: int = field(default=0, metadata=within(1, 10**6))
     seed: int = field(default=0, metadata=within(0, 2**63 - 1))
@@ -50,8 +56,12 @@ class Variation:
 class Case:
     """One run of a study.
 
-    It has the number `index` (from 0), the name of a `variation`, the number `pose` (from 0) of its `start`, and the
-    `seed` of the scenario.
+    Attributes:
+        index: Number of the case, from 0.
+        variation: Name of the variation.
+        pose: Number of the start pose, from 0.
+        seed: Seed of the scenario.
+        start: Start pose (n,) [rad, m].
     """
 
     index: int
@@ -63,16 +73,16 @@ class Case:
 
 @dataclass
 class Study:
-    """Schema of a study file: a scenario over poses, seeds and variations. One study gives one table of results.
+    """Schema of a study file: runs of a scenario for all combinations of poses, seeds and variations.
 
     Attributes:
         scenario: Name of an arm, or path of a scenario's YAML file, relative to the current working folder.
         set: Settings "key=value" of the scenario, as for `dvrk-drake simulate --set`.
         poses: Start poses, one list of n numbers [rad, m] each. Default: the start of the scenario.
         random_poses: Random start poses, instead of `poses`.
-        seeds: Seeds, each of which is combined with each pose. The seed of a run is drawn from this seed and the number
-            of the pose, so that runs are independent. All variations use the same seeds.
-        variations: Variations, each of which is run from each pose with each seed. Default: the unchanged scenario.
+        seeds: Seeds. The seed of a run is computed from one of these seeds and the number of the pose, so that runs are
+            independent. All variations use the same seeds.
+        variations: Variations of the scenario. Default: the unchanged scenario.
         measures: Measures that are computed for each run.
     """
 
@@ -100,14 +110,14 @@ class Study:
 
     @cached_property
     def cases(self) -> tuple[Case, ...]:
-        """All runs, ordered by pose, so that the first part of a study is a smaller study."""
+        """All cases, ordered by pose, so that the first cases form a smaller study."""
         starts = self._starts()
         runs = [(k, seed, v.name) for k in range(len(starts)) for seed in self.seeds for v in self.variations]
         return tuple(Case(i, v, k, _seed_of_run(seed, k), tuple(starts[k])) for i, (k, seed, v) in enumerate(runs))
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of all inputs, including files and versions. It differs between studies with different results."""
+        """Hash of all inputs of the study, including files and software versions."""
         content = {
             "versions": versions(),
             "scenarios": {name: dataclasses.asdict(scenario) for name, scenario in self.scenarios.items()},
@@ -124,7 +134,7 @@ class Study:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def scenario_of(self, case: Case) -> Scenario:
-        """Returns the scenario with which `dvrk-drake simulate` repeats a case."""
+        """Returns the scenario of a case, with which `dvrk-drake simulate` can repeat the case."""
         scenario = self.scenarios[case.variation]
         controller = scenario.controller
         if controller.model:  # workers may use another working folder
@@ -133,20 +143,20 @@ class Study:
         return dataclasses.replace(scenario, arm=arm, controller=controller, start=list(case.start), seed=case.seed)
 
     def check(self) -> None:
-        """Checks that all cases can be run, before the first one runs.
+        """Checks that all cases are valid.
 
         Raises:
             StudyError: A field is invalid. The message gives the field, its value, and the accepted values.
             ScenarioError, ArmError, ModelError: The scenario is invalid for a variation or a pose.
         """
         if not self.scenario:
-            raise StudyError("scenario is missing; give an arm's name, or the path of a scenario's YAML file")
+            raise StudyError("scenario is missing. Give the name of an arm, or the path of a scenario's YAML file.")
         if not (self.seeds and self.variations and self.measures):
             raise StudyError("seeds, variations and measures must not be empty")
         if fault := number_fault(self):
             raise StudyError(fault)
         if len({*self.seeds}) < len(self.seeds):
-            raise StudyError(f"seeds must be different whole numbers from 0; got {self.seeds}")
+            raise StudyError(f"seeds must not contain a number twice; got {self.seeds}")
         _check_names("variations", [variation.name for variation in self.variations])
         if any(scenario.mounted_arm.joint_names != self.arm.joint_names for scenario in self.scenarios.values()):
             raise StudyError("all variations must have the same joints")
@@ -157,9 +167,12 @@ class Study:
                 except StudyError as error:
                     raise StudyError(f"measures[{i}].{error}") from error
         _check_names("measures", [measure.column for measure in self.measures])
+        reserved = ", ".join([*RESERVED, "q1, q2, ..."])
         for column in (measure.column for measure in self.measures):
             if column in RESERVED or not re.fullmatch(r"[A-Za-z_]\w*", column) or re.fullmatch(r"q\d+", column):
-                raise StudyError(f'measures: "{column}" cannot be a column; allowed: a word, but {", ".join(RESERVED)}')
+                raise StudyError(
+                    f'measures: "{column}" cannot be a column; allowed: letters, digits and "_", except {reserved}'
+                )
         self._check_poses()
 
     def _check_poses(self) -> None:
@@ -169,7 +182,7 @@ class Study:
         if self.random_poses is None:
             return
         if self.poses:
-            raise StudyError("poses and random_poses: give one of them")
+            raise StudyError("poses and random_poses exclude each other. Remove one of them.")
 
     def _starts(self) -> list[list[float]]:
         """Returns the start poses of the arm."""
@@ -182,7 +195,7 @@ class Study:
 
 
 def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
-    """Reads a study file, adds settings "key=value" of its scenario, and checks it.
+    """Reads a study file, adds settings "key=value" of its scenario, and checks the study.
 
     Raises:
         StudyError: The file cannot be read, has an unknown key, or has an invalid value.
@@ -197,7 +210,7 @@ def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of all software that the results depend on."""
+    """Returns the versions of the packages that the results depend on, by name."""
     return {package: version(package) for package in ("dvrk-drake", "drake", "numpy")}
 
 
@@ -207,4 +220,4 @@ def _seed_of_run(seed: int, pose: int) -> int:
 
 def _check_names(what: str, names: list[str]) -> None:
     if len({*names}) < len(names) or not all(name.isprintable() and name for name in names):
-        raise StudyError(f"{what} must have different names, of one line; got {names}")
+        raise StudyError(f"{what} must have different names of one line each; got {names}")

@@ -1,4 +1,4 @@
-"""Results of a study: a file with one row per run that survives interruptions, and a summary."""
+"""Results of a study: file with one row per run, and summary. Interruptions do not damage the file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ from dvrk_drake.recordings.recording import column_names
 
 @dataclass(frozen=True)
 class Row:
-    """Result of a run: `values` by column of the measures, or no values and the `error` in one line."""
+    """Result of a run.
+
+    Attributes:
+        values: Values of the measures, by column; empty for a failed run.
+        error: Error message in one line; empty unless the run failed.
+    """
 
     values: Mapping[str, float | bool]
     error: str = ""
@@ -33,15 +38,15 @@ class Row:
 class StudyTable:
     """Results of one study in a CSV file with a header and one row per run.
 
-    The columns are: study (its fingerprint), case (number of the run), variation, pose (number of the start pose),
-    seed (of the scenario), q1..qn (start pose [rad, m]), one column per measure (a number, inf, true or false), and
-    error. The error is empty unless the run failed; the measures of a failed run are empty. Numbers have all digits.
+    Columns: study (fingerprint), case (number of the run), variation, pose (number of the start pose), seed (of the
+    scenario), q1..qn (start pose [rad, m]), one column per measure (a number, inf, true or false), and error. The error
+    is empty unless the run failed. The measures of a failed run are empty. Numbers have full precision.
 
-    The table is a context manager that locks the file against other processes.
+    The table is a context manager. It locks the file against other processes.
     """
 
     def __init__(self, path: str | Path, study: Study) -> None:
-        """Opens the table at `path`, which is new or was started with the same study.
+        """Opens the table at `path`. The file is new or contains rows of the same study.
 
         Raises:
             StudyError: The file is of another study, is not the table of a study, or is locked by another process.
@@ -69,7 +74,7 @@ class StudyTable:
         self._lock.close()
 
     def append(self, case: Case, row: Row) -> None:
-        """Appends the row of a case that has none yet.
+        """Appends the row of a case without a row.
 
         Raises:
             RecordingError: The row cannot be written. The earlier rows remain complete.
@@ -78,7 +83,7 @@ class StudyTable:
         self.rows[case.index] = row
 
     def sort(self) -> None:
-        """Sorts the rows by the number of the case, as one atomic operation."""
+        """Sorts the rows by the number of the case and replaces the file atomically."""
         with atomic_write(self._path, "wb") as stream:
             stream.write(_line(self._header))
             stream.writelines(_line(self._cells(case, self.rows[case.index])) for case in self._study.cases)
@@ -89,30 +94,32 @@ class StudyTable:
         return [*key, *map(repr, case.start), *values, row.error]
 
     def _read(self) -> dict[int, Row]:
-        """Reads the complete rows of the file, by the number of their case."""
+        """Reads the complete rows of the file, by the number of the case."""
         content, begin = read_bytes(self._path), _line(self._header)
         whole, tail = content[: content.rfind(b"\n") + 1], content[content.rfind(b"\n") + 1 :]
         if not whole and begin.startswith(tail):
-            return {}  # new, or interrupted while writing the header
+            return {}  # new file, or interrupted while writing the header
         try:
             rows = list(csv.reader(io.StringIO(whole.decode(), newline=""), strict=True))
         except (UnicodeDecodeError, csv.Error):
             rows = []
         if not rows or rows[0][:2] != self._header[:2]:
-            raise StudyError(f"{self._path}: is there and is no table of a study; name another output")
+            raise StudyError(
+                f"{self._path}: the file exists and does not contain results of a study. Give another output."
+            )
         header, *rows = rows
         found: dict[int, Row] = {}
         for line, cells in enumerate(rows, 2):
-            where = f"{self._path}:{line}"
+            where = f"{self._path}, line {line}"
             if header != self._header or cells[:1] != [self._study.fingerprint]:
                 raise StudyError(
-                    f"{where}: was begun with another study (its file, or what that names, or a version changed); "
-                    "name another output"
+                    f"{where}: the results are from a different study. Its files or the installed versions have "
+                    "changed since then. Give another output."
                 )
             if len(cells) != len(header) or not cells[1].isdigit() or int(cells[1]) >= len(self._study.cases):
-                raise StudyError(f"{where}: was changed by hand: is no row of this study; name another output")
+                raise StudyError(f"{where}: the line is not a result of this study. Give another output.")
             if int(cells[1]) in found:
-                raise StudyError(f"{where}: has case {cells[1]} again; name another output")
+                raise StudyError(f"{where}: case {cells[1]} occurs twice. Give another output.")
             found[int(cells[1])] = self._row(cells, where)
         return found
 
@@ -123,7 +130,7 @@ class StudyTable:
         try:
             return Row({name: _value(text) for name, text in zip(self._names, texts, strict=True)})
         except ValueError as error:
-            raise StudyError(f"{where}: was changed by hand: {error}; name another output") from error
+            raise StudyError(f"{where}: {error}. Give another output.") from error
 
 
 def _line(cells: list[str]) -> bytes:
@@ -141,7 +148,7 @@ def _value(text: str) -> float | bool:
 
 
 def _lock(path: Path) -> IO[bytes]:
-    """Locks `path` until it is closed; creates the file if it does not exist."""
+    """Locks the file `path` until the returned stream is closed; creates the file if it does not exist."""
     try:
         file = open(path, "ab")  # noqa: SIM115
     except OSError as error:
@@ -150,7 +157,9 @@ def _lock(path: Path) -> IO[bytes]:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         file.close()
-        raise StudyError(f"{path}: another study is writing it") from error
+        raise StudyError(
+            f"{path}: another process is writing this file. Wait for it, or give another output."
+        ) from error
     return file
 
 
@@ -170,21 +179,23 @@ class ParquetStudyTable(StudyTable):
     """
 
     def __init__(self, path: str | Path, study: Study) -> None:
-        """Opens the table at `path`, which is new or was written by the same study.
+        """Opens the table at `path`. The file is new or contains rows of the same study.
 
         Raises:
             StudyError: As for a `StudyTable`, or pyarrow is not installed.
             RecordingError: The file cannot be read or written.
         """
         if pyarrow is None:
-            raise StudyError(f"{path}: Parquet needs pyarrow: pip install 'dvrk-drake[parquet]', or name a .csv")
+            raise StudyError(
+                f"{path}: Parquet requires pyarrow. Run: pip install 'dvrk-drake[parquet]'. Or give a .csv file."
+            )
         self._parquet = Path(path)
         finished = _finished_rows(self._parquet, study) if self._parquet.exists() else {}
         super().__init__(f"{path}.rows.csv", study)
         self.rows.update(finished)
 
     def sort(self) -> None:
-        """Writes the Parquet file in the order of the cases, as one atomic operation."""
+        """Writes the Parquet file atomically, in the order of the cases, and removes the CSV file."""
         content = []
         for case in self._study.cases:
             key = {"study": self._study.fingerprint, **dataclasses.asdict(case), "case": case.index}
@@ -198,43 +209,51 @@ class ParquetStudyTable(StudyTable):
     def _schema(self) -> pyarrow.Schema:
         text, whole, number = pyarrow.string(), pyarrow.int64(), pyarrow.float64()
         types = {"study": text, "case": whole, "variation": text, "pose": whole, "seed": whole, "error": text}
-        types |= {measure.column: pyarrow.bool_() if measure.is_answer else number for measure in self._study.measures}
+        types |= {measure.column: pyarrow.bool_() if measure.is_boolean else number for measure in self._study.measures}
         return pyarrow.schema([(name, types.get(name, number)) for name in self._header])
 
 
 def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
-    """Reads the rows of a finished study."""
+    """Reads the rows of a finished study, by the number of the case."""
     try:
         content = pyarrow.parquet.read_table(path).to_pylist()
     except (OSError, pyarrow.ArrowException) as error:
-        raise StudyError(f"{path}: is there and is no table of a study; name another output") from error
+        raise StudyError(
+            f"{path}: the file exists and does not contain results of a study. Give another output."
+        ) from error
     if {row.get("study") for row in content} != {study.fingerprint}:
-        raise StudyError(f"{path}: was made by another study; name another output")
+        raise StudyError(f"{path}: the results are from a different study. Give another output.")
     names = [measure.column for measure in study.measures]
     return {row["case"]: Row({} if row["error"] else {n: row[n] for n in names}, row["error"] or "") for row in content}
 
 
 @dataclass(frozen=True)
 class Share:
-    """Number of `runs` with a true measure, and Wilson's 95 % interval `lower`..`upper` for independent runs."""
+    """Share of runs in which a boolean measure is true.
 
-    yes: int
+    Attributes:
+        count: Number of runs in which the measure is true.
+        runs: Number of runs.
+        lower, upper: Wilson's 95 % interval of the share, for independent runs.
+    """
+
+    count: int
     runs: int
     lower: float
     upper: float
 
     @classmethod
-    def of(cls, yes: int, runs: int) -> Share:
-        """Computes the share of `yes` among `runs` and its interval."""
+    def of(cls, count: int, runs: int) -> Share:
+        """Computes the interval for `count` of `runs`."""
         from scipy.stats import binomtest  # takes 0.3 s
 
-        interval = binomtest(yes, runs).proportion_ci(method="wilson")
-        return cls(yes, runs, float(interval.low), float(interval.high))
+        interval = binomtest(count, runs).proportion_ci(method="wilson")
+        return cls(count, runs, float(interval.low), float(interval.high))
 
 
 @dataclass(frozen=True)
 class Quantiles:
-    """Quantiles of one measure over all runs. Failed runs count as infinite."""
+    """Median, 95th percentile and maximum of one measure over all runs. Failed runs count as infinite."""
 
     median: float
     percentile_95: float
@@ -243,7 +262,13 @@ class Quantiles:
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of one variation: the number of `runs`, the number of failed runs, and each measure by its column."""
+    """Summary of one variation.
+
+    Attributes:
+        variation: Name of the variation.
+        runs, failed: Number of runs and of failed runs.
+        measures: Summary of each measure, by column.
+    """
 
     variation: str
     runs: int
@@ -252,24 +277,26 @@ class Summary:
 
 
 def summarise(study: Study, rows: Mapping[int, Row]) -> list[Summary]:
-    """Returns one summary per variation over the cases in `rows`. Variations without rows are omitted."""
+    """Returns one summary per variation that has cases in `rows`."""
     summaries = []
     for variation in study.variations:
-        of_it = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
-        if of_it:
-            measures = {measure.column: _summary_of(measure, of_it) for measure in study.measures}
-            summaries.append(Summary(variation.name, len(of_it), sum(bool(row.error) for row in of_it), measures))
+        variation_rows = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
+        if variation_rows:
+            measures = {measure.column: _summary_of(measure, variation_rows) for measure in study.measures}
+            summaries.append(
+                Summary(variation.name, len(variation_rows), sum(bool(row.error) for row in variation_rows), measures)
+            )
     return summaries
 
 
 def values_of(measure: Measure, rows: list[Row]) -> NDArray[np.float64]:
-    """Returns the value of each run (m,); failed runs have the worst value."""
+    """Returns the value (m,) of each run; failed runs have the worst value."""
     return np.array([row.values.get(measure.column, measure.worst) for row in rows], float)
 
 
 def _summary_of(measure: Measure, rows: list[Row]) -> Share | Quantiles:
     values = values_of(measure, rows)
-    if measure.is_answer:
+    if measure.is_boolean:
         return Share.of(int(values.sum()), len(values))
     # Do not interpolate between runs, since values can be infinite.
     median, percentile_95 = np.quantile(values, [0.5, 0.95], method="inverted_cdf")

@@ -1,4 +1,4 @@
-"""Simulated arm for tuning: quantities that both tuning methods share, and one closed loop for all trials."""
+"""Simulated arm for tuning: properties that both tuning methods use, and a closed loop for step tests."""
 
 from __future__ import annotations
 
@@ -34,47 +34,53 @@ def step_size(arm: Arm) -> NDArray[np.float64]:
 
 
 def band(arm: Arm) -> NDArray[np.float64]:
-    """Returns the settling band (n,) of each joint [rad, m]: 2 % of the step, but at least one encoder count."""
+    """Returns the settling band (n,) of each joint [rad, m]: 2 % of the step, and at least one encoder count."""
     return np.maximum(0.02 * step_size(arm), arm.encoder_counts())
 
 
 def effort_limits(arm: Arm) -> NDArray[np.float64]:
-    """Returns the maximum effort (n,) of each joint with zero effort of the others, limited by arm and motors."""
+    """Returns the maximum effort (n,) of each joint [N m, N] with zero effort of the other joints.
+
+    It is the smaller one of the arm's effort limit and the effort that the motors can produce.
+    """
     motors = per_actuator(arm.effects.saturation, arm.joint_names, np.inf)
-    # tau_joint = J' tau_actuator: one joint's effort needs these actuator efforts.
+    # Actuator efforts per unit of a single joint effort, since tau_joint = J' tau_actuator.
     share = np.abs(np.linalg.inv(arm.transmission.matrix).T)
     with np.errstate(divide="ignore"):
         return np.minimum(arm.effort_limits, np.min(motors[:, None] / share, axis=0))
 
 
-def known_model(arm: Arm) -> IdentifiedModel:
-    """Returns an ideal identified model: the SDF's links, and the springs and cables of the arm's effects."""
+def ideal_model(arm: Arm) -> IdentifiedModel:
+    """Returns an exact model of the arm: the links of the SDF, and the springs and cables of the arm's file."""
     return IdentifiedModel.from_arm(arm, [*arm.effects.cables, *arm.effects.springs])
 
 
-#: Maximum holding effort in tuning poses, as a share of the motor's maximum effort. No gains help a motor without
-#: reserve. (In a part of the joint box the wrist spring of an MTM exceeds the maximum effort of its motor.)
-HOLDING_SHARE = 0.5
+#: Maximum holding effort in tuning poses, as a share of the motor's maximum effort. In other poses the motor saturates,
+#: whatever the gains are. In a part of the joint box, the wrist spring of an MTM exceeds the effort of its motor.
+MAX_HOLDING_SHARE = 0.5
 
 
 @cache
 def tuning_poses(arm: Arm, count: int, seed: int) -> NDArray[np.float64]:
-    """Draws poses (count, n) from the joint box, a tenth of each range from the stops, with low holding efforts.
+    """Returns random poses (count, n) with low holding efforts and a margin of 10 % of each range from the stops.
 
     Raises:
         ArmError: Too few poses have a low holding effort.
     """
     candidates = arm.sample_poses(40 * count, np.random.default_rng(seed), margin=0.1)
-    efforts = known_model(arm).holding_torque(candidates) @ np.linalg.inv(arm.transmission.matrix)
+    efforts = ideal_model(arm).holding_torque(candidates) @ np.linalg.inv(arm.transmission.matrix)
     motors = per_actuator(arm.effects.saturation, arm.joint_names, np.inf)
-    light = candidates[np.all(np.abs(efforts) <= HOLDING_SHARE * motors, axis=1)]
-    if len(light) < count:
-        raise ArmError(f"{arm.name}: its motors hold hardly any pose with {100 * HOLDING_SHARE:.0f} % of their effort")
-    return light[:count]
+    suitable = candidates[np.all(np.abs(efforts) <= MAX_HOLDING_SHARE * motors, axis=1)]
+    if len(suitable) < count:
+        raise ArmError(
+            f"{arm.name}: gravity requires more than {100 * MAX_HOLDING_SHARE:.0f} % of a motor's maximum effort "
+            "at almost all poses. Check the inertias and motor limits of the arm."
+        )
+    return suitable[:count]
 
 
 def middle_pose(arm: Arm) -> NDArray[np.float64]:
-    """Returns the tuning pose (n,) nearest to the middle of the joint box, with distances scaled by the ranges."""
+    """Returns the tuning pose (n,) nearest to the middle of the joint box. Distances are relative to the ranges."""
     poses = tuning_poses(arm, 200, 0)
     width = arm.position_upper - arm.position_lower
     middle = 0.5 * (arm.position_upper + arm.position_lower)
@@ -96,12 +102,12 @@ _PUBLISHED_JOINTS = (
 _PUBLISHED_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
 _PUBLISHED_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
 _PUBLISHED_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
-#: The controller ran at 100 Hz and summed the errors of all samples. A Ki of 1 equals 100 N m/(rad s).
+#: Rate of the published controller [Hz]. It sums the errors of all samples, so its Ki of 1 equals 100 N m/(rad s).
 _PUBLISHED_RATE = 100.0
 
 
 def published_gains(arm: Arm) -> Gains | None:
-    """Returns the published gains, with Ki per second, for an arm with the joints of an MTM, or None for other arms."""
+    """Returns the published gains with Ki per second. None for an arm without the joints of an MTM."""
     if arm.joint_names != _PUBLISHED_JOINTS:
         return None
     return Gains(list(_PUBLISHED_KP), list(_PUBLISHED_KV), [_PUBLISHED_RATE * ki for ki in _PUBLISHED_KI])
@@ -117,8 +123,8 @@ class Condition:
 
     Attributes:
         name: Name of the condition in tables.
-        gravity: Ratio of the true to the modelled gravity torque.
-        inertia: Ratio of all true to modelled masses and inertias. The gravity model is scaled accordingly.
+        gravity: Ratio of the true gravity torque to that of the model.
+        inertia: Ratio of all true masses and inertias to those of the model. The gravity model is scaled accordingly.
         ticks: Additional delay in time steps.
     """
 
@@ -128,19 +134,19 @@ class Condition:
     ticks: int = 0
 
 
-NOMINAL = Condition("modelled")
+NOMINAL = Condition("nominal")
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Response of the n joints at m times [s; rad, N m; m, N for a prismatic joint].
+    """Step response of the n joints at m times.
 
     Attributes:
-        t: Times (m,).
-        q: True positions (m, n).
-        q_measured: Delayed positions (m, n) from the encoders.
-        effort: Commanded efforts (m, n).
-        q_desired: Desired positions (n,).
+        t: Times (m,) [s].
+        q: True positions (m, n) [rad, m].
+        q_measured: Delayed positions (m, n) from the encoders [rad, m].
+        effort: Commanded efforts (m, n) [N m, N].
+        q_desired: Desired positions (n,) [rad, m].
     """
 
     t: NDArray[np.float64]
@@ -151,21 +157,21 @@ class Response:
 
 
 class Bench:
-    """Closed loop of an arm with all of its `effects` and a GravityPidController with an ideal identified model."""
+    """Closed loop of an arm with all of its `effects` and a GravityPidController with an exact model."""
 
     def __init__(self, arm: Arm, condition: Condition = NOMINAL) -> None:
-        """Builds the loop. The first loop of an arm in a process compiles its controller, which takes seconds."""
+        """Builds the loop. The first loop of an arm in a process takes seconds, since it compiles the controller."""
         self.arm = arm
-        # Heavier links increase both gravity and inertia. Scale the gravity model so that only `gravity` remains wrong.
-        believed = condition.inertia / condition.gravity
+        # Heavier links increase both gravity and inertia. Scale the model so that its gravity error is only `gravity`.
+        model_scale = condition.inertia / condition.gravity
         self._station = ArmStation(
             arm,
             plant_config=arm_plant_config(PERIOD),
-            effects=_later(arm.effects, condition.ticks),
+            effects=_with_additional_delay(arm.effects, condition.ticks),
             modify_plant=lambda plant: _scale_rotors(plant, condition.inertia),
         )
-        model = known_model(arm)
-        model = model.with_scaled_parameters(np.full(len(model.base_parameters), believed))
+        model = ideal_model(arm)
+        model = model.with_scaled_parameters(np.full(len(model.base_parameters), model_scale))
         self._controller = GravityPidController(model, period=PERIOD)
         builder = DiagramBuilder()
         add_closed_loop(builder, self._station, self._controller)
@@ -177,7 +183,7 @@ class Bench:
         self._inertias = _scaled_links(self._station.plant, condition.inertia)
 
     def step(self, q: NDArray[np.float64], q_desired: NDArray[np.float64], gains: Gains, duration: float) -> Response:
-        """Simulates a step from rest at q (n,), with unloaded friction springs, to q_desired (n,) at time 0."""
+        """Simulates a step from q (n,), at rest and with unloaded friction, to q_desired (n,) at time 0."""
         root = self._diagram.CreateDefaultContext()
         station = self._station.GetMyMutableContextFromRoot(root)
         controller = self._controller.GetMyMutableContextFromRoot(root)
@@ -194,7 +200,7 @@ class Bench:
         return Response(t, true[:, :n], measured[:, :n], effort, np.array(q_desired))
 
 
-def _later(effects: ArmEffects, ticks: int) -> ArmEffects:
+def _with_additional_delay(effects: ArmEffects, ticks: int) -> ArmEffects:
     delay = effects.delay or DelayEffect()
     return dataclasses.replace(effects, delay=dataclasses.replace(delay, measurement=delay.measurement + ticks))
 
@@ -218,15 +224,15 @@ def _scaled_links(plant: MultibodyPlant, factor: float) -> dict[str, SpatialIner
 
 @cache
 def bench_of(arm: str, condition: Condition = NOMINAL) -> Bench:
-    """Returns the bench of an arm, given by its name or file. Each process caches its benches."""
+    """Returns the closed loop of an arm, given by its name or file. Each process caches its loops."""
     return Bench(load_arm(arm), condition)
 
 
 class JointOnBench:
-    """Implementation of `procedure.JointUnderTest` that releases the joint at `step` from the middle pose."""
+    """Implementation of `procedure.JointUnderTest`. Its step starts at the distance `step` from the middle pose."""
 
     def __init__(self, bench: Bench, joint: int) -> None:
-        """Selects the joint with this index. The other joints are held with the arm's own gains."""
+        """Selects the joint with this index. The other joints are regulated with the gains of the arm's file."""
         arm = bench.arm
         self._bench, self._joint = bench, joint
         self._q_desired = middle_pose(arm)

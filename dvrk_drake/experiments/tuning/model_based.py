@@ -1,4 +1,4 @@
-"""Model-based gains, from the mass matrix over the joint box, friction, encoders, motors and delay."""
+"""Model-based design of gains from the mass matrix, friction, encoders, motors and delay."""
 
 from __future__ import annotations
 
@@ -17,32 +17,33 @@ from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_pos
 
 #: Damping ratio of a joint at its largest inertia, without the additional damping of dry friction.
 DAMPING_RATIO = 0.8
-#: Minimum phase margin [rad] and gain margin at all inertias of the joint in its box.
+#: Minimum phase margin [rad] and minimum gain margin, at the smallest and the largest inertia of the joint.
 PHASE_MARGIN, GAIN_MARGIN = np.pi / 6, 2.0
-#: Maximum effort caused by one encoder count, as a share of the maximum effort, unless the dry friction is larger.
-SHAKE = 0.05
-#: Time after which the integrator shall move a joint that sticks at the edge of its band [s].
-BREAK_AWAY = 0.25
+#: Maximum effort due to one encoder count, as a share of the maximum effort. Dry friction increases this limit.
+MAX_COUNT_EFFORT = 0.05
+#: Maximum time until the integral term moves a joint that sticks at the edge of its settling band [s].
+BREAK_AWAY_TIME = 0.25
 #: Assumed gravity error, as a share of the largest gravity torque; upper bound of Ki / (Kp w).
 GRAVITY_ERROR, INTEGRAL_SHARE = 0.2, 0.15
-#: Candidate frequencies in descending order [rad/s].
+#: Tested natural frequencies, in descending order [rad/s].
 FREQUENCIES = np.geomspace(300.0, 1.0, 400)
-#: Number of poses for the mass matrix, and number of these at which the stability of all joints together is checked.
+#: Number of poses for the mass matrix, and number of poses for checking the stability of all joints together.
 POSES, NUM_STABILITY_POSES = 200, 20
 
 
 @dataclass(frozen=True)
-class JointFacts:
-    """Properties of one joint that determine its gains [kg m^2, N m, rad; kg, N, m].
+class JointProperties:
+    """Properties of one joint that determine its gains.
 
     Attributes:
-        inertia: Smallest inertia, with all other joints free, and largest inertia, with all other joints held.
-        dry_friction: Maximum dry friction.
-        viscous: Coefficient of viscous friction.
-        gravity: Largest gravity torque.
-        count: Resolution of the encoder.
-        band: Settling band.
-        effort_limit: Maximum effort.
+        inertia: Smallest inertia (other joints free) and largest inertia (other joints locked)
+            [kg m^2, kg].
+        dry_friction: Dry friction [N m, N].
+        viscous: Coefficient of viscous friction [N m s/rad, N s/m].
+        gravity: Largest gravity torque [N m, N].
+        count: Resolution of the encoder in joint coordinates [rad, m].
+        band: Settling band [rad, m].
+        effort_limit: Maximum effort [N m, N].
     """
 
     inertia: tuple[float, float]
@@ -59,10 +60,10 @@ class JointDesign:
     """Gains of one joint and their derivation.
 
     Attributes:
-        kp, kd, ki: Gains.
+        kp, kd, ki: Gains [N m/rad, N m s/rad, N m/(rad s)], with N/m instead of N m/rad for a prismatic joint.
         frequency: Natural frequency of the closed loop at the largest inertia [rad/s].
         margins: Margins at the smallest and at the largest inertia.
-        limited_by: Requirement that a faster loop would violate.
+        limited_by: Requirement that the next higher frequency violates.
     """
 
     kp: float
@@ -79,19 +80,19 @@ class ArmDesign:
 
     Attributes:
         gains: Gains of all joints.
-        facts: Properties of each joint.
+        properties: Properties of each joint.
         joints: Design of each joint.
     """
 
     gains: Gains
-    facts: tuple[JointFacts, ...]
+    properties: tuple[JointProperties, ...]
     joints: tuple[JointDesign, ...]
 
 
 def design_arm(arm: Arm) -> ArmDesign:
-    """Designs each joint separately, then checks the stability of all joints together at poses of the joint box.
+    """Designs the gains of each joint separately, then checks the stability of all joints together.
 
-    The coupled joints must be stable with one additional period of delay and with 20 % less inertia than the model.
+    The coupled joints must be stable at all checked poses, with one additional period of delay and 20 % less inertia.
     While they are unstable, the frequency of the joint with the largest share of the unstable mode is reduced by 10 %.
 
     Raises:
@@ -99,67 +100,73 @@ def design_arm(arm: Arm) -> ArmDesign:
     """
     sampling = sampling_of(arm)
     masses = mass_matrices(arm, arm.sample_poses(POSES, np.random.default_rng(1)))
-    facts = joint_facts(arm, masses)
-    joints = [_named(arm, name, fact, sampling) for name, fact in zip(arm.joint_names, facts, strict=True)]
-    slowed = np.ones(arm.num_joints)
-    harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
-    viscous = [fact.viscous for fact in facts]
-    loops = [SampledLoop(0.8 * M, harder, viscous) for M in masses[:: POSES // NUM_STABILITY_POSES]]
-    while np.min(slowed) > 0.1:
+    properties = joint_properties(arm, masses)
+    joints = [
+        _design_named_joint(arm, name, joint, sampling) for name, joint in zip(arm.joint_names, properties, strict=True)
+    ]
+    frequency_scales = np.ones(arm.num_joints)
+    more_delay = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
+    viscous = [joint.viscous for joint in properties]
+    loops = [SampledLoop(0.8 * M, more_delay, viscous) for M in masses[:: POSES // NUM_STABILITY_POSES]]
+    while np.min(frequency_scales) > 0.1:
         gains = rounded_gains((joint.kp, joint.kd, joint.ki) for joint in joints)
         growth, shares = max((loop.least_damped_mode(gains) for loop in loops), key=lambda mode: mode[0])
         if growth < 1.0:
-            return ArmDesign(gains, facts, tuple(joints))
-        slow = int(np.argmax(shares))
-        slowed[slow] *= 0.9
-        joints[slow] = design_joint(facts[slow], sampling, slowed[slow])
-    raise ControllerError(f"{arm.name}: no gains with which all joints are stable together")
+            return ArmDesign(gains, properties, tuple(joints))
+        j = int(np.argmax(shares))
+        frequency_scales[j] *= 0.9
+        joints[j] = design_joint(properties[j], sampling, frequency_scales[j])
+    raise ControllerError(
+        f"{arm.name}: no gains stabilise all joints together. Check the inertias, delays and encoders of the arm."
+    )
 
 
-def _named(arm: Arm, name: str, fact: JointFacts, sampling: Sampling) -> JointDesign:
+def _design_named_joint(arm: Arm, name: str, joint: JointProperties, sampling: Sampling) -> JointDesign:
     try:
-        return design_joint(fact, sampling)
+        return design_joint(joint, sampling)
     except ControllerError as error:
         raise ControllerError(f"{arm.name}, {name}: {error}") from error
 
 
-def design_joint(fact: JointFacts, sampling: Sampling, slowed: float = 1.0) -> JointDesign:
-    """Returns the fastest gains that satisfy all requirements, with their frequency multiplied by `slowed`.
+def design_joint(joint: JointProperties, sampling: Sampling, frequency_scale: float = 1.0) -> JointDesign:
+    """Returns the gains with the highest frequency that satisfies all requirements, times `frequency_scale`.
 
     Raises:
         ControllerError: No gains satisfy the requirements.
     """
-    limited_by = "fastest tried"
+    limited_by = "highest tested frequency"
     for w in FREQUENCIES:
-        design = _joint_gains(fact, sampling, w)
-        if reason := _objection(fact, sampling, design):
+        design = _joint_gains(joint, sampling, w)
+        if reason := _violated_requirement(joint, sampling, design):
             limited_by = reason
             continue
-        if slowed < 1.0:
+        if frequency_scale < 1.0:
             limited_by = "other joints"
-            design = _joint_gains(fact, sampling, slowed * w)
+            design = _joint_gains(joint, sampling, frequency_scale * w)
         kp, kd, ki = design
-        low, high = (SampledLoop(M, sampling, fact.viscous).margins(Gains([kp], [kd], [ki])) for M in fact.inertia)
-        return JointDesign(kp, kd, ki, float(slowed * w), (low, high), limited_by)
-    raise ControllerError(f"no gains for {FREQUENCIES[-1]:g} rad/s or more, limited by: {limited_by}")
+        low, high = (SampledLoop(M, sampling, joint.viscous).margins(Gains([kp], [kd], [ki])) for M in joint.inertia)
+        return JointDesign(kp, kd, ki, float(frequency_scale * w), (low, high), limited_by)
+    raise ControllerError(
+        f"no gains satisfy the requirements at {FREQUENCIES[-1]:g} rad/s or more (limited by {limited_by})"
+    )
 
 
-def _joint_gains(fact: JointFacts, sampling: Sampling, w: float) -> tuple[float, float, float]:
-    """Returns kp, kd and ki for the frequency w at the largest inertia."""
-    kp, kd = place(fact.inertia[1], w, DAMPING_RATIO, sampling, fact.viscous)
-    unknown = fact.dry_friction + GRAVITY_ERROR * fact.gravity
-    return kp, kd, min(unknown / (fact.band * BREAK_AWAY), INTEGRAL_SHARE * w * kp)
+def _joint_gains(joint: JointProperties, sampling: Sampling, w: float) -> tuple[float, float, float]:
+    """Returns kp, kd and ki for the natural frequency w [rad/s] at the largest inertia."""
+    kp, kd = place(joint.inertia[1], w, DAMPING_RATIO, sampling, joint.viscous)
+    disturbance = joint.dry_friction + GRAVITY_ERROR * joint.gravity
+    return kp, kd, min(disturbance / (joint.band * BREAK_AWAY_TIME), INTEGRAL_SHARE * w * kp)
 
 
-def _objection(fact: JointFacts, sampling: Sampling, design: tuple[float, float, float]) -> str:
-    """Returns the requirement that the gains violate, or "" if they violate none."""
+def _violated_requirement(joint: JointProperties, sampling: Sampling, design: tuple[float, float, float]) -> str:
+    """Returns the first requirement that the gains violate, or "" if they satisfy all."""
     kp, kd, ki = design
-    # Effort of one count in one period, before low-pass filtering.
-    jolt = fact.count * (kp + kd * (1.0 - sampling.decay) / sampling.period)
-    if jolt > max(fact.dry_friction, SHAKE * fact.effort_limit):
+    # Change of the effort in one period if the measured position changes by one count.
+    count_effort = joint.count * (kp + kd * (1.0 - sampling.decay) / sampling.period)
+    if count_effort > max(joint.dry_friction, MAX_COUNT_EFFORT * joint.effort_limit):
         return "encoder count"
-    for M in fact.inertia:
-        margins = SampledLoop(M, sampling, fact.viscous).margins(Gains([kp], [kd], [ki]))
+    for M in joint.inertia:
+        margins = SampledLoop(M, sampling, joint.viscous).margins(Gains([kp], [kd], [ki]))
         if margins.phase < PHASE_MARGIN:
             return "phase margin"
         if margins.gain < GAIN_MARGIN:
@@ -168,10 +175,10 @@ def _objection(fact: JointFacts, sampling: Sampling, design: tuple[float, float,
 
 
 def sampling_of(arm: Arm, period: float = 1e-3) -> Sampling:
-    """Returns the sampling of an arm. Its delay includes one period for the computation of the controller."""
+    """Returns the sampling of an arm. The delay includes one period for the computation of the controller."""
     delay, encoder = arm.effects.delay, arm.effects.encoder
-    own = delay.measurement + delay.command if delay else 0
-    return Sampling(period, own + 1, encoder.velocity_cut_off if encoder else np.inf)
+    arm_delay = delay.measurement + delay.command if delay else 0
+    return Sampling(period, arm_delay + 1, encoder.velocity_cut_off if encoder else np.inf)
 
 
 def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -186,7 +193,7 @@ def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array(masses)
 
 
-def joint_facts(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointFacts, ...]:
+def joint_properties(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointProperties, ...]:
     """Returns the properties of each joint from `masses` (m, n, n) at poses of the whole joint box."""
     least = 1.0 / np.max(np.diagonal(np.linalg.inv(masses), axis1=1, axis2=2), axis=0)
     largest = np.max(np.diagonal(masses, axis1=1, axis2=2), axis=0)
@@ -200,20 +207,21 @@ def joint_facts(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointFacts, ...]
         effort_limits(arm),
     )
     rows = zip(*columns, strict=True)
-    return tuple(JointFacts((float(row[0]), float(row[1])), *map(float, row[2:])) for row in rows)
+    return tuple(JointProperties((float(row[0]), float(row[1])), *map(float, row[2:])) for row in rows)
 
 
 def friction(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the dry friction (n,) that acts in both directions [N m, N] and the viscous friction (n,) of each joint.
+    """Computes the friction of each joint when only this joint moves.
 
-    Viscous friction is in [N m s/rad; N s/m]. Both are for the motion of one joint alone.
+    Returns:
+        Dry friction (n,) that acts in both directions [N m, N], and viscous friction (n,) [N m s/rad, N s/m].
     """
     dry, viscous = np.zeros(arm.num_joints), np.zeros(arm.num_joints)
     for effect in arm.effects.friction:
         row = np.abs(joint_row(arm, effect.coordinate))
         if effect.kind == "viscous":
             viscous += effect.coefficient * row**2
-        elif effect.kind != "presliding forward":  # acts in one direction only
+        elif effect.kind != "presliding forward":  # this kind acts in one direction only
             dry += effect.coefficient * row
     return dry, viscous
 

@@ -1,7 +1,8 @@
 """Tuning procedure of the paper (section III.J).
 
-Kp is raised until the joint oscillates. Then Kv is raised until the oscillation is damped, and Ki until the offset
-vanishes. The paper does not give the stopping criteria. The criteria used here are the constants of this module.
+The procedure raises Kp until the joint oscillates, then Kv until the oscillation is damped, and then Ki until the
+offset is inside the settling band. The paper does not state the stopping criteria. Those used here are the constants of
+this module.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ class Oscillation:
     """Oscillation of a joint. A swing is the motion from one turning point to the next.
 
     Attributes:
-        swings: Number of swings. The first is not evaluated, since it starts with slack cables and a zero integral.
-        growth: Mean ratio of the sizes of consecutive swings; 0 for too few swings.
-        period: Duration of two swings [s]; infinite for too few swings.
+        swings: Number of swings. The first swing is not evaluated, since friction and integral are zero at its start.
+        growth: Mean ratio of the amplitudes of consecutive swings; 0 for too few swings.
+        period: Period of the oscillation, i.e. duration of two swings [s]; infinite for too few swings.
     """
 
     swings: int
@@ -34,57 +35,57 @@ class Oscillation:
         return self.growth >= 1.0
 
 
-#: Number of evaluated swings: enough to detect 1 % of growth, but too few to reach the stops.
-JUDGED = 8
-#: Minimum number of evaluated swings. A joint that sticks after three swings does not oscillate.
-MIN_TURNING_POINTS = 3
+#: Maximum number of evaluated swings: enough to detect a growth of 1 %, but too few to reach the stops.
+MAX_EVALUATED_SWINGS = 8
+#: Minimum number of evaluated swings. A joint that sticks after fewer swings does not oscillate.
+MIN_EVALUATED_SWINGS = 3
 
 
-def judge_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold: float) -> Oscillation:
+def evaluate_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold: float) -> Oscillation:
     """Evaluates the oscillation of positions x (m,) at times t (m,) after a release at rest.
 
     Motions smaller than `threshold` [rad, m] are not counted as swings.
     """
-    turns = turning_points(x, threshold)[: JUDGED + 2]
-    swings = np.abs(np.diff(x[turns]))
-    judged = swings[1:]
-    if len(judged) < MIN_TURNING_POINTS:
+    extrema = turning_points(x, threshold)[: MAX_EVALUATED_SWINGS + 2]
+    swings = np.abs(np.diff(x[extrema]))
+    evaluated = swings[1:]
+    if len(evaluated) < MIN_EVALUATED_SWINGS:
         return Oscillation(len(swings), 0.0, np.inf)
-    growth = (judged[-1] / judged[0]) ** (1.0 / (len(judged) - 1))
-    half = np.diff(t[turns[1:]]).mean()
-    return Oscillation(len(swings), float(growth), float(2.0 * half))
+    growth = (evaluated[-1] / evaluated[0]) ** (1.0 / (len(evaluated) - 1))
+    half_period = np.diff(t[extrema[1:]]).mean()
+    return Oscillation(len(swings), float(growth), float(2.0 * half_period))
 
 
 def turning_points(x: NDArray[np.float64], threshold: float) -> NDArray[np.int_]:
-    """Returns the indices of the first sample and of each extremum of x (m,) with a reversal above `threshold`."""
+    """Returns the indices of the first sample and of each extremum of x (m,) after which x changes by `threshold`."""
     found, extreme, direction = [0], 0, 0.0
     for i, value in enumerate(x):
-        way = value - x[extreme]
+        change = value - x[extreme]
         if direction == 0.0:
-            if abs(way) > threshold:
-                direction, extreme = float(np.sign(way)), i
-        elif way * direction >= 0:
+            if abs(change) > threshold:
+                direction, extreme = float(np.sign(change)), i
+        elif change * direction >= 0:
             extreme = i
-        elif -way * direction > threshold:
+        elif -change * direction > threshold:
             found.append(extreme)
             direction, extreme = -direction, i
     return np.array(found)
 
 
-#: Maximum duration of a release [s] and in periods of the last release; durations of the step tests [s].
-RELEASE, PERIODS, DAMPING_STEP, OFFSET_STEP = 1.5, 7.0, 1.0, 2.0
-#: Factor by which Kp is raised until the joint oscillates, and number of logarithmic bisections after that.
-RAISE, BISECTIONS = 2.0, 5
-#: Maximum overshoot of a damped step, as a share of the step, without and with the integral term.
+#: Maximum duration of a release, in s and in periods of the last release; durations of the tests for Kv and Ki [s].
+RELEASE_DURATION, RELEASE_PERIODS, DAMPING_DURATION, OFFSET_DURATION = 1.5, 7.0, 1.0, 2.0
+#: Factor by which Kp is raised until the joint oscillates; number of logarithmic bisections after that.
+KP_FACTOR, NUM_BISECTIONS = 2.0, 5
+#: Maximum overshoot of a damped step response, as a share of the step, without and with the integral term.
 OVERSHOOT, OVERSHOOT_WITH_INTEGRAL = 0.05, 0.15
-#: Factor by which Kv and Ki are raised; factor by which Kp is lowered if no Kv damps the joint.
-FINER, LESS = 1.5, 0.7
-#: Range of the damping ratio for Kv; range of Ki as a share of Kp per period.
-RATIOS, SHARES = (0.05, 3.0), (0.02, 1.0)
+#: Factor by which Kv and Ki are raised; factor by which Kp is reduced if no Kv damps the joint.
+KV_KI_FACTOR, KP_REDUCTION = 1.5, 0.7
+#: Range of the damping ratio that determines Kv; range of Ki as a share of Kp per period of the ultimate oscillation.
+DAMPING_RATIOS, KI_SHARES = (0.05, 3.0), (0.02, 1.0)
 
 
 class JointUnderTest(Protocol):
-    """Interface to one joint of an arm whose other joints are held."""
+    """Interface to one joint of an arm. The other joints are regulated."""
 
     step: float
     """Initial distance from the desired position in releases and steps [rad, m]."""
@@ -107,8 +108,8 @@ class Ultimate:
     Attributes:
         gain: Smallest Kp with a sustained oscillation [N m/rad; N/m], or the largest tested Kp if there is none.
         period: Period of the oscillation at this gain [s].
-        growth: Ratio of consecutive swings at this gain.
-        sustained: False if the joint oscillated with none of the tested gains.
+        growth: Mean ratio of the amplitudes of consecutive swings at this gain.
+        sustained: False if the joint oscillated at none of the tested gains.
     """
 
     gain: float
@@ -122,18 +123,18 @@ class JointProcedure:
     """Result of the procedure for one joint.
 
     Attributes:
-        kp, kd, ki: Gains.
-        ultimate: Ultimate gain, with which the procedure starts.
-        kp_lowered: Ratio of the final Kp to the ultimate gain; 1 if Kp did not have to be lowered.
+        kp, kd, ki: Gains [N m/rad, N m s/rad, N m/(rad s)], with N/m instead of N m/rad for a prismatic joint.
+        ultimate: Ultimate gain of the joint.
+        kp_ratio: Ratio of the final Kp to the ultimate gain; 1 if Kp was not reduced.
         damped: False if no Kv damped the joint.
-        offset: Remaining distance at the end of a step [rad, m].
+        offset: Remaining position error at the end of a step [rad, m].
     """
 
     kp: float
     kd: float
     ki: float
     ultimate: Ultimate
-    kp_lowered: float
+    kp_ratio: float
     damped: bool
     offset: float
 
@@ -149,76 +150,76 @@ def tune_joint(joint: JointUnderTest) -> JointProcedure:
 def find_ultimate_gain(joint: JointUnderTest) -> Ultimate:
     """Raises Kp until the oscillation after a release from `joint.step` is sustained, then bisects.
 
-    With dry friction F the joint moves only if Kp step > F. Near the ultimate gain of such a joint small swings decay
-    and large ones grow. The result is therefore valid for the given step. Kp is raised until the motor reaches its
-    limit within a twentieth of the step; a higher Kp has no effect.
+    With dry friction F the joint moves only if Kp step > F. Near the ultimate gain of such a joint, small oscillations
+    decay and large ones grow. Therefore the result is valid only for the given step. The largest tested Kp saturates
+    the motor at a twentieth of the step, since a higher Kp has almost no effect.
     """
 
-    watched = RELEASE
+    duration = RELEASE_DURATION
 
-    def swing(kp: float) -> Oscillation:
-        nonlocal watched
-        t, error = joint.respond(kp, 0.0, 0.0, watched)
-        found = judge_oscillation(t, error, max(2.0 * joint.count, 0.02 * joint.step))
-        # The period decreases with the gain, and a bisection lowers the gain only slightly.
-        watched = min(RELEASE, PERIODS * found.period)
+    def release(kp: float) -> Oscillation:
+        nonlocal duration
+        t, error = joint.respond(kp, 0.0, 0.0, duration)
+        found = evaluate_oscillation(t, error, max(2.0 * joint.count, 0.02 * joint.step))
+        # The period decreases with the gain, and a bisection reduces the gain only slightly.
+        duration = min(RELEASE_DURATION, RELEASE_PERIODS * found.period)
         return found
 
     largest = 20.0 * joint.effort_limit / joint.step
     low, high = largest / 1024.0, largest / 1024.0
-    found = swing(high)
+    found = release(high)
     while not found.sustained and high < largest:
-        low, high = high, min(RAISE * high, largest)
-        found = swing(high)
+        low, high = high, min(KP_FACTOR * high, largest)
+        found = release(high)
     if not found.sustained:
         return Ultimate(high, found.period, found.growth, False)
-    return _bisect(swing, low, high, found)
+    return _bisect(release, low, high, found)
 
 
-def _bisect(swing: Callable[[float], Oscillation], low: float, high: float, found: Oscillation) -> Ultimate:
-    for _ in range(BISECTIONS):
+def _bisect(release: Callable[[float], Oscillation], low: float, high: float, found: Oscillation) -> Ultimate:
+    for _ in range(NUM_BISECTIONS):
         middle = float(np.sqrt(low * high))
-        tried = swing(middle)
-        if tried.sustained:
-            high, found = middle, tried
+        oscillation = release(middle)
+        if oscillation.sustained:
+            high, found = middle, oscillation
         else:
             low = middle
     return Ultimate(high, found.period, found.growth, True)
 
 
 def _damp(joint: JointUnderTest, ultimate: Ultimate) -> tuple[float, float, bool]:
-    """Returns Kp, the smallest Kv that damps the joint, and whether one exists. Kp is lowered until one exists."""
+    """Returns Kp, the smallest Kv that damps the joint, and whether such a Kv exists. Reduces Kp if necessary."""
     period = ultimate.period if np.isfinite(ultimate.period) else 0.1
     kp = ultimate.gain
     while kp > 0.003 * ultimate.gain:
         # The frequency is proportional to the square root of Kp.
         w = 2.0 * np.pi / period * np.sqrt(kp / ultimate.gain)
-        for ratio in _raised(RATIOS):
+        for ratio in _geometric_series(DAMPING_RATIOS):
             kd = 2.0 * ratio * kp / w
-            if _try_step(joint, (kp, kd, 0.0), DAMPING_STEP, OVERSHOOT).damped:
+            if _try_step(joint, (kp, kd, 0.0), DAMPING_DURATION, OVERSHOOT).damped:
                 return kp, float(kd), True
-        kp *= LESS
+        kp *= KP_REDUCTION
     return kp, float(kd), False
 
 
 def _remove_offset(joint: JointUnderTest, kp: float, kd: float, period: float) -> tuple[float, float]:
-    """Returns the smallest Ki with which the joint settles, or the Ki with the smallest offset, and this offset."""
-    best, nearest = 0.0, _try_step(joint, (kp, kd, 0.0), OFFSET_STEP, OVERSHOOT_WITH_INTEGRAL).offset
-    for share in _raised(SHARES):
-        if nearest <= joint.band:
+    """Returns the smallest Ki with which the joint settles, or else the Ki with the smallest offset, and the offset."""
+    best, smallest_offset = 0.0, _try_step(joint, (kp, kd, 0.0), OFFSET_DURATION, OVERSHOOT_WITH_INTEGRAL).offset
+    for share in _geometric_series(KI_SHARES):
+        if smallest_offset <= joint.band:
             break
         ki = share * kp / (period if np.isfinite(period) else 0.1)
-        tried = _try_step(joint, (kp, kd, ki), OFFSET_STEP, OVERSHOOT_WITH_INTEGRAL)
-        if not tried.damped:
+        step = _try_step(joint, (kp, kd, ki), OFFSET_DURATION, OVERSHOOT_WITH_INTEGRAL)
+        if not step.damped:
             break
-        if tried.offset < nearest:
-            best, nearest = ki, tried.offset
-    return best, nearest
+        if step.offset < smallest_offset:
+            best, smallest_offset = ki, step.offset
+    return best, smallest_offset
 
 
-def _raised(ends: tuple[float, float]) -> list[float]:
-    steps = int(np.ceil(np.log(ends[1] / ends[0]) / np.log(FINER)))
-    return [ends[0] * FINER**i for i in range(steps + 1)]
+def _geometric_series(ends: tuple[float, float]) -> list[float]:
+    steps = int(np.ceil(np.log(ends[1] / ends[0]) / np.log(KV_KI_FACTOR)))
+    return [ends[0] * KV_KI_FACTOR**i for i in range(steps + 1)]
 
 
 class _Step(NamedTuple):
@@ -227,9 +228,9 @@ class _Step(NamedTuple):
 
 
 def _try_step(joint: JointUnderTest, gains: tuple[float, float, float], duration: float, overshoot: float) -> _Step:
-    """Returns whether a step has at most this overshoot and comes to rest, and the remaining distance."""
+    """Returns whether a step settles with at most this overshoot, and its remaining position error [rad, m]."""
     t, error = joint.respond(*gains, duration)
     last = error[t > 0.8 * duration]
-    rests = np.ptp(last) <= max(2.0 * joint.count, joint.band)
-    damped = rests and -np.min(error) <= overshoot * joint.step + joint.count
+    at_rest = np.ptp(last) <= max(2.0 * joint.count, joint.band)
+    damped = at_rest and -np.min(error) <= overshoot * joint.step + joint.count
     return _Step(bool(damped), float(np.abs(last).mean()))

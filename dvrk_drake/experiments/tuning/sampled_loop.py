@@ -16,8 +16,8 @@ class Sampling:
     """Sampling and delay of the control loop.
 
     Attributes:
-        period: Period of measurement and control [s].
-        ticks: Number of periods from a measurement to the effort that is computed from it.
+        period: Sample period of measurements and controller [s].
+        ticks: Number of periods between a measurement and its effort.
         cut_off: Cut-off frequency of the low-pass filter of the velocity [Hz]; infinite for no filter.
     """
 
@@ -32,23 +32,23 @@ class Sampling:
 
     @property
     def position_lag(self) -> float:
-        """Mean delay from a position to the effort computed from it, including the zero-order hold [s]."""
+        """Mean delay between a position and its effort, including the zero-order hold [s]."""
         return (self.ticks + 0.5) * self.period
 
     @property
     def velocity_lag(self) -> float:
-        """Mean delay of the velocity, including half a period for the difference and the low-pass filter [s]."""
+        """Mean delay between a velocity and its effort, including difference quotient and low-pass filter [s]."""
         return self.position_lag + (0.5 + self.decay / (1.0 - self.decay)) * self.period
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Stability margins of one joint's loop, opened at the motor.
+    """Stability margins of the control loop of one joint, opened at the motor.
 
     Attributes:
         phase: Smallest phase margin over all crossover frequencies [rad]; not positive for an unstable loop.
         crossover: Crossover frequency of the smallest phase margin [rad/s].
-        gain: Gain margin: the factor by which the loop gain can be raised before the loop is unstable.
+        gain: Gain margin: factor of the loop gain at which the loop becomes unstable.
     """
 
     phase: float
@@ -57,11 +57,11 @@ class Margins:
 
 
 class SampledLoop:
-    """Linear closed loop of n joints with mass matrix M, viscous friction b and the law of GravityPidController.
+    """Linear closed loop of n joints with mass matrix M, viscous friction b and a PID controller.
 
-    Between two samples M vd = u - b v. The effort u = Kp e + Kd de + Ki sum(e) h, with e = -q, uses the measurement
-    from `ticks` periods ago and is held for one period. Gravity is compensated. The velocity is estimated as in
-    `systems.arm_effects.drive_step.DriveStep`.
+    Between two samples M vd = u - b v. The effort is u = Kp e + Kd de + Ki sum(e) h with e = -q, as in
+    GravityPidController. It uses the measurement from `ticks` periods ago and is constant for one period. Gravity is
+    compensated exactly. The velocity is estimated as in `systems.arm_effects.drive_step.DriveStep`.
     """
 
     def __init__(self, M: ArrayLike, sampling: Sampling, viscous: ArrayLike = 0.0) -> None:
@@ -78,16 +78,16 @@ class SampledLoop:
         self._plant = cont2discrete((A, np.vstack([zero, M_inverse]), np.eye(2 * n), 0), sampling.period)[:2]
 
     def closed_loop(self, gains: Gains) -> NDArray[np.float64]:
-        """Returns the matrix A with x[k+1] = A x[k].
+        """Returns the matrix A of the closed loop, x[k+1] = A x[k].
 
-        The state x (n (5 + 2 ticks),) consists of q and v, the last reading and velocity estimate, the delayed
-        measurements with the oldest first, and the integral as an effort; see `at_rest`.
+        The state x (n (5 + 2 ticks),) consists of q and v, the last measured position and velocity estimate, the
+        delayed measurements (oldest first), and the integral as an effort.
         """
         size = self._n * (5 + 2 * self._sampling.ticks)
         return np.column_stack([self._advance(x, gains) for x in np.eye(size)])
 
     def at_rest(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Returns the state of joints that have been at rest at q (n,)."""
+        """Returns the state of the loop for joints at rest at q (n,) [rad, m]."""
         still = np.concatenate([np.broadcast_to(np.asarray(q, float), self._n), np.zeros(self._n)])
         return np.concatenate([np.tile(still, 2 + self._sampling.ticks), np.zeros(self._n)])
 
@@ -109,9 +109,9 @@ class SampledLoop:
         return bool(np.max(np.abs(np.linalg.eigvals(self.closed_loop(gains)))) < 1.0)
 
     def least_damped_mode(self, gains: Gains) -> tuple[float, NDArray[np.float64]]:
-        """Returns the growth factor per period of the least damped mode and each joint's share (n,) of its energy.
+        """Returns the growth factor of the least damped mode per period, and the joints' shares (n,) of its energy.
 
-        The shares are those of the kinetic energy without the coupling terms of the mass matrix.
+        The energy is the kinetic energy without the coupling terms of the mass matrix.
         """
         z, modes = np.linalg.eig(self.closed_loop(gains))
         worst = int(np.argmax(np.abs(z)))
@@ -120,7 +120,7 @@ class SampledLoop:
         return float(np.abs(z[worst])), energy / max(energy.sum(), np.finfo(float).tiny)
 
     def margins(self, gains: Gains) -> Margins:
-        """Computes the margins of the loop, which must have a single joint."""
+        """Computes the stability margins. The loop must have one joint."""
         assert self._n == 1
         h, decay = self._sampling.period, self._sampling.decay
         w = np.geomspace(1e-2, np.pi / h, 4000)
@@ -159,6 +159,9 @@ def place(
         damping_ratio: Damping ratio z.
         sampling: Sampling that determines the lags.
         viscous: Viscous friction b of the joint [N m s/rad; N s/m].
+
+    Returns:
+        kp and kd.
     """
     w, z, T, T_v = frequency, damping_ratio, sampling.position_lag, sampling.velocity_lag
     m = (inertia + viscous * T_v) / (1.0 + (2.0 * z * w + w**2 * T) * T_v - 0.5 * (w * T) ** 2)

@@ -1,4 +1,4 @@
-"""Tuning of an arm and comparison of the gains, in parallel on all cores."""
+"""Tunes an arm and compares the gains, in parallel on all cores."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from dvrk_drake.experiments.tuning.procedure import JointProcedure, tune_joint
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 
-#: Duration of a step test [s], and its final part in which the joints should be at rest [s].
-DURATION, REST = 2.0, 0.4
+#: Duration of a step test, and of its final part in which the joints should be at rest [s].
+DURATION, REST_TIME = 2.0, 0.4
 CONDITIONS = (
     NOMINAL,
     Condition("G +20 %", gravity=1.2),
@@ -39,7 +39,7 @@ CONDITIONS = (
     Condition("M -20 %", inertia=0.8),
     Condition("+1 tick", ticks=1),
 )
-#: Number of random poses in the joint box, and their seed.
+#: Number of random start poses of the steps, and their seed.
 POSES, SEED = 6, 3
 
 
@@ -48,11 +48,11 @@ class StepMeasures:
     """Performance measures of the n joints in one step, computed from their true positions.
 
     Attributes:
-        settling: Time (n,) after which the joint stays inside its `band` [s]; infinite if it leaves the band during
-            the last `REST`.
-        overshoot: Maximum distance (n,) beyond the goal, as a share of the step; 0 if the joint does not reach it.
-        steady_error: Mean distance (n,) from the goal over the last `REST` [rad, m].
-        oscillation: Peak-to-peak commanded effort (n,) over the last `REST`, as a share of the effort limit.
+        settling: Times (n,) after which the joints stay inside the settling band [s]; infinite for a joint that is
+            outside the band during the last `REST_TIME`.
+        overshoot: Maximum distances (n,) beyond the goal, as shares of the step; 0 for a joint that does not reach it.
+        steady_error: Mean distances (n,) from the goal over the last `REST_TIME` [rad, m].
+        oscillation: Peak-to-peak commanded efforts (n,) over the last `REST_TIME`, as shares of the effort limits.
     """
 
     settling: NDArray[np.float64]
@@ -66,12 +66,12 @@ class Comparison:
     """Comparison of the gains of an arm.
 
     Attributes:
-        arm: Arm that the gains are for.
+        arm: Arm of the gains.
         gains: Gains by name.
         conditions: Conditions (c,) of the arm.
         poses: Start poses (p, n) of the steps.
-        measures: Measures by name, for each condition and pose.
-        responses: Response by name to the step from the first pose, with the arm as modelled.
+        measures: Performance measures [condition][pose], by name of the gains.
+        responses: Step responses from the first pose in the first condition, by name of the gains.
     """
 
     arm: Arm
@@ -82,11 +82,14 @@ class Comparison:
     responses: Mapping[str, Response]
 
     def table(self, name: str, measure: str) -> NDArray[np.float64]:
-        """Returns one field of `StepMeasures` as an array (c, p, n)."""
+        """Returns one field of `StepMeasures` for the gains `name` as an array (c, p, n)."""
         return np.array([[getattr(m, measure) for m in poses] for poses in self.measures[name]])
 
     def best(self, names: Iterable[str]) -> str:
-        """Returns the gains with the fewest joints that do not settle; for equal numbers, the fastest gains."""
+        """Returns the name of the gains with the fewest joints that do not settle.
+
+        For equal numbers, it is the name of the gains with the smallest mean settling time.
+        """
 
         def rank(name: str) -> tuple[int, float]:
             settling = self.table(name, "settling")
@@ -106,30 +109,30 @@ def step_goal(arm: Arm, q: NDArray[np.float64]) -> NDArray[np.float64]:
 def measure_step(arm: Arm, response: Response) -> StepMeasures:
     """Computes the performance measures of a step response."""
     t, error = response.t, response.q - response.q_desired
-    way = error[0]
+    step = error[0]
     outside = np.abs(error) > band(arm)
     last_outside = np.where(outside.any(axis=0), len(t) - 1 - np.argmax(outside[::-1], axis=0), -1)
     settling = np.append(t, np.inf)[last_outside + 1]
-    late = t > t[-1] - REST
+    at_rest = t > t[-1] - REST_TIME
     return StepMeasures(
-        settling=np.where(settling > t[-1] - REST, np.inf, settling),
-        overshoot=np.maximum(np.max(-error / way, axis=0), 0.0),
-        steady_error=np.abs(error[late]).mean(axis=0),
-        oscillation=np.ptp(response.effort[late], axis=0) / arm.effort_limits,
+        settling=np.where(settling > t[-1] - REST_TIME, np.inf, settling),
+        overshoot=np.maximum(np.max(-error / step, axis=0), 0.0),
+        steady_error=np.abs(error[at_rest]).mean(axis=0),
+        oscillation=np.ptp(response.effort[at_rest], axis=0) / arm.effort_limits,
     )
 
 
 def run_step(bench: Bench, q: NDArray[np.float64], gains: Gains) -> Response:
-    """Simulates a simultaneous step of all joints, so that each joint is disturbed by the others."""
+    """Simulates a simultaneous step of all joints from q (n,), so that the joints disturb each other."""
     return bench.step(q, step_goal(bench.arm, q), gains, DURATION)
 
 
 Method = Literal["paper", "model"]
-#: Names in tables of gains that were not found by a method.
+#: Names of gains that are not results of a tuning method.
 OWN, PUBLISHED = "the arm's own", "published"
 #: Function called with the finished share, 0..1.
 Progress = Callable[[float], object]
-#: Share of the procedure in the total duration of a run.
+#: Share of the paper's procedure in the progress of a run.
 PROCEDURE_SHARE = 0.5
 
 
@@ -139,9 +142,9 @@ class Tuning:
 
     Attributes:
         arm: Arm that was tuned.
-        procedure: Result of the paper's procedure for each joint, if requested.
-        design: Result of the model-based design, if requested.
-        comparison: Comparison of these gains with the arm's own and the published ones.
+        procedure: Results of the paper's procedure for the joints. None if not requested.
+        design: Result of the model-based design. None if not requested.
+        comparison: Comparison of these gains with the gains of the arm's file and the published gains.
     """
 
     arm: Arm
@@ -151,7 +154,7 @@ class Tuning:
 
     @property
     def found(self) -> dict[str, Gains]:
-        """Gains that were found by tuning, by method."""
+        """Gains by tuning method."""
         gains = self.comparison.gains
         return {name: gains[name] for name in gains if name not in (OWN, PUBLISHED)}
 
@@ -169,11 +172,11 @@ def tune_arm(
         name: Name of an arm, or path of its YAML file.
         methods: Tuning methods.
         progress: Function called with the finished share of the run, 0..1.
-        conditions: Conditions of the arm in the comparison. The first is the arm as modelled.
-        poses: Number of poses in the comparison.
+        conditions: Conditions of the arm in the comparison. The first condition has no model errors.
+        poses: Number of start poses in the comparison.
 
     Raises:
-        ArmError: The arm does not exist, or its motors are too weak to hold it.
+        ArmError: The arm does not exist, or its motors are too weak to compensate gravity.
     """
     arm = load_arm(name)
     share = PROCEDURE_SHARE if "paper" in methods else 0.0
@@ -202,7 +205,7 @@ def _compare(
     progress: Progress,
 ) -> Comparison:
     arm = load_arm(name)
-    # Sort the runs by condition, since each process builds one arm per condition.
+    # Order the runs by condition, since each process caches one closed loop per condition.
     runs = {
         (which, c, p): executor.submit(_step, name, condition, poses, p, gains[which])
         for c, condition in enumerate(conditions)

@@ -1,1 +1,1 @@
-"""Figures in one style, as PNG files. Matplotlib is imported here only."""
+"""Plots results as PNG files. Only this package imports Matplotlib."""

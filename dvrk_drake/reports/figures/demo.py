@@ -1,4 +1,4 @@
-"""Figures of the demo."""
+"""Plots the results of the demo."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def plot_demo(output: Path, result: DemoResult) -> None:
         np.array([j.rms_torque for j in result.fresh.joints]),
         {
             "identified": np.array([j.rms_error for j in result.fresh.joints]),
-            "the paper's least squares": np.array([j.rms_error for j in result.fresh_paper.joints]),
+            "least squares of the paper": np.array([j.rms_error for j in result.fresh_paper.joints]),
         },
-        f"{arm.name} (simulated): {result.fresh.poses} fresh poses",
+        f"{arm.name} (simulated): RMS torque error at {result.fresh.poses} poses that were not used for fitting",
     )
     plot_positions(
         output / "release.png",
         arm,
         result.release_time,
-        {"identified model": result.released, "model as drawn (SDF)": result.released_nominal},
-        f"{arm.name} (simulated without dry friction): held until {HELD_UNTIL} s, released under gravity compensation "
-        f"until {RELEASED_UNTIL} s, then driven home\n{NO_DRY_FRICTION}",
+        {"identified model": result.released, "nominal model (SDF)": result.released_nominal},
+        f"{arm.name} (simulated without dry friction): regulated until {HELD_UNTIL} s, gravity compensation until "
+        f"{RELEASED_UNTIL} s, then motion to the home position\n{NO_DRY_FRICTION}",
     )
     title = PLANS[arm.name.lower()].step_title
     plot_positions(output / "step.png", arm, result.step_time, {"identified model": result.step}, title)

@@ -1,4 +1,4 @@
-"""Figure of the dVRK's installed gravity compensation beside a model's."""
+"""Plots a gravity-compensation file of the dVRK and a model for comparison."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
 
 FILE_COLOUR = "#d1495b"
 
-#: What is wrong with a pose -> colour of its strip.
-_FLAGS = {"clip active": "#edae49", "pushes against the model": "#d1495b", "runaway": "#5b3a8c"}
+#: Mapping from the problem of a pose to the colour of its curve.
+_PROBLEM_COLOURS = {"torque limit active": "#edae49", "opposite sign": "#d1495b", "runaway": "#5b3a8c"}
 
 _BINS = 60
 
-_DRAWN = 6  # the file has nothing for joint 7
+_NUM_PANELS = 6  # the file has no torque for joint 7
 
 
 def plot_compensation(path: str | Path, comparison: CompensationComparison, title: str) -> None:
-    """One panel a joint over its position: ranges over all poses, and below the share of poses that are wrong.
+    """Plots the torques of file and model over the position of each joint, and the share of poses with a problem.
 
-    Bands are the range over all other joints. Drawn are the file before its clip, its limits (dashed), and the sweep
-    that the file says its data are from (grey ground).
+    Bands show the range over the positions of all other joints. The torque of the file is shown before its limits
+    (dashed). The grey area is the range of the data from which the file was identified.
 
     Args:
-        path: PNG to write.
-        comparison: what to draw.
-        title: above all.
+        path: PNG file to write.
+        comparison: Comparison of the file with the model.
+        title: Title of the figure.
 
     Raises:
-        DvrkDrakeError: the file cannot be written.
+        DvrkDrakeError: The file cannot be written.
     """
     figure = plt.figure(figsize=(16, 9.5), layout="constrained")
     grid = figure.add_gridspec(4, 3, height_ratios=[3, 1, 3, 1])
-    for j in range(_DRAWN):
+    for j in range(_NUM_PANELS):
         row, column = 2 * (j // 3), j % 3
         torque_axes = figure.add_subplot(grid[row, column])
         share_axes = figure.add_subplot(grid[row + 1, column], sharex=torque_axes)
@@ -55,16 +55,18 @@ def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None
     edges, centres, members = _bins(comparison, j)
     if file.sweep is not None:
         span = np.clip(file.sweep[:, j], edges[0], edges[-1])
-        axes.axvspan(*span, color="0.92", label="sweep of the file's data")
+        axes.axvspan(*span, color="0.92", label="range of the data of the file")
     for torque, colour, label in (
-        (comparison.file_torque, FILE_COLOUR, "installed file, before its clip"),
+        (comparison.file_torque, FILE_COLOUR, "file, before its torque limits"),
         (comparison.model_torque, MODEL_COLOUR, "model"),
     ):
         low, middle, high = (np.array([f(torque[m, j]) for m in members]) for f in (np.min, np.mean, np.max))
         axes.fill_between(centres, low, high, color=colour, alpha=0.3, label=f"{label} (range)")
         axes.plot(centres, middle, color=colour, linewidth=1.2)
     for i, limit in enumerate((joint.clip_lower, joint.clip_upper)):
-        axes.axhline(limit, color="black", linestyle="--", linewidth=0.9, label="" if i else "clip of the file")
+        axes.axhline(
+            limit, color="black", linestyle="--", linewidth=0.9, label="" if i else "torque limits of the file"
+        )
     axes.set_title(f"J{j + 1} {joint.name}", fontsize=10)
     axes.set_ylabel("torque [N m]")
     axes.tick_params(labelbottom=False)
@@ -74,10 +76,10 @@ def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None
 def _draw_shares(axes: Axes, comparison: CompensationComparison, j: int) -> None:
     _, centres, members = _bins(comparison, j)
     flags = (comparison.clipped, comparison.opposed, comparison.runaway)
-    for (label, colour), flag in zip(_FLAGS.items(), flags, strict=True):
+    for (label, colour), flag in zip(_PROBLEM_COLOURS.items(), flags, strict=True):
         axes.plot(centres, [100 * flag[m, j].mean() for m in members], color=colour, label=f"{label} [% of poses]")
     axes.set_ylim(-3, 103)
-    axes.set_ylabel("% of poses")
+    axes.set_ylabel("poses [%]")
     axes.set_xlabel(f"q{j + 1} [rad]")
     axes.grid(alpha=0.3)
 
@@ -85,7 +87,7 @@ def _draw_shares(axes: Axes, comparison: CompensationComparison, j: int) -> None
 def _bins(
     comparison: CompensationComparison, j: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.int_]]]:
-    """Edges and centres of bins of q_j that hold poses, and which."""
+    """Returns the edges of all bins of q_j, the centres of bins with poses, and the indices of these poses."""
     q = comparison.q[:, j]
     edges = np.linspace(q.min(), q.max(), _BINS + 1)
     index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)

@@ -1,4 +1,4 @@
-"""Figures of identifications and validations, of poses and of motions."""
+"""Plots identification and validation results for static poses and motions."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO
 
 
 def plot_identification(folder: Path, result: Identification) -> None:
-    """Writes PNGs of fitted and predicted efforts; a motion's as `plot_motion`."""
+    """Plots measured and predicted efforts. See `plot_motion` and `plot_static_identification` for the files."""
     if isinstance(result, DynamicIdentification):
         fit = validate_motion(result.model, result.recording)
         arm = result.model.arm
-        plot_motion(folder, arm, fit, f"{arm.name}, fitted to {Path(result.recording.source).name}")
+        plot_motion(folder, arm, fit, f"{arm.name}, model fitted to {Path(result.recording.source).name}")
     elif isinstance(result, StaticIdentification):
         plot_static_identification(folder, result)
 
 
 def plot_validation(folder: Path, validation: Validation) -> None:
-    """Writes PNGs of errors; a motion's as `plot_motion`."""
+    """Plots the errors of a model. See `plot_motion` and `plot_static_validation` for the files."""
     if isinstance(validation, DynamicValidation):
         arm = validation.model.arm
         plot_motion(folder, arm, validation, f"{arm.name}, {Path(validation.recording.source).name}")
@@ -49,9 +49,10 @@ def plot_static_identification(folder: Path, result: StaticIdentification) -> No
         np.array([j.rms_zero_torque_included for j in joints]),
         {
             "leave-one-out": np.array([j.rms_leave_one_out_included for j in joints]),
-            "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_included for j in joints]),
+            "10-fold, effects selected anew": np.array([j.rms_cross_validation_included for j in joints]),
         },
-        f"{result.model.arm.name}: poses not used for fitting ({Path(recording.source).name}, without excluded ones)",
+        f"{result.model.arm.name}: RMS torque error in cross-validation, {Path(recording.source).name}, without "
+        "excluded measurements",
     )
     plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.excluded)
 
@@ -66,7 +67,7 @@ def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
         arm,
         np.array([j.rms_torque for j in validation.joints]),
         {"model": np.array([j.rms_error for j in validation.joints])},
-        f"{model.arm.name}: all {validation.poses} poses of {Path(recording.source).name}",
+        f"{model.arm.name}: RMS torque error at all {validation.poses} poses of {Path(recording.source).name}",
     )
     plot_measured_against_predicted(
         folder / "predicted.png", model, recording, validation.measured, validation.excluded
@@ -80,7 +81,15 @@ def plot_torque_error(
     rms_model: dict[str, NDArray[np.float64]],
     title: str,
 ) -> None:
-    """RMS torque error per joint (n,) [N m, N], zero torque beside each model; log scale: joints differ by decades."""
+    """Plots the RMS torque error of each joint for zero torque and for each model, on a logarithmic scale.
+
+    Args:
+        path: PNG file to write.
+        arm: Arm of the joints.
+        rms_zero: RMS errors (n,) of zero torque [N m; N].
+        rms_model: RMS errors (n,) [N m; N] by name of the model.
+        title: Title of the figure.
+    """
     names = arm.joint_names
     figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
     bars = {"zero torque": rms_zero, **rms_model}
@@ -108,14 +117,14 @@ def plot_measured_against_predicted(
     measured_joints: NDArray[np.bool_],
     excluded: list[ExcludedMeasurement],
 ) -> None:
-    """One panel a joint: predicted over measured torque of every pose.
+    """Plots predicted over measured torque of each pose, with one panel per joint.
 
     Args:
-        path: PNG to write.
-        model: what predicts.
-        recording: in joint coordinates.
-        measured_joints: (m, n); what is no holding torque is not drawn.
-        excluded: what is excluded is drawn as a cross, and does not stretch the axes.
+        path: PNG file to write.
+        model: Model that predicts the torques.
+        recording: Recording in joint coordinates.
+        measured_joints: Mask (m, n) of holding torques. Other torques are not drawn.
+        excluded: Excluded measurements, drawn as crosses. The axes do not extend to them.
     """
     usable = usable_measurements(recording.q.shape, excluded) & measured_joints
     arm = model.arm
@@ -125,7 +134,7 @@ def plot_measured_against_predicted(
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
         use, left_out = usable[:, j], measured_joints[:, j] & ~usable[:, j]
         if not np.any(use):
-            ax.set_title(f"J{j + 1} {name}: nothing measured", fontsize=10)
+            ax.set_title(f"J{j + 1} {name}: no measurements", fontsize=10)
             ax.set(xticks=[], yticks=[])
             continue
         shown = np.concatenate([measured[use, j], predicted[use, j], [0.0]])
@@ -138,7 +147,7 @@ def plot_measured_against_predicted(
             np.clip(predicted[left_out, j], *limits),
             "x",
             color=MEASURED_COLOUR,
-            label="excluded (at the edge: outside)",
+            label="excluded (at the edge: outside the axes)",
         )
         ax.set(xlim=limits, ylim=limits)
         ax.locator_params(nbins=5)
@@ -152,19 +161,21 @@ def plot_measured_against_predicted(
     key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
     if key:
         figure.legend(*key, loc="lower right", fontsize=8)
-    figure.suptitle(f"{model.arm.name}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
+    figure.suptitle(
+        f"{model.arm.name}: predicted and measured torque, {len(recording)} rows of {Path(recording.source).name}"
+    )
     save_figure(figure, path)
 
 
 def plot_motion(folder: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """Writes efforts.png, residuals.png and error_budget.png of a motion."""
+    """Writes efforts.png, residuals.png and error_budget.png of a motion into `folder`."""
     _plot_efforts(folder / "efforts.png", arm, validation, title)
     _plot_residuals(folder / "residuals.png", arm, validation, title)
     _plot_budget(folder / "error_budget.png", validation, title)
 
 
 def _plot_efforts(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """One panel an actuator: measured and predicted effort over time, and their difference."""
+    """Plots measured and predicted efforts and residuals over time, with one panel per actuator."""
     count = arm.num_joints
     figure, axes = plt.subplots(count, 1, figsize=(13, 1.9 * count), sharex=True, layout="constrained")
     for i, (actuator, ax) in enumerate(zip(validation.actuators, axes, strict=True)):
@@ -172,18 +183,20 @@ def _plot_efforts(path: Path, arm: Arm, validation: DynamicValidation, title: st
         ax.plot(validation.t, measured - predicted, color=ZERO_COLOUR, linewidth=0.8, label="measured - predicted")
         ax.plot(validation.t, measured, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
         ax.plot(validation.t, predicted, color=MODEL_COLOUR, linewidth=1.0, label="predicted")
-        relative = "" if actuator.relative_error is None else f", error {100 * actuator.relative_error:.1f} %"
+        relative = (
+            "" if actuator.relative_error is None else f", relative RMS error {100 * actuator.relative_error:.1f} %"
+        )
         ax.set_title(f"actuator {i + 1} {actuator.name}{relative}", fontsize=9)
-        ax.set_ylabel("N" if arm.prismatic[i] else "N m", fontsize=8)
+        ax.set_ylabel(f"effort [{'N' if arm.prismatic[i] else 'N m'}]", fontsize=8)
         ax.tick_params(labelsize=7)
     axes[-1].set_xlabel("time [s]", fontsize=8)
     axes[0].legend(fontsize=7, loc="upper right", ncols=3)
-    figure.suptitle(f"{title}: efforts of the actuators behind {validation.cut_off:g} Hz")
+    figure.suptitle(f"{title}: efforts of the actuators, after low-pass filtering at {validation.cut_off:g} Hz")
     save_figure(figure, path)
 
 
 def _plot_residuals(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """One column an actuator: the difference over position, velocity and time."""
+    """Plots residuals over position, velocity and time, with one column per actuator."""
     count = arm.num_joints
     figure, axes = plt.subplots(3, count, figsize=(2.6 * count, 7), sharey="col", layout="constrained")
     residuals = validation.measured - validation.predicted
@@ -200,12 +213,12 @@ def _plot_residuals(path: Path, arm: Arm, validation: DynamicValidation, title: 
             ax.set_xlabel(label, fontsize=8)
             ax.tick_params(labelsize=7)
         axes[0, i].set_title(f"{i + 1} {actuator.name}\n[{'N' if arm.prismatic[i] else 'N m'}]", fontsize=9)
-    figure.suptitle(f"{title}: measured - predicted effort")
+    figure.suptitle(f"{title}: residuals (measured - predicted effort) of the actuators")
     save_figure(figure, path)
 
 
 def _plot_budget(path: Path, validation: DynamicValidation, title: str) -> None:
-    """Stacked shares of each actuator's squared error, their height the relative error."""
+    """Plots the relative error of each actuator, divided into shares of the squared error."""
     kinds = ("bias", "friction_like", "position_dependent", "other")
     colours = ("#edae49", MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR)
     figure, ax = plt.subplots(figsize=(11, 5), layout="constrained")
@@ -213,7 +226,7 @@ def _plot_budget(path: Path, validation: DynamicValidation, title: str) -> None:
     bottom = np.zeros(len(heights))
     for kind, colour in zip(kinds, colours, strict=True):
         part = heights * np.array([getattr(a, kind) for a in validation.actuators])
-        ax.bar(range(len(heights)), part, 0.6, bottom=bottom, color=colour, label=kind.replace("_", " "))
+        ax.bar(range(len(heights)), part, 0.6, bottom=bottom, color=colour, label=kind.replace("_", "-"))
         bottom += part
     for i, actuator in enumerate(validation.actuators):
         if actuator.repeatability is not None:
@@ -222,8 +235,8 @@ def _plot_budget(path: Path, validation: DynamicValidation, title: str) -> None:
                 [i - 0.35, i + 0.35], [floor, floor], color="black", linewidth=1.2, label="_" if i else "repeatability"
             )
     ax.set_xticks(range(len(heights)), [a.name.replace("_", "\n") for a in validation.actuators], fontsize=8)
-    ax.set_ylabel("relative error [%], split by shares of its square")
-    ax.set_title(title)
+    ax.set_ylabel("relative RMS error [%]")
+    ax.set_title(f"{title}: relative RMS error of the actuators, divided by shares of the squared error")
     ax.legend(fontsize=8)
     save_figure(figure, path)
 

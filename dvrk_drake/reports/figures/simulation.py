@@ -1,4 +1,4 @@
-"""Figure of a simulation: positions over time."""
+"""Plots the positions of a simulation over time."""
 
 from __future__ import annotations
 
@@ -15,18 +15,32 @@ from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, save
 
 
 def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> None:
-    """Writes a PNG of the simulated positions, beside the desired ones if there are any."""
+    """Writes a PNG of the simulated positions and, if available, the desired positions."""
     curves = {"simulated": simulation.recording.q}
     if simulation.desired is not None:
         curves["desired"] = simulation.desired
     arm = scenario.mounted_arm
-    plot_positions(path, arm, simulation.time, curves, f"{arm.name}, simulated, mode {scenario.controller.mode}")
+    plot_positions(
+        path,
+        arm,
+        simulation.time,
+        curves,
+        f"{arm.name}: simulated joint positions, controller mode {scenario.controller.mode}",
+    )
 
 
 def plot_positions(
     path: Path, arm: Arm, t: NDArray[np.float64], curves: dict[str, NDArray[np.float64]], title: str
 ) -> None:
-    """One panel a joint of positions over time: `curves` label -> (samples, n) [rad, m]; dashed from the second on."""
+    """Plots positions over time, with one panel per joint.
+
+    Args:
+        path: PNG file to write.
+        arm: Arm of the joints.
+        t: Times (m,) [s].
+        curves: Positions (m, n) [rad; m] by label. The second and later curves are dashed.
+        title: Title of the figure.
+    """
     names = arm.joint_names
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
     colours = [MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
@@ -34,7 +48,7 @@ def plot_positions(
         for i, (label, q) in enumerate(curves.items()):
             ax.plot(t, q[:, j], "-" if i == 0 else "--", color=colours[i % 3], linewidth=1.2, label=label)
         low, high = ax.get_ylim()
-        if high - low < 2e-3:  # A joint that stands still should look still.
+        if high - low < 2e-3:  # keeps the noise of a joint at rest small
             ax.set_ylim((low + high) / 2 - 1e-3, (low + high) / 2 + 1e-3)
         ax.set_title(f"J{j + 1} {name}", fontsize=10)
         ax.set_ylabel(f"position [{'m' if arm.prismatic[j] else 'rad'}]", fontsize=8)

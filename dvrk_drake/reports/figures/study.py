@@ -1,4 +1,4 @@
-"""Figure of a study's summary."""
+"""Plots the results of a study."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COLOURS = (MODEL_COLOUR, MEASURED_COLOUR, "#edae49", "#66a182", "#2e4057", "#8d5
 
 
 def plot_study(path: Path, study: Study, rows: Mapping[int, Row]) -> None:
-    """One panel a measure: shares with their intervals, or the share of runs up to each number."""
+    """Plots each measure in one panel: shares with their intervals, or cumulative distributions."""
     summaries, count = summarise(study, rows), len(study.measures)
     columns = math.ceil(math.sqrt(count))
     figure, axes = plt.subplots(
@@ -29,13 +29,13 @@ def plot_study(path: Path, study: Study, rows: Mapping[int, Row]) -> None:
         squeeze=False,
     )
     for ax, measure in zip(axes.flat, study.measures, strict=False):
-        if measure.is_answer:
+        if measure.is_boolean:
             _draw_shares(ax, measure, summaries)
         else:
             _draw_distribution(ax, measure, study, rows)
     for ax in axes.flat[count:]:
         ax.axis("off")
-    figure.suptitle(f"{study.arm.name}, {Path(study.scenario).name}: {len(rows)} runs")
+    figure.suptitle(f"{study.arm.name}, {Path(study.scenario).name}: results of {len(rows)} runs")
     save_figure(figure, path)
 
 
@@ -43,11 +43,11 @@ def _draw_shares(ax: plt.Axes, measure: Measure, summaries: list[Summary]) -> No
     for i, summary in enumerate(summaries):
         share = summary.measures[measure.column]
         assert isinstance(share, Share)
-        y, low, high = (100 * value for value in (share.yes / share.runs, share.lower, share.upper))
+        y, low, high = (100 * value for value in (share.count / share.runs, share.lower, share.upper))
         error = [[max(0.0, y - low)], [max(0.0, high - y)]]
         ax.errorbar(i, y, error, fmt="o", capsize=6, color=COLOURS[i % len(COLOURS)])
     ax.set_xticks(range(len(summaries)), [summary.variation for summary in summaries], fontsize=8)
-    ax.set(xlim=(-0.6, len(summaries) - 0.4), ylim=(-3, 103), ylabel="runs [%]")
+    ax.set(xlim=(-0.6, len(summaries) - 0.4), ylim=(-3, 103), ylabel="share of runs [%]")
     ax.set_title(f"{measure.column}, 95 % intervals", fontsize=10)
     ax.grid(alpha=0.3)
 
@@ -55,19 +55,23 @@ def _draw_shares(ax: plt.Axes, measure: Measure, summaries: list[Summary]) -> No
 def _draw_distribution(ax: plt.Axes, measure: Measure, study: Study, rows: Mapping[int, Row]) -> None:
     smallest = np.inf
     for i, variation in enumerate(study.variations):
-        of_it = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
-        values = np.sort(values_of(measure, of_it))
+        variation_rows = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
+        values = np.sort(values_of(measure, variation_rows))
         share = 100 * np.arange(1, len(values) + 1) / max(len(values), 1)
         finite = np.isfinite(values)
         colour = COLOURS[i % len(COLOURS)]
         smallest = min(smallest, values.min(initial=np.inf))
-        # What is infinite has no place on the axis: the line ends below 100 %.
+        # Infinite values are not drawn, so the line ends below 100 %.
         ax.step(
             values[finite], share[finite], where="post", marker=".", markersize=3, color=colour, label=variation.name
         )
     if measure.unit and smallest > 0:
         ax.set_xscale("log")
-    ax.set(ylim=(-3, 103), ylabel="runs up to it [%]", xlabel=f"[{measure.unit}]" if measure.unit else "share of limit")
+    ax.set(
+        ylim=(-3, 103),
+        ylabel="cumulative share of runs [%]",
+        xlabel=f"[{measure.unit}]" if measure.unit else "share of limit",
+    )
     ax.set_title(measure.column, fontsize=10)
     ax.grid(alpha=0.3)
     ax.legend(fontsize=7)

@@ -1,4 +1,4 @@
-"""Style of all figures, and how they are written."""
+"""Colours of all figures, and a function that saves a figure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MODEL_COLOUR, ZERO_COLOUR, MEASURED_COLOUR = "#1f6f8b", "#c9c9c9", "#d1495b"
 
 
 def save_figure(figure: plt.Figure, path: Path) -> None:
-    """Writes a PNG at once or not at all, and closes the figure."""
+    """Writes a PNG file atomically and closes the figure."""
     with atomic_write(path, "wb") as stream:
         figure.savefig(stream, dpi=110, format="png")
     plt.close(figure)

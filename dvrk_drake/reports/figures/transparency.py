@@ -1,4 +1,4 @@
-"""Figure of the interaction force at an arm's handle."""
+"""Plots the interaction force at the handle of an arm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dvrk_drake.reports.figures.style import save_figure
 
 
 def plot_transparency(path: Path, arm: Arm, forces: Sequence[OperatorForces]) -> None:
-    """Force and torque at the handle over time, one curve each compensation."""
+    """Plots force and torque at the handle over time, with one curve per compensation."""
     figure, both = plt.subplots(2, 1, figsize=(11, 6.5), sharex=True, layout="constrained")
     for one in forces:
         late = one.time >= GRASP_TIME
@@ -24,7 +24,7 @@ def plot_transparency(path: Path, arm: Arm, forces: Sequence[OperatorForces]) ->
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
-    figure.suptitle(f"{arm.name}, simulated: interaction force and torque at the handle")
+    figure.suptitle(f"{arm.name}, simulated: magnitude of interaction force and torque at the handle")
     both[0].legend(fontsize=8, ncols=min(4, len(forces)), loc="lower right", bbox_to_anchor=(1.0, 1.0))
     both[1].set_xlabel("time [s]")
     save_figure(figure, path)

@@ -1,4 +1,4 @@
-"""Figure of tuned gains: step responses."""
+"""Plots the step responses of tuned gains."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ COLOURS = {OWN: "#9a9a9a", PUBLISHED: "#b58db6", "paper": "#edae49", "model": "#
 
 
 def plot_steps(path: Path, comparison: Comparison) -> None:
-    """One panel a joint: the step of all joints at once from the first pose, with all gains; the band is shaded."""
+    """Plots the step response from the first pose for all gains, with one panel per joint. The band is shaded."""
     arm = comparison.arm
     figure, axes = plt.subplots(2, -(-arm.num_joints // 2), figsize=(15, 7), layout="constrained")
     for j, (name, ax) in enumerate(zip(arm.joint_names, axes.flat, strict=False)):
         unit = "mm" if arm.prismatic[j] else "mrad"
         for which, response in comparison.responses.items():
-            way = 1e3 * (response.q[:, j] - response.q[0, j])
+            displacement = 1e3 * (response.q[:, j] - response.q[0, j])
             sign = np.sign(response.q_desired[j] - response.q[0, j])
-            ax.plot(response.t, sign * way, color=COLOURS[which], label=which, linewidth=1.2)
+            ax.plot(response.t, sign * displacement, color=COLOURS[which], label=which, linewidth=1.2)
             goal = 1e3 * abs(response.q_desired[j] - response.q[0, j])
         half = 1e3 * band(arm)[j]
         ax.axhspan(goal - half, goal + half, color="#1f6f8b", alpha=0.15, linewidth=0)
-        # What runs away would flatten all the others.
+        # Limits the axis, so that an unstable response does not flatten the others.
         ax.set_ylim(-0.1 * goal, 1.6 * goal)
         ax.set_title(f"J{j + 1} {name}", fontsize=9)
-        ax.set_ylabel(f"[{unit}]", fontsize=8)
+        ax.set_ylabel(f"displacement [{unit}]", fontsize=8)
         ax.set_xlabel("time [s]", fontsize=8)
         ax.tick_params(labelsize=8)
     for ax in axes.flat[arm.num_joints :]:
         ax.axis("off")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower right", fontsize=9)
-    figure.suptitle(f"{arm.name}, simulated with all effects: all joints step at once; shaded: settled")
+    figure.suptitle(f"{arm.name}, simulated with all effects: simultaneous step of all joints, settling band shaded")
     save_figure(figure, path)

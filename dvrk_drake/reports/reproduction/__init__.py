@@ -1,1 +1,1 @@
-"""The paper's figures and tables redone, a module each, as sections of a page."""
+"""Reproduces the figures and tables of the paper. Each module creates one or more sections of a page."""

@@ -1,4 +1,4 @@
-"""The mechanisms of the simulated arms beside what is published: DH parameters of the MTM, remote centre of the PSM."""
+"""Compares the mechanisms of the simulated arms with the paper: DH parameters of the MTM, model of the PSM."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, 
 
 
 def reproduce_table_1() -> Section:
-    """Table I beside the same of the plant."""
+    """Compares Table I with the DH parameters of the plant."""
     arm = load_arm(PAPER_ARM)
     ours, worst = recomputed_table(arm)
     published = np.array([published_row(row) for row in TABLE_1])
@@ -63,10 +63,10 @@ def reproduce_table_1() -> Section:
         "table1",
         "Table I: DH parameters of the MTM",
         (
-            f"Found from how the links of the simulated plant move at {POSES} random poses; the transforms that these "
-            f"numbers give err by at most {worst:.0e}. They differ from the paper's by at most {angles:.0e} rad and "
-            f"{lengths:.0e} m: it is the same arm. What differs is what the table leaves out: the parallelogram, which "
-            "carries elbow torque to the shoulder's motor and has stops in q2 + q3, and L1, which affects no joint.",
+            f"The DH parameters of the plant are computed from the link poses at {POSES} random joint positions. "
+            f"Their transforms have an error of at most {worst:.0e}. They differ from Table I by at most "
+            f"{angles:.0e} rad and {lengths:.0e} m. Table I does not contain the parallelogram, which transmits "
+            "elbow torque to the shoulder motor and has joint stops in q2 + q3, and L1, which affects no joint.",
         ),
         (ResultTable("table1", "DH parameters [rad, m], theta = +-q + offset", header, tuple(rows)),),
     )
@@ -76,38 +76,39 @@ _FILE = "psm_release.png"
 
 
 def reproduce_psm(session: ReproductionSession) -> Section:
-    """The mechanism's facts beside the paper's file's, then releases of a simulated PSM."""
+    """Compares the PSM models, and simulates releases of a PSM."""
     psm, sample_sizes = session.psm, session.sample_sizes
     poses = session.random_poses("psm", sample_sizes.psm_releases)
     ours = session.release("psm", psm.truth, psm.file, poses, "PSM: releasing ours")
-    nominal = session.folder / "psm_nominal.yaml"
+    nominal_file = session.folder / "psm_nominal.yaml"
     psm_nominal = type(psm.model).from_arm(load_arm("psm"))
-    psm_nominal.save(nominal)
-    drawn = session.release("psm", psm.truth, nominal, poses, "PSM: releasing the model as drawn")
-    _plot(session.folder / _FILE, ours, drawn)
+    psm_nominal.save(nominal_file)
+    nominal = session.release("psm", psm.truth, nominal_file, poses, "PSM: releasing the nominal model")
+    _plot(session.folder / _FILE, ours, nominal)
     names = ours.arm.joint_names
     disabled = [joint.name for joint in psm.model.joints if joint.feedforward_scale == 0.0]
     rows = (
-        ("model as drawn (mean)", *numbers(np.abs(drawn.final).mean(axis=0), "{:.4f}")),
+        ("nominal model (mean)", *numbers(np.abs(nominal.final).mean(axis=0), "{:.4f}")),
         ("ours (mean)", *numbers(np.abs(ours.final).mean(axis=0), "{:.4f}")),
         ("ours (largest at any time)", *numbers(ours.largest.max(axis=0), "{:.4f}")),
-        ("model as drawn, share held", *numbers(drawn.held.mean(axis=0), "{:.3f}")),
+        ("nominal model, share held", *numbers(nominal.held.mean(axis=0), "{:.3f}")),
         ("ours, share held", *numbers(ours.held.mean(axis=0), "{:.3f}")),
     )
     remarks = (
-        "The paper shows a model and no experiment: its masses are placeholders. The table sets its file's faults "
-        "beside what our plant gives when it is asked.",
-        f"{psm.truth.origin} Ours is identified from {sample_sizes.collected} poses collected on it. Each release is "
-        f"at a random pose inside the limits, watched for {sample_sizes.duration:g} s under gravity compensation "
-        f"alone. **Every joint stays within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
-        f"{share(ours.num_held, len(poses))}** of the poses with ours, at {share(drawn.num_held, len(poses))} with "
-        "the model as drawn.",
-        f"`identify` gives no torque to {', '.join(disabled) or 'no joint'}: what it measured there is below 2 % of "
-        "the effort limit or no better than zero. Friction alone must hold these, and where the spring of the roll "
-        "exceeds it, far from its middle, it does not.",
+        "The paper shows a model without an experiment, and its masses are placeholders. The first table compares the "
+        "file of the paper with our plant.",
+        f"{psm.truth.origin} Ours is identified from {sample_sizes.collected} poses of this arm. Each release starts "
+        f"at a random pose inside the joint limits and takes {sample_sizes.duration:g} s with gravity compensation "
+        f"only. **All joints stay within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
+        f"{share(ours.num_held, len(poses))}** of the poses with ours, and at {share(nominal.num_held, len(poses))} "
+        "with the nominal model.",
+        f"`identify` disabled feedforward of these joints: {', '.join(disabled) or 'none'}. Their torque is below 2 "
+        "% of the effort limit, or the model is not more accurate than zero torque. Only friction resists their "
+        "gravity and spring torque. It is too small for the spring of the roll joint far from the middle of its "
+        "range.",
     )
     release = ResultTable("psm_release", "Absolute drift after release [rad; insertion m]", ("", *names), rows)
-    shows = "PSM: largest drift of each release, sorted"
+    shows = "PSM: cumulative distribution of the largest drift of each release"
     return Section("psm", "Fig. 8: the PSM", remarks, (_facts(), release), {_FILE: shows})
 
 
@@ -122,36 +123,40 @@ def _facts() -> ResultTable:
     rows = (
         (
             "loops of the linkage",
-            "second parents of links: Finalize() refuses the file",
-            "cut and pinned: it simulates",
+            "links with two parents: Finalize() rejects the file",
+            "loop-closure constraints",
         ),
         (
             "remote centre of motion",
-            "none exactly: the front four-bar has bars .530/.535, ends .0370/.0407 m",
-            f"kept to {remote:.0e} m over {PSM_POSES} random poses",
+            "not exact: the front four-bar has bars of 0.530 and 0.535 m, ends of 0.0370 and 0.0407 m",
+            f"error {remote:.0e} m at {PSM_POSES} random poses",
         ),
-        ("wrist yaw axis", "equals the wrist pitch axis", f"{np.degrees(angle):.1f} degrees from the wrist pitch axis"),
+        (
+            "wrist yaw axis",
+            "identical to the wrist pitch axis",
+            f"{np.degrees(angle):.1f} degrees from the wrist pitch axis",
+        ),
         ("yaw", "locked by its limits", f"{arm.position_lower[yaw]:+.3f}..{arm.position_upper[yaw]:+.3f} rad"),
-        ("inertias", "1 kg m^2 each, centres of mass at the origins", f"from shapes, {sum(masses):.2f} kg in all"),
+        ("inertias", "1 kg m^2 each, centres of mass at the origins", f"from shapes, total mass {sum(masses):.2f} kg"),
         (
             "prismatic joint",
             "all 15 joints revolute in the file, one prismatic in the text",
             "insertion, one of 7 joints",
         ),
     )
-    return ResultTable("psm", "The PSM's model", ("", "the paper's file", "ours"), rows)
+    return ResultTable("psm", "Models of the PSM", ("", "file of the paper", "ours"), rows)
 
 
 def _instance(plant: MultibodyPlant) -> str:
     return plant.GetModelInstanceName(plant.GetBodyByName("base_link").model_instance())
 
 
-def _plot(path: Path, ours: Drifts, drawn: Drifts) -> None:
+def _plot(path: Path, ours: Drifts, nominal: Drifts) -> None:
     names, prismatic = ours.arm.joint_names, ours.arm.prismatic
     figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained", sharey=True)
     band = ours.arm.per_joint(*BAND)
     for j, ax in enumerate(axes.flat[: len(names)]):
-        for drifts, colour, label in ((drawn, "#8d8d8d", "model as drawn"), (ours, MODEL_COLOUR, "ours")):
+        for drifts, colour, label in ((nominal, "#8d8d8d", "nominal model"), (ours, MODEL_COLOUR, "ours")):
             sizes = np.sort(np.maximum(drifts.largest[:, j], 1e-6))
             shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
             ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
@@ -159,11 +164,11 @@ def _plot(path: Path, ours: Drifts, drawn: Drifts) -> None:
         ax.set_xscale("log")
         ax.set_title(names[j], fontsize=10)
         ax.set_xlabel(f"largest drift [{'m' if prismatic[j] else 'rad'}]", fontsize=8)
-        ax.set_ylabel("poses [%]", fontsize=8)
+        ax.set_ylabel("cumulative share of poses [%]", fontsize=8)
         ax.tick_params(labelsize=7)
         ax.grid(alpha=0.3)
     for ax in axes.flat[len(names) :]:
         ax.axis("off")
     axes.flat[-1].legend(*axes.flat[0].get_legend_handles_labels(), loc="center", fontsize=9)
-    figure.suptitle(f"PSM after release: largest drift at {len(ours.positions)} random poses")
+    figure.suptitle(f"PSM: largest drift after release at {len(ours.positions)} random poses")
     save_figure(figure, path)

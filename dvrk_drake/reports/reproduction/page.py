@@ -1,4 +1,4 @@
-"""Results as people read them: a page with figures and tables, and each table as a CSV file."""
+"""Writes the results as a page with figures and tables, and each table as a CSV file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from dvrk_drake.models.files import atomic_write
 
 @dataclass(frozen=True)
 class ResultTable:
-    """A table; `name` is that of its file without the ending, and unique on a page."""
+    """Table of results.
+
+    Attributes:
+        name: Name of the CSV file without suffix, unique on a page.
+        title: Caption.
+        header: Column headings.
+        rows: Cells of each row.
+    """
 
     name: str
     title: str
@@ -25,12 +32,12 @@ class ResultTable:
     rows: tuple[tuple[str, ...], ...]
 
     def markdown(self) -> str:
-        """The table in Markdown, its title above it."""
+        """Returns the title and the table in Markdown."""
         lines = [f"**{self.title}**", "", _line(self.header), _line(["---"] * len(self.header))]
         return "\n".join([*lines, *map(_line, self.rows)])
 
     def csv(self) -> str:
-        """The table as a CSV file."""
+        """Returns the content of the CSV file."""
         stream = io.StringIO()
         csv.writer(stream, lineterminator="\n").writerows([self.header, *self.rows])
         return stream.getvalue()
@@ -41,11 +48,11 @@ class Section:
     """Result of reproducing one figure of the paper.
 
     Attributes:
-        name: as the command line calls it.
-        title: heading.
-        remarks: what was done, what differs from the paper and why, a paragraph each.
-        tables: numbers.
-        figures: PNG in the page's folder -> what it shows.
+        name: Name of the section on the command line.
+        title: Heading.
+        remarks: Paragraphs about the experiment and the differences from the paper.
+        tables: Tables of results.
+        figures: Mapping from the PNG file in the folder of the page to its caption.
     """
 
     name: str
@@ -55,11 +62,11 @@ class Section:
     figures: dict[str, str] = field(default_factory=dict)
 
     def markdown(self) -> str:
-        """The section in Markdown."""
+        """Returns the section in Markdown."""
         parts = [f"## {self.title}", *self.remarks]
         for table in self.tables:
             parts += [table.markdown(), f"[{table.name}.csv]({table.name}.csv)"]
-        parts += [f"![{shows}]({figure})\n\n*{shows}*" for figure, shows in self.figures.items()]
+        parts += [f"![{caption}]({figure})\n\n*{caption}*" for figure, caption in self.figures.items()]
         return "\n\n".join(parts)
 
 
@@ -67,34 +74,38 @@ def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str
     """Writes index.md and a CSV file for each table.
 
     Args:
-        folder: an existing one, in which the figures are.
-        sections: in the page's order.
-        left_out: what was asked for and could not be done, and why.
+        folder: Existing folder that contains the figures.
+        sections: Sections of the page, in order.
+        left_out: Requested results that could not be computed, with the reason for each.
 
     Returns:
-        The page.
+        Path of index.md.
     """
     for section in sections:
         for table in section.tables:
             with atomic_write(folder / f"{table.name}.csv") as stream:
                 stream.write(table.csv())
-    parts = ["# The paper redone", _PREFACE, "\n".join(f"- [{s.title}](#{_anchor(s.title)})" for s in sections)]
-    parts += [f"**Left out:** {reason}" for reason in left_out]
+    parts = [
+        "# Reproduction of the paper",
+        _PREFACE,
+        "\n".join(f"- [{s.title}](#{_anchor(s.title)})" for s in sections),
+    ]
+    parts += [f"**Missing:** {reason}" for reason in left_out]
     with atomic_write(folder / "index.md") as stream:
         stream.write("\n\n".join([*parts, *(section.markdown() for section in sections)]) + "\n")
     return folder / "index.md"
 
 
 def numbers(values: ArrayLike, pattern: str) -> tuple[str, ...]:
-    """Each number in a format such as "{:.3f}"."""
+    """Returns each number as text, formatted with a pattern such as "{:.3f}"."""
     return tuple(pattern.format(x) for x in np.asarray(values).tolist())
 
 
-def share(held: int, of: int) -> str:
-    """A share with its 95 % confidence interval (Wilson, 1927)."""
-    interval = Share.of(held, of)
+def share(held: int, total: int) -> str:
+    """Returns a share with its 95 % confidence interval (Wilson, 1927) as text."""
+    interval = Share.of(held, total)
     low, high = 100 * interval.lower, 100 * interval.upper
-    return f"{held} of {of} ({100 * held / of:.1f} %, 95 % interval {low:.1f}..{high:.1f} %)"
+    return f"{held} of {total} ({100 * held / total:.1f} %, 95 % interval {low:.1f}..{high:.1f} %)"
 
 
 def _line(cells: Sequence[str]) -> str:
@@ -108,6 +119,8 @@ def _anchor(title: str) -> str:
 
 
 _PREFACE = (
-    "*Gravity Compensation Control of da Vinci Robot* (Rutfield, Zia, Boos, Santoso, Sujumnong, WPI 2015), its figures "
-    "and tables made again by `dvrk-drake reproduce` beside the published numbers. Angles in rad, torques in N m."
+    "This page compares published figures and tables of *Gravity Compensation Control of da Vinci Robot* (Rutfield, "
+    "Zia, Boos, Santoso, Sujumnong, WPI 2015) with results of `dvrk-drake reproduce`. Angles are in rad, torques in "
+    "N m. "
+    '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes this project.'
 )

@@ -1,4 +1,4 @@
-"""Redoes what is asked for and writes a page of it."""
+"""Reproduces the requested figures and tables, and writes a page with the results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MAKERS: dict[str, Callable[[ReproductionSession], Section]] = {
     "psm": reproduce_psm,
     "transparency": reproduce_transparency,
 }
-#: What can be redone, in the order of the page.
+#: Names of all sections, in the order of the page.
 NAMES = tuple(_MAKERS)
 
 
@@ -40,30 +40,31 @@ def reproduce(
     sample_sizes: SampleSizes | None = None,
     seed: int = 0,
 ) -> Path:
-    """Writes figures, tables and index.md, which has what is finished at any time.
+    """Writes figures, tables and index.md. The page is updated after each finished section.
 
     Args:
-        names: of `NAMES`.
-        folder: an existing one.
-        recordings: without them Fig. 4 is left out if other things are asked for, and Fig. 5 and 6 have another arm.
-        progress: called with a step, "fig5: releasing" for example, and its finished share, 0..1.
-        sample_sizes: how much is done.
-        seed: of true arms, poses and noise.
+        names: Sections to reproduce, from `NAMES`.
+        folder: Existing folder for the results.
+        recordings: Recordings of the paper. Without them, Fig. 4 is omitted if other sections are requested, and
+            Fig. 5 and 6 use a different ground-truth arm.
+        progress: Function called with a step, for example "fig5: releasing", and its finished share, 0..1.
+        sample_sizes: Numbers of poses and releases. None: the default numbers.
+        seed: Seed of ground-truth arms, poses and noise.
 
     Returns:
-        The page.
+        Path of index.md.
 
     Raises:
-        DvrkDrakeError: a name that is not known.
-        RecordingError: a recording cannot be read, or Fig. 4 alone is asked for and there is none.
+        DvrkDrakeError: A name is not in `NAMES`.
+        RecordingError: A recording cannot be read, or only Fig. 4 is requested and its recording is missing.
     """
     if unknown := sorted(set(names) - set(NAMES)):
-        raise DvrkDrakeError(f"{', '.join(unknown)} cannot be reproduced; known: {', '.join(NAMES)}")
+        raise DvrkDrakeError(f"{', '.join(unknown)} cannot be reproduced; allowed: {', '.join(NAMES)}")
     wanted = [name for name in NAMES if name in names]
     left_out = []
     if recordings.folder is None and "fig4" in wanted and len(wanted) > 1:
         wanted.remove("fig4")
-        left_out.append("Fig. 4 needs the recording of the paper's poses; name its folder with --data.")
+        left_out.append("Fig. 4 requires the recording of the paper. Give its folder with --data.")
     with local_executor() as executor:
         session = ReproductionSession(
             folder, recordings, executor, sample_sizes=sample_sizes or SampleSizes(), seed=seed

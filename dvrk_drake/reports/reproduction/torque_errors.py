@@ -1,4 +1,4 @@
-"""Fig. 4: how far the torque of a model is from what held the real arm, pose by pose."""
+"""Reproduces Fig. 4: torque errors of models at the static poses of the real arm."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 
 _FILE = "fig4.png"
-#: Smaller squared errors are drawn as this [(N m)^2]: efforts that were measured as exactly 0.
+#: Smallest drawn squared error [(N m)^2]. Smaller errors, for efforts measured as exactly 0, are drawn at this value.
 FLOOR = 1e-9
 
 
 def reproduce_figure_4(
     recordings: PaperRecordings, folder: Path, progress: Callable[[float], object] = lambda share: None
 ) -> Section:
-    """Squared torque errors of joints 2-7 at the paper's 72 poses; writes fig4.png into `folder`.
+    """Computes the squared torque errors of joints 2-7 at the 72 poses of the paper, and writes fig4.png.
 
     Raises:
-        RecordingError: the recording is not there.
+        RecordingError: The recording is missing.
     """
     recording, arm = recordings.poses, load_arm(PAPER_ARM)
     paper = identify_static(recording, arm, "paper")
@@ -36,8 +36,8 @@ def reproduce_figure_4(
     included = ~_excluded(ours)
     _plot(folder / _FILE, ours, paper, zero, included)
     same = (
-        "Its squared errors are the published ones to "
-        f"{np.abs(paper.residuals[:, 1:] ** 2 - published).max():.0e} (N m)^2 at every pose. "
+        "Its squared errors differ from the published errors by at most "
+        f"{np.abs(paper.residuals[:, 1:] ** 2 - published).max():.0e} (N m)^2. "
         if published is not None
         else ""
     )
@@ -49,25 +49,25 @@ def reproduce_figure_4(
     joints = tuple(f"J{j}" for j in range(2, 8))
     squared = ResultTable(
         "fig4_mean_squared",
-        "Fig. 4: mean squared error over the 72 poses that were fitted [(N m)^2]",
+        "Fig. 4: mean squared torque error of the fit at 72 poses [(N m)^2]",
         ("", *joints),
         (
             ("published", *numbers(FIGURE_4_MEANS, "{:.2e}")),
-            ("the paper's least squares, again", *numbers(np.mean(paper.residuals[:, 1:] ** 2, axis=0), "{:.2e}")),
+            ("the paper's least squares, reproduced", *numbers(np.mean(paper.residuals[:, 1:] ** 2, axis=0), "{:.2e}")),
             ("zero torque", *numbers(np.mean(zero[:, 1:] ** 2, axis=0), "{:.2e}")),
             ("ours", *numbers(np.mean(ours.residuals[:, 1:] ** 2, axis=0), "{:.2e}")),
         ),
     )
     left_out = ResultTable(
         "fig4_left_out",
-        "RMS error at poses that were not fitted [N m]; without excluded measurements, then with all",
+        "RMS torque error in cross-validation [N m], without excluded measurements and with all measurements",
         ("", *joints),
         (
             ("zero torque", *rms(zero, included)),
-            ("the paper's, each pose from all others", *rms(paper.leave_one_out_residuals, included)),
-            ("ours, each pose from all others", *rms(ours.leave_one_out_residuals, included)),
+            ("the paper's, leave-one-out", *rms(paper.leave_one_out_residuals, included)),
+            ("ours, leave-one-out", *rms(ours.leave_one_out_residuals, included)),
             (
-                "ours, each tenth from the others, every choice made anew",
+                "ours, 10-fold, effects selected anew",
                 *numbers([joint.rms_cross_validation_included for joint in ours.model.joints[1:]], "{:.4f}"),
             ),
             ("all measurements: zero torque", *rms(zero, every)),
@@ -77,17 +77,17 @@ def reproduce_figure_4(
     )
     worse = [f"J{j + 1}" for j in range(1, 7) if np.mean(paper.residuals[:, j] ** 2) > np.mean(zero[:, j] ** 2)]
     remarks = (
-        f"On the paper's own recording ({len(recording)} poses of a real MTM). The paper's least squares (eq. 10) is "
-        f"done again: unweighted, twelve parameters. {same}At the poses that it was fitted to it is worse than "
-        f"commanding nothing on {', '.join(worse)}: joints 2 and 3, whose torques are ten to a hundred times larger, "
-        "decide what the parameters are, and what they get wrong there the wrist must bear.",
-        "Ours differs: each joint is weighted by its own spread; offsets, springs and cables are terms of their own "
-        "where predictions of left-out poses gain by them; a joint that is better off with zero torque gets that; "
-        f"and {int(np.sum(~included))} measurements that press on the linkage's stop, or that no other pose agrees "
-        "with, are left out (crosses in the figure). With those left in, the paper's reads better on J2: it fits "
-        "the stop along with gravity.",
+        f"Both methods use the recording of the paper ({len(recording)} poses of a real MTM). The paper's method is "
+        f"unweighted least squares with twelve parameters (eq. 10). {same}On {', '.join(worse)}, its error is larger "
+        "than that of zero torque, even at the fitted poses. The torques of joints 2 and 3 are ten to a hundred times "
+        "larger and therefore determine the parameters.",
+        "Our method differs in four points. Joints are weighted by their residual variance. Offsets, springs and "
+        "cables are added if they improve cross-validation. A joint gets zero torque if the model does not improve "
+        f"it. Finally, {int(np.sum(~included))} measurements at joint stops and outliers are excluded (crosses in "
+        "the figure). With all measurements, the paper's error on J2 is smaller, because it fits the joint stop "
+        "together with gravity.",
     )
-    shows = "Squared torque error of joints 2-7 at each of the 72 poses, predicted from the others; below 1e-9 as 1e-9"
+    shows = "Squared torque error of joints 2-7 at 72 poses, leave-one-out; errors below 1e-9 are drawn at 1e-9"
     return Section("fig4", "Fig. 4: torque errors", remarks, (squared, left_out), {_FILE: shows})
 
 
@@ -127,5 +127,5 @@ def _plot(
     axes.flat[0].plot([], [], "x", color=ZERO_COLOUR, label="excluded measurement")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
-    figure.suptitle("Fig. 4 redone: each pose predicted from the other 71 (paper's own recording)")
+    figure.suptitle("Fig. 4 reproduced: squared torque error, leave-one-out, recording of the paper")
     save_figure(figure, path)

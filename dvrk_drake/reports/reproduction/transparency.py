@@ -1,51 +1,51 @@
-"""Transparency: the interaction force at the handle with each compensation."""
+"""Computes the interaction force at the handle (transparency) with each compensation."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from dvrk_drake.dynamics.friction_compensation import MAX_RATIO
-from dvrk_drake.experiments.reproduction.session import Lead, ReproductionSession, led
+from dvrk_drake.experiments.reproduction.session import OperatorCase, ReproductionSession, simulate_case
 from dvrk_drake.experiments.transparency import OperatorForces
 from dvrk_drake.reports.figures.transparency import plot_transparency
 from dvrk_drake.reports.reproduction.page import ResultTable, Section
 
 
 def reproduce_transparency(session: ReproductionSession) -> Section:
-    """Leads the handle along one path with each compensation."""
+    """Moves the handle along one path with each compensation, and returns the interaction forces."""
     mtm, paper = session.mtm, session.paper_file
     poses, seed = session.sample_sizes.path_poses, session.seed
     rows: list[tuple[str, Path | None, float]] = [
-        ("limp motors", None, 0.0),
+        ("no compensation", None, 0.0),
         ("the paper's compensation", paper, 0.0),
         ("ours", mtm.file, 0.0),
         (f"ours, friction {MAX_RATIO:g}", mtm.file, MAX_RATIO),
     ]
-    leads = [Lead(name, mtm.truth.arm, str(model or ""), ratio, poses, seed) for name, model, ratio in rows]
+    cases = [OperatorCase(name, mtm.truth.arm, str(model or ""), ratio, poses, seed) for name, model, ratio in rows]
     forces = []
-    for one in session.executor.map(led, leads):
+    for one in session.executor.map(simulate_case, cases):
         forces.append(one)
-        session.progress("a hand leads the MTM", len(forces) / len(leads))
+        session.progress("simulating the operator", len(forces) / len(cases))
     plot_transparency(session.folder / "transparency.png", mtm.truth.arm, forces)
     table = ResultTable(
         "transparency",
-        "What the hand must exert",
-        ("", "force, RMS [N]", "force, 95 % [N]", "torque, RMS [mN m]", "torque, 95 % [mN m]"),
+        "Interaction force and torque at the handle, RMS and 95th percentile",
+        ("", "RMS force [N]", "95 % force [N]", "RMS torque [mN m]", "95 % torque [mN m]"),
         tuple(_row(one) for one in forces),
     )
     remarks = (
-        "The paper proposes it and gives no number: force and torque at the handle while a hand (a spring and damper "
-        "of a person's stiffness) moves the ground-truth arm along a path through random poses, slowly.",
+        "The paper proposes this experiment as future work. A simulated hand (spring and damper) slowly moves the "
+        "handle of the ground-truth arm along a path through random poses.",
         mtm.truth.origin,
-        f"The last row also takes {MAX_RATIO:g} of the friction off the hand, less where what remains must hold "
-        "the arm against the error of the identified gravity (docs/friction_compensation.md).",
+        f"In the last row, {MAX_RATIO:g} of the friction is compensated. The ratio is smaller where friction must "
+        "resist the error of the identified gravity (docs/friction_compensation.md).",
     )
     return Section(
         "transparency",
         "Transparency: interaction force at the handle",
         remarks,
         (table,),
-        {"transparency.png": "Force and torque of the hand over time"},
+        {"transparency.png": "Magnitude of interaction force and torque at the handle over time"},
     )
 
 

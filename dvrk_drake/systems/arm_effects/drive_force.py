@@ -1,6 +1,4 @@
-"""Efforts on the plant of a real arm that are computed outside of the solver (motors, cables, springs, external
-efforts), and the sensor of motor efforts.
-"""
+"""Efforts that are computed outside of Drake's solver (motors, cables, springs, disturbance), and the effort sensor."""
 
 from __future__ import annotations
 
@@ -23,45 +21,45 @@ from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 class Motors:
     """Conversion of commanded joint efforts to motor efforts.
 
-    The command is clamped to the joints' limits and converted to actuator efforts J^-T tau [N m, N]. These are rounded
-    to multiples of `effort.command_resolution` and limited to `saturation`.
+    The command is clamped to the limits of the joints and converted to actuator efforts J^-T tau [N m, N]. The actuator
+    efforts are rounded to multiples of `effort.command_resolution` and limited to `saturation`.
 
     Attributes:
-        constants: Joint limits, command resolution and saturation (3, n), for `motor_effort_into`.
-        to_motors: Matrix J^-T (n, n).
+        constants: Joint limits, command resolution and saturation, as rows of an array (3, n).
+        to_motors: Matrix J^-T (n, n) from joint efforts to actuator efforts.
     """
 
     def __init__(self, arm: Arm, effects: ArmEffects, effort_limits: NDArray[np.float64]) -> None:
-        """Creates the motors of `arm`, whose joints have `effort_limits` (n,) [N m, N]."""
+        """Creates the motors of `arm` with the `effort_limits` (n,) [N m, N] of the joints."""
         names = arm.joint_names
         steps = per_actuator(effects.effort.command_resolution if effects.effort else {}, names, 0.0)
         self.constants = np.array([effort_limits, steps, per_actuator(effects.saturation, names, np.inf)])
         self.to_motors = np.ascontiguousarray(np.linalg.inv(arm.transmission.matrix).T)
 
     def effort(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the actuator efforts (n,) for a command (n,) on the joints."""
+        """Returns the actuator efforts (n,) for commanded joint efforts (n,)."""
         effort = np.empty(len(self.to_motors))
         motor_effort_into(np.ascontiguousarray(command), self.constants, self.to_motors, effort)
         return effort
 
 
 @numba.njit("float64(float64, float64)", cache=True)
-def in_steps(value, step):
-    """Rounds `value` to the nearest multiple of `step`. A step of 0 leaves it unchanged."""
+def round_to_step(value, step):
+    """Rounds `value` to the nearest multiple of `step`. A step of 0 means no rounding."""
     return step * np.rint(value / step) if step > 0.0 else value
 
 
 @numba.njit("void(float64[::1], float64[:, ::1], float64[:, ::1], float64[::1])", cache=True)
 def motor_effort_into(command, constants, to_motors, effort):
     """Computes `Motors.effort` in compiled code."""
-    limits, steps, most = constants
+    limits, steps, saturation = constants
     effort[:] = 0.0
     for k in range(len(command)):
         tau = min(max(command[k], -limits[k]), limits[k])
         for i in range(len(effort)):
             effort[i] += to_motors[i, k] * tau
     for i in range(len(effort)):
-        effort[i] = min(max(in_steps(effort[i], steps[i]), -most[i]), most[i])
+        effort[i] = min(max(round_to_step(effort[i], steps[i]), -saturation[i]), saturation[i])
 
 
 class EffortSensor(LeafSystem):
@@ -76,16 +74,24 @@ class EffortSensor(LeafSystem):
         - effort_measured
 
     - `effort_commanded` (n): commanded joint efforts at the time of the measurement [N m, N]. Unconnected: zero.
-    - `effort_measured` (n): measured joint efforts: the motor efforts for the command, with Gaussian noise, rounded to
-      multiples of `measured_resolution`. Noise and rounding act on the actuators. The noise changes every time step.
+    - `effort_measured` (n): measured joint efforts [N m, N]. Gaussian noise is added to the motor efforts, which are
+      then rounded to multiples of `measured_resolution`. The noise changes every time step.
 
-    The noise comes from a counter-based generator (Philox, Salmon et al., SC 2011). Its numbers for a time step depend
-    only on seed and index, not on the order of evaluations. So a seed gives the same noise bit for bit, and an output
-    that is not evaluated costs no time. Drake's RandomSource has no seed that Python can set (1.51 to 1.58).
+    The noise comes from a counter-based generator (Philox, Salmon et al., SC 2011). The noise of a time step depends
+    only on the seed and the index of the step. A seed therefore gives identical noise for any order of evaluations.
+    Python cannot set the seed of Drake's RandomSource (1.51 to 1.58).
     """
 
     def __init__(self, arm: Arm, motors: Motors, effort: EffortEffect | None, time_step: float, seed: int) -> None:
-        """Creates the sensor of `arm` with noise from `seed` >= 0 every `time_step` [s]. No `effort`: it is exact."""
+        """Creates the sensor.
+
+        Args:
+            arm: Arm with n joints.
+            motors: Motors of the arm.
+            effort: Noise and resolution. None: the measurement is exact.
+            time_step: Period in which the noise changes [s].
+            seed: Seed of the noise, at least 0.
+        """
         super().__init__()
         effort = effort or EffortEffect()
         names, n = arm.joint_names, arm.num_joints
@@ -101,16 +107,16 @@ class EffortSensor(LeafSystem):
         port = self.get_input_port()
         effort = self._motors.effort(port.Eval(context) if port.HasValue(context) else np.zeros(len(self._steps)))
         if np.any(self._deviations):
-            # Adds half a time step, because sums of time steps are not exact.
+            # Half a step is added before truncation, because sums of time steps are not exact.
             tick = int(context.get_time() / self._time_step + 0.5)
             bits = np.random.Philox(key=self._seed, counter=[0, 0, tick, 0])
             effort = effort + self._deviations * np.random.Generator(bits).standard_normal(len(effort))
-        counted = np.array([in_steps(value, step) for value, step in zip(effort, self._steps, strict=True)])
+        counted = np.array([round_to_step(value, step) for value, step in zip(effort, self._steps, strict=True)])
         output.SetFromVector(self._transmission.pull_back_effort(counted))
 
 
 class DriveForce(LeafSystem):
-    """Sum of the efforts of motors, cables, springs and disturbance, in one system to save time in every step.
+    """Computes the sum of the efforts of motors, cables, springs and disturbance. One system is faster than several.
 
     .. pydrake_system::
 
@@ -123,18 +129,23 @@ class DriveForce(LeafSystem):
         - generalized_force
 
     - `effort_commanded` (n): commanded joint efforts [N m, N]; see `Motors`. Unconnected: zero.
-    - `effort_disturbance` (n): joint efforts that are added after the motors. Unconnected: zero.
+    - `effort_disturbance` (n): joint efforts that are added after the motors [N m, N]. Unconnected: zero.
     - `plant_state`: state of the whole plant.
-    - `generalized_force`: input for the plant's port `applied_generalized_force`: motor efforts, disturbance, cables
-      and springs. The models of cables and springs state the effort that motors need to compensate them, so it is
-      subtracted.
+    - `generalized_force`: generalized force (nv) for the plant's port `applied_generalized_force`. The effects of
+      cables and springs are defined as the effort that compensates them, so they are subtracted.
     """
 
     def __init__(self, arm: Arm, motors: Motors, parts: PlantEffects, effects: ArmEffects) -> None:
-        """Creates the system for `arm`, whose plant is finalized and has the `parts`. It uses cables and springs only.
+        """Creates the system.
+
+        Args:
+            arm: Simulated arm.
+            motors: Motors of the arm.
+            parts: Effects in the finalized plant of the arm.
+            effects: Effects of the arm, of which cables and springs are used here.
 
         Raises:
-            StationError: An effect that the arm cannot have.
+            StationError: An effect is not valid for this arm.
         """
         super().__init__()
         laws = [*effects.cables, *effects.springs]
@@ -157,19 +168,20 @@ class DriveForce(LeafSystem):
         )
 
     def _make_calc(self, n: int) -> Callable[[Context, BasicVector], None]:
-        """Returns the handler of the port. Its data are local names for speed, see GravityPidController."""
-        eval_vector_input, motors_into, subtract_at = self.EvalVectorInput, entry_point(_force_into), entry_point(_take)
+        """Returns the handler of the port. The handler uses local names for speed; see GravityPidController."""
+        eval_vector_input, motors_into = self.EvalVectorInput, entry_point(_force_into)
+        subtract_at = entry_point(_subtract_at)
         torque_into = None if self._torque is None else entry_point(self._torque)
         constants, to_motors, from_motors = self._motors.constants, self._motors.to_motors, self._from_motors
         joints, coefficients = self._joints, self._coefficients
-        nothing, q, tau = np.zeros(n), np.empty(n), np.empty(n)
+        zero, q, tau = np.zeros(n), np.empty(n), np.empty(n)
 
         def calc(context: Context, output: BasicVector) -> None:
-            command, outside = eval_vector_input(context, 0), eval_vector_input(context, 1)
+            command, disturbance = eval_vector_input(context, 0), eval_vector_input(context, 1)
             force = output.get_mutable_value()
             motors_into(
-                nothing if command is None else command.get_value(),
-                nothing if outside is None else outside.get_value(),
+                zero if command is None else command.get_value(),
+                zero if disturbance is None else disturbance.get_value(),
                 eval_vector_input(context, 2).get_value(),
                 joints,
                 constants,
@@ -191,19 +203,22 @@ class DriveForce(LeafSystem):
     " float64[::1], float64[::1], float64[::1])",
     cache=True,
 )
-def _force_into(command, outside, state, joints, constants, to_motors, from_motors, q, motors, force):
-    """Computes `force` from motors and disturbance, joint positions `q` and actuator efforts `motors`, in place."""
+def _force_into(command, disturbance, state, joints, constants, to_motors, from_motors, q, motors, force):
+    """Computes the generalized force of motors and disturbance, in place in `force`.
+
+    The joint positions `q` and the actuator efforts `motors` are also written.
+    """
     motor_effort_into(command, constants, to_motors, motors)
     for i in range(len(force)):
         force[i] = 0.0
         for k in range(len(motors)):
             force[i] += from_motors[i, k] * motors[k]
     for k in range(len(joints)):
-        force[joints[k]] += outside[k]
+        force[joints[k]] += disturbance[k]
         q[k] = state[joints[k]]
 
 
 @numba.njit("void(float64[::1], int64[::1], float64[::1])", cache=True)
-def _take(tau, joints, force):
+def _subtract_at(tau, joints, force):
     for k in range(len(joints)):
         force[joints[k]] -= tau[k]

@@ -1,4 +1,4 @@
-"""Joints for the coordinates of an arm's drive in its plant, where Drake's solver computes friction and stops."""
+"""Joints of a plant for the coordinates of an arm's drive, at which Drake's solver computes friction and stops."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import Cable
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
-#: Inertia of each added body as a fraction of the arm's inertia at the coordinate, and its mass [kg]. Drake limits the
-#: stiffness of a constraint by the lighter of its bodies and the time step. For an MTM's parallelogram, 3 N m cause a
-#: deflection of 1 mrad.
+#: Inertia of each added body as a fraction of the arm's inertia at the coordinate. Mass of each added body [kg]. Drake
+#: limits the stiffness of a constraint, depending on the lighter body and the time step. For the parallelogram of an
+#: MTM, 3 N m cause a deflection of 1 mrad.
 SHARE, MASS = 2e-3, 1e-6
 #: Distance from the axis at which coupled bodies are constrained [m].
 RADIUS = 0.1
-#: Inextensible cable. Its only compliance is that of Drake's solver.
+#: Inextensible cable. Only the compliance of Drake's solver remains.
 STIFF = Cable(stiffness=float("inf"))
 
 
@@ -39,17 +39,18 @@ class DriveJoints:
     """Finds or creates the joint of a coordinate x = row q of an arm's joints, before the plant is finalized.
 
     If x is proportional to the position of one joint, that joint is used. For a sum of joints, a body with its own
-    joint is added, which rotates by x. It is coupled to a link that rotates by x about the same axis if the arm has
-    one, e.g. the crank of an MTM's parallelogram relative to the yaw link. Otherwise it is coupled to the last of a
-    chain of bodies on the world. Each body of the chain rotates relative to the previous one by the contribution of one
-    joint.
+    joint is added, which rotates by x. The body is coupled in one of two ways:
+
+    - to a link that rotates by x about the same axis, e.g. the crank of the parallelogram relative to the yaw link,
+    - otherwise to the last body of a chain that begins at the world. Each body of the chain rotates relative to the
+      previous one by the contribution of one joint.
 
     Attributes:
-        motors: Mapping of actuator to the motor that `add_motor` created.
+        motors: Motors that `add_motor` created, by the name of the actuator.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
-        """Creates it for the `arm` that `add_arm` added to `plant` as `instance`."""
+        """Creates the object for the `arm` that `add_arm` added to `plant` as `instance`."""
         self._plant, self._arm, self._instance = plant, arm, instance
         self._added: list[tuple[Joint, NDArray[np.float64]]] = []
         self.motors: dict[str, JointActuator] = {}
@@ -57,8 +58,8 @@ class DriveJoints:
     def add_motor(self, name: str, cable: Cable) -> None:
         """Adds a separate joint for the motor of an actuator and couples it to the arm by an elastic cable.
 
-        Afterwards `along` returns the motor's joint for that actuator. The rotor inertia that the SDF states at the
-        actuator's joint is moved to the motor.
+        Afterwards, `joint_of_coordinate` returns the joint of the motor for this actuator. The rotor inertia in the SDF
+        is moved from the actuator's joint to the motor.
 
         Raises:
             StationError: The actuator is prismatic or drives several joints, so no separate rotor is defined.
@@ -66,7 +67,9 @@ class DriveJoints:
         plant, i = self._plant, self._arm.joint_names.index(name)
         row = joint_row(self._arm, f"actuator.{name}")
         if self._arm.prismatic[i] or not np.array_equal(row, np.eye(len(row))[i]):
-            raise StationError(f"{self._arm.name}: stretch.{name}: allowed are actuators that turn one joint alone")
+            raise StationError(
+                f"{self._arm.name}: stretch.{name}: the actuator must drive one revolute joint and no other joint"
+            )
         joint = self._new(row, cable)
         motor = plant.AddJointActuator(f"motor_{name}", joint)
         at_joint = plant.GetJointActuatorByName(name, self._instance)
@@ -75,15 +78,15 @@ class DriveJoints:
         at_joint.set_default_rotor_inertia(0.0)
         self.motors[name] = motor
 
-    def along(self, coordinate: str) -> tuple[Joint, float]:
-        """Returns the same as `joint`, for a coordinate of the drive by its name."""
+    def joint_of_coordinate(self, coordinate: str) -> tuple[Joint, float]:
+        """Returns the joint of a named coordinate of the drive, and the factor from joint position to coordinate."""
         owner, _, name = coordinate.partition(".")
         if owner == "actuator" and name in self.motors:
             return self.motors[name].joint(), 1.0
         return self.joint(joint_row(self._arm, coordinate))
 
     def joint(self, row: NDArray[np.float64]) -> tuple[Joint, float]:
-        """Returns the joint of x = row q, row (n,), and the factor that converts its position to x."""
+        """Returns the joint of x = row q with row (n,), and the factor that converts the position of the joint to x."""
         terms = np.flatnonzero(np.abs(row) > 1e-12)
         if len(terms) == 1:
             (i,) = terms
@@ -99,7 +102,7 @@ class DriveJoints:
         return joint
 
     def set_positions(self, q_plant: NDArray[np.float64], q: ArrayLike) -> None:
-        """Writes the positions of added joints at the pose q (n,) into q_plant."""
+        """Writes the positions of the added joints at the pose q (n,) into `q_plant` (nq,)."""
         q = np.asarray(q, float)
         for i, (joint, row) in enumerate(self._added):
             q_plant[joint.position_start()] = row @ q
@@ -109,7 +112,7 @@ class DriveJoints:
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
     def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
-        """Returns a new joint parallel to a path of coaxial joints whose angles add up to `row` q, if there is one."""
+        """Returns a new joint parallel to coaxial joints whose angles add up to row q, or None if there are none."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
         for name in names:
@@ -122,7 +125,7 @@ class DriveJoints:
                 total = total + sign * self._arm.linkage.matrix[names.index(joint.name())]
                 if np.allclose(total, row, atol=1e-12):
                     origin = _offset(joint.frame_on_parent()) + along
-                    return self._beside(row, cable, joint.parent_body(), origin, last)
+                    return self._add_coaxial_joint(row, cable, joint.parent_body(), origin, last)
                 parent = joint.parent_body()
                 if parent.index() not in above:
                     break
@@ -133,7 +136,7 @@ class DriveJoints:
                 along, joint = along + step, upper
         return None
 
-    def _beside(
+    def _add_coaxial_joint(
         self,
         row: NDArray[np.float64],
         cable: Cable,
@@ -141,12 +144,20 @@ class DriveJoints:
         p_PR: NDArray[np.float64],
         last: RevoluteJoint,
     ) -> Joint:
-        """Returns a joint from `parent` about the axis of `last` at p_PR. Its body rotates with the child of `last`."""
+        """Returns a new joint about the axis of `last`.
+
+        Args:
+            row: Row (n,) of the coordinate.
+            cable: Cable that couples the new body to the child of `last`.
+            parent: Parent body P of the joint.
+            p_PR: Position (3,) of the joint in P [m].
+            last: Last of the coaxial joints.
+        """
         plant, name = self._plant, f"drive_{len(self._added)}"
         body = self._body(name, row)
         frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", parent, RigidTransform(p_PR)))
         joint = plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), last.revolute_axis()))
-        self._tie(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis(), cable)
+        self._couple_rotation(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis(), cable)
         return joint
 
     def _chain(self, row: NDArray[np.float64], cable: Cable) -> Joint:
@@ -161,16 +172,16 @@ class DriveJoints:
             end = body
         body = self._body(f"drive_{i}", row)
         joint = plant.AddJoint(RevoluteJoint(f"drive_{i}", plant.world_frame(), body.body_frame(), axis))
-        self._tie(end, np.zeros(3), body, axis, cable)
+        self._couple_rotation(end, np.zeros(3), body, axis, cable)
         return joint
 
-    def _tie(
+    def _couple_rotation(
         self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64], cable: Cable
     ) -> None:
-        """Couples the rotation of B to A about a common axis by a rod between points a quarter of a turn apart."""
+        """Couples the rotations of A and B about a common axis by a rod between two points 90 degrees apart."""
         e = np.eye(3)[np.argmin(np.abs(axis))]
         f = np.cross(axis, e)
-        # The distance of the rod from the axis is `RADIUS` divided by the square root of 2.
+        # The distance of the rod from the axis is RADIUS / sqrt(2).
         lever, length = 0.5 * RADIUS**2, float(np.sqrt(2.0)) * RADIUS
         p_AP, p_BQ = p_AAxis + RADIUS * e, RADIUS * f
         self._plant.AddDistanceConstraint(A, p_AP, B, p_BQ, length, cable.stiffness / lever, cable.damping / lever)
@@ -183,7 +194,7 @@ class DriveJoints:
 
 @cache
 def _mass_matrix(arm: Arm) -> NDArray[np.float64]:
-    """Returns the mass matrix (n, n) of the joints in the middle of their ranges."""
+    """Returns the mass matrix (n, n) with all joints in the middle of their ranges."""
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, 0.5 * (arm.position_lower + arm.position_upper))

@@ -1,4 +1,4 @@
-"""Discrete update of a real arm's drive in each time step: springs of dry friction and encoders."""
+"""Discrete update of the drive in each time step: springs of dry friction, and encoders."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from dvrk_drake.dynamics.actuator_effects import effect_step
 from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
-from dvrk_drake.systems.arm_effects.drive_force import in_steps
+from dvrk_drake.systems.arm_effects.drive_force import round_to_step
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 
 
 class DriveStep(LeafSystem):
-    """Updates friction springs and encoders. One system for both, as each Python system costs 4 us per step.
+    """Updates friction springs and encoders in one system, because each Python system costs time in every step.
 
     .. pydrake_system::
 
@@ -31,25 +31,34 @@ class DriveStep(LeafSystem):
         - state_estimated
 
     - `plant_state`: state of the plant that contains the sliders of `add_friction`.
-    - `desired_state`: input for the plant's port of that name and the arm's instance: positions, then velocities (zero)
-      of all its actuators. The position for a slider's actuator is the anchor of its spring.
-    - `state_estimated` (2n): measured q, then v of the arm's joints, `delay` time steps ago [rad, rad/s; m, m/s on a
-      prismatic joint].
+    - `desired_state`: positions, then velocities (zero) of all actuators of the arm's instance, for the plant's port of
+      that name. The position for a slider's actuator is the anchor of the slider's spring.
+    - `state_estimated` (2n): measured q, then v of the arm's joints [rad, rad/s; m, m/s on a prismatic joint], delayed
+      by the measurement delay.
 
-    **Friction.** An anchor is fixed while the deflection of its spring is below the slip limit. Beyond it, the anchor
-    follows at that distance, see `effect_step` of the slider's kind. The plant evaluates the spring at the end of a
-    step. The anchor moves afterwards, always towards less deflection. So the energy that a slider takes is never less
-    than the energy that its spring stores, and friction never adds energy. At initialization all springs are relaxed.
+    **Friction.** An anchor is fixed while the deflection of the spring is below the slip limit. Beyond this limit, the
+    anchor follows at a constant distance; see `effect_step`. The plant evaluates the spring at the end of a step. The
+    anchor moves afterwards, always towards less deflection. The spring therefore never returns more energy than was
+    put into it, so friction adds no energy. At initialization, all springs are relaxed.
 
-    **Encoders.** A measured actuator position is a whole number of counts. Joint positions follow from the
-    transmission. The velocity is the difference of two readings over the time step h with a first-order low-pass: with
-    a = exp(-2 pi f h), y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h. Without an encoder, position and velocity are
-    exact. The arm is assumed to be at rest before the start, at the pose of `SetAtRest` or the pose at initialization.
-    With a delay, the output during initialization itself uses the pose of `SetAtRest`.
+    **Encoders.** A measured actuator position is a whole number of encoder counts. Joint positions follow from the
+    transmission. The velocity is the difference of two readings over the time step h, after a first-order low-pass
+    filter with cut-off frequency f: y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h with a = exp(-2 pi f h). Without an
+    encoder, position and velocity are exact.
+
+    **Start.** The arm is assumed to be at rest before the start, at the pose of `SetAtRest` or at the pose at
+    initialization. With a delay, the output during initialization uses the pose of `SetAtRest`.
     """
 
     def __init__(self, arm: Arm, parts: PlantEffects, effects: ArmEffects, q_default: NDArray[np.float64]) -> None:
-        """Creates it for `arm` with a finalized plant and its `parts`. The arm is at rest at `q_default` (n,) first."""
+        """Creates the system.
+
+        Args:
+            arm: Simulated arm.
+            parts: Effects in the finalized plant of the arm.
+            effects: Effects of the arm, of which encoder and delay are used here.
+            q_default: Initial pose (n,) [rad, m] of the arm at rest.
+        """
         super().__init__()
         n, time_step = arm.num_joints, parts.time_step
         encoder, delay = effects.encoder, effects.delay.measurement if effects.delay else 0
@@ -59,15 +68,15 @@ class DriveStep(LeafSystem):
         self._J = arm.transmission.matrix
         to_joints = np.ascontiguousarray(np.linalg.inv(arm.transmission.matrix))
         exact = to_joints @ parts.to_actuators
-        whole = np.rint(exact)  # removes rounding errors from entries that only select a joint
+        whole = np.rint(exact)  # used to remove rounding errors from entries that only select a joint
         self._maps = parts.to_actuators, to_joints, np.where(np.abs(exact - whole) < 1e-12, whole, exact)
         self._places = np.array([[s.code, s.actuator, s.position] for s in parts.sliders], dtype=int).reshape(-1, 3)
         self._laws = np.array([[s.travel, s.fall_speed, s.side] for s in parts.sliders]).reshape(-1, 3)
         self._measure_into = entry_point(_measure_into)
         self.DeclareVectorInputPort(name="plant_state", size=2 * exact.shape[1])
         self._queue_length = max(delay - 1, 0)
-        hooks = self.DeclareDiscreteState(num_state_variables=2 * parts.num_actuators)
-        self.DeclareStateOutputPort(name="desired_state", state_index=hooks)
+        anchors = self.DeclareDiscreteState(num_state_variables=2 * parts.num_actuators)
+        self.DeclareStateOutputPort(name="desired_state", state_index=anchors)
         out, memory = self._at_rest(q_default)
         self.DeclareDiscreteState(out)
         self.DeclareDiscreteState(memory)
@@ -82,76 +91,77 @@ class DriveStep(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec=time_step, offset_sec=0.0, update=self._make_update())
 
     def _make_update(self) -> Callable[[Context, DiscreteValues], None]:
-        """Returns the handler of the update. Its data are local names for speed, see GravityPidController."""
-        eval_vector_input, follow, measure_into = self.EvalVectorInput, entry_point(_follow), self._measure_into
+        """Returns the handler of the update. The handler uses local names for speed; see GravityPidController."""
+        eval_vector_input, measure_into = self.EvalVectorInput, self._measure_into
+        move_anchors = entry_point(_move_anchors)
         places, laws, maps, constants = self._places, self._laws, self._maps, self._constants
-        rubs, time_step = len(places) > 0, self._constants[-1]
+        has_friction, time_step = len(places) > 0, self._constants[-1]
 
         def update(context: Context, discrete_state: DiscreteValues) -> None:
             state = eval_vector_input(context, 0).get_value()
             value = discrete_state.get_mutable_value
-            if rubs:
-                follow(state, places, laws, time_step, value(_HOOKS))
+            if has_friction:
+                move_anchors(state, places, laws, time_step, value(_ANCHORS))
             measure_into(state, *maps, constants, value(_MEMORY), value(_OUT))
 
         return update
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        """Computes the output without delay, i.e. the result of the coming update."""
+        """Computes the output without delay. It is the result of the coming update."""
         memory = context.get_discrete_state(_MEMORY).get_value().copy()
         state = self.EvalVectorInput(context, 0).get_value()
         self._measure_into(state, *self._maps, self._constants, memory, output.get_mutable_value())
 
     def SetAtRest(self, context: Context, q: NDArray[np.float64]) -> None:
-        """Sets the measurements in this system's context to those of an arm at rest at q (n,)."""
+        """Sets the measurements in the context of this system to those of an arm at rest at q (n,) [rad, m]."""
         for group, value in zip((_OUT, _MEMORY), self._at_rest(q), strict=True):
             context.SetDiscreteState(group, value)
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self.EvalVectorInput(context, 0).get_value()
-        hooks = discrete_state.get_mutable_value(_HOOKS)
-        hooks[self._places[:, 1]] = state[self._places[:, 2]]
+        anchors = discrete_state.get_mutable_value(_ANCHORS)
+        anchors[self._places[:, 1]] = state[self._places[:, 2]]
         exact = self._maps[2]
         for group, value in zip((_OUT, _MEMORY), self._at_rest(exact @ state[: exact.shape[1]]), strict=True):
             discrete_state.set_value(group, value)
 
     def _at_rest(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the output and the memory of an arm at rest at q (n,)."""
+        """Returns the discrete states `_OUT` and `_MEMORY` of an arm at rest at q (n,)."""
         n = len(q)
         a = self._J @ q
         if self._constants[n] >= 0.0:
-            a = np.array([in_steps(x, step) for x, step in zip(a, self._constants[:n], strict=True)])
+            a = np.array([round_to_step(x, step) for x, step in zip(a, self._constants[:n], strict=True)])
             q = self._maps[1] @ a
         still = np.zeros(n)
         out = np.concatenate([q, still])
         return out, np.concatenate([a, still, *[out] * self._queue_length])
 
 
-_HOOKS, _OUT, _MEMORY = 0, 1, 2  # indices of the discrete state groups
+_ANCHORS, _OUT, _MEMORY = 0, 1, 2  # indices of the discrete state groups
 
 
 @numba.njit("void(float64[::1], int64[:, ::1], float64[:, ::1], float64, float64[::1])", cache=True)
-def _follow(state, places, laws, time_step, hooks):
-    """Moves the anchors of the springs; see `Slider` for `places` and `laws`."""
+def _move_anchors(state, places, laws, time_step, anchors):
+    """Moves the anchors of the springs, in place. `places` and `laws` have one row per `Slider`."""
     num_positions = len(state) // 2
     for i in range(len(places)):
-        code, hook, column = places[i]
+        code, actuator, column = places[i]
         travel, fall_speed, side = laws[i]
         position, velocity = state[column], state[num_positions + column]
-        holds = travel
+        slip_travel = travel
         if fall_speed > 0.0:
-            holds *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
-        stretch = side * (position - hooks[hook])
+            slip_travel *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
+        deflection = side * (position - anchors[actuator])
         # The deflection of a spring that starts relaxed equals the element's state.
-        z, _ = effect_step(code, 0.0, stretch, 0.0, holds)
-        if abs(stretch - z * holds) < 1e-12 * travel:
+        z, _ = effect_step(code, 0.0, deflection, 0.0, slip_travel)
+        if abs(deflection - z * slip_travel) < 1e-12 * travel:
             continue
-        stretch = z * holds
-        if holds < travel:
-            # The deflection increases in the present step and in the step that the anchor is for. Up to `travel`, the
-            # effort limit covers this.
-            stretch = math.copysign(max(abs(stretch) - 2.0 * time_step * abs(velocity), 0.0), stretch)
-        hooks[hook] = position - side * stretch
+        deflection = z * slip_travel
+        if slip_travel < travel:
+            # The deflection still increases in this step and in the step that uses the anchor. At the full `travel`,
+            # the effort limit of the actuator covers this.
+            deflection = math.copysign(max(abs(deflection) - 2.0 * time_step * abs(velocity), 0.0), deflection)
+        anchors[actuator] = position - side * deflection
 
 
 @numba.njit(
@@ -159,21 +169,21 @@ def _follow(state, places, laws, time_step, hooks):
     cache=True,
 )
 def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out):
-    """Measures `state`. The queue outputs its oldest measurement and stores this one; without a queue it is output now.
+    """Measures `state` and writes the delayed measurement to `out`. Without a queue, there is no delay.
 
-    `memory` holds the last reading and velocity of the actuators, then the queue. `constants` holds the resolutions
-    (n), the decay of the low-pass and the time step.
+    `memory` contains the last readings and velocities of the actuators, then the queue of measurements. `constants`
+    contains the resolutions (n), the decay of the low-pass filter and the time step.
     """
     n, num_positions = to_actuators.shape
     decay, time_step = constants[n], constants[n + 1]
     queue = memory[2 * n :]
-    late = len(queue)
+    queue_size = len(queue)
     measured = out
-    if late:
+    if queue_size:
         out[:] = queue[: 2 * n]
-        for i in range(late - 2 * n):
+        for i in range(queue_size - 2 * n):
             queue[i] = queue[i + 2 * n]
-        measured = queue[late - 2 * n :]
+        measured = queue[queue_size - 2 * n :]
     if decay < 0.0:
         for i in range(n):
             q, v = 0.0, 0.0
@@ -186,7 +196,7 @@ def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out)
         a = 0.0
         for k in range(num_positions):
             a += to_actuators[i, k] * state[k]
-        a = in_steps(a, constants[i])
+        a = round_to_step(a, constants[i])
         memory[n + i] = decay * memory[n + i] + (1.0 - decay) * (a - memory[i]) / time_step
         memory[i] = a
     for i in range(n):

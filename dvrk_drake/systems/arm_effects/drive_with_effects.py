@@ -1,4 +1,4 @@
-"""Drive of a real arm: the parts of `ArmEffects` between a plant and the ports of its station."""
+"""Drive with simulated effects, between a plant and the ports of its station."""
 
 from __future__ import annotations
 
@@ -24,11 +24,14 @@ class DriveWithEffects:
     """Arguments of `add_drive_with_effects`.
 
     Attributes:
-        arm: Arm that is simulated.
-        plant: Finalized plant. `instance` is the arm, `joints` its joints, `parts` the effects that were added to it.
+        arm: Simulated arm.
+        plant: Finalized plant.
+        instance: Model instance of the arm in the plant.
+        joints: Joints of the arm in the plant.
+        parts: Effects that were added to the plant.
         effects: All effects of the arm.
         seed: Seed of the noise.
-        home: Pose (n,) of the arm at rest before the start.
+        home: Pose (n,) [rad, m] of the arm at rest before the start.
     """
 
     arm: Arm
@@ -42,7 +45,11 @@ class DriveWithEffects:
 
 
 def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> tuple[DrivePorts, DriveStep]:
-    """Connects the inputs of a finalized plant. Returns the ports and the system that stores past measurements."""
+    """Adds the systems of the drive and connects the inputs of the plant.
+
+    Returns:
+        Ports of the drive, and the system that computes the measured state.
+    """
     drive.parts.finish(drive.joints)
     plant, delay = drive.plant, drive.effects.delay or DelayEffect()
     step = builder.AddNamedSystem("drive_step", DriveStep(drive.arm, drive.parts, drive.effects, drive.home))
@@ -51,16 +58,18 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
         builder.Connect(step.GetOutputPort("desired_state"), plant.get_desired_state_input_port(drive.instance))
     state = add_true_state(builder, plant, drive.joints)
     motors = Motors(drive.arm, drive.effects, drive.joints.effort_limits)
-    # Optional: unconnected, its output is not read.
+    # This port is optional. The output of the PassThrough is not read if it is unconnected.
     commanded = builder.AddNamedSystem("effort_commanded", PassThrough(drive.arm.num_joints))
     force = builder.AddNamedSystem("drive_force", DriveForce(drive.arm, motors, drive.parts, drive.effects))
-    at_motors = _late(builder, "command_delay", delay.command, commanded.get_output_port(), drive)
+    at_motors = _add_delay(builder, "command_delay", delay.command, commanded.get_output_port(), drive)
     builder.Connect(at_motors, force.GetInputPort("effort_commanded"))
     builder.Connect(plant.get_state_output_port(), force.GetInputPort("plant_state"))
     builder.Connect(force.get_output_port(), plant.get_applied_generalized_force_input_port())
     sensor = EffortSensor(drive.arm, motors, drive.effects.effort, drive.parts.time_step, drive.seed)
     builder.AddNamedSystem("effort_sensor", sensor)
-    builder.Connect(_late(builder, "measurement_delay", delay.measurement, at_motors, drive), sensor.get_input_port())
+    builder.Connect(
+        _add_delay(builder, "measurement_delay", delay.measurement, at_motors, drive), sensor.get_input_port()
+    )
     ports = DrivePorts(
         commanded.get_input_port(),
         force.GetInputPort("effort_disturbance"),
@@ -71,10 +80,10 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
     return ports, step
 
 
-def _late(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: DriveWithEffects) -> OutputPort:
+def _add_delay(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: DriveWithEffects) -> OutputPort:
     if steps == 0:
         return port
-        # The sampled input already causes a delay of one step, because the plant steps while it is stored.
+    # The delay system samples its input, which already causes a delay of one step.
     delay = builder.AddNamedSystem(name, DiscreteTimeDelay(drive.parts.time_step, steps - 1, drive.arm.num_joints))
     builder.Connect(port, delay.get_input_port())
     return delay.get_output_port()

@@ -1,4 +1,4 @@
-"""Effects of a real arm that are parts of its plant, mainly dry friction, as elements of Drake's solver."""
+"""Effects of a real arm that are elements of Drake's solver, mainly dry friction."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from dvrk_drake.models.effects_schema import FRICTION_KINDS, ArmEffects, Frictio
 from dvrk_drake.systems.arm_effects.drive_joints import DriveJoints
 from dvrk_drake.systems.ideal_drive import PlantJoints
 
-#: Relaxation time of the presliding springs [s]: damping over stiffness. It limits the ringing after an impact. Drake
-#: limits the sum of spring and damper to the element's coefficient, so sliding friction is unchanged.
+#: Relaxation time of the presliding springs [s], i.e. damping divided by stiffness. It limits oscillations after an
+#: impact. Drake limits the sum of spring and damper effort to the friction coefficient, so it does not change sliding
+#: friction.
 RELAXATION = 0.02
 
 
 @dataclass(frozen=True)
 class Slider:
-    """Elasto-plastic element in a finalized plant, realised as an actuator with a gain and an effort limit.
+    """Elasto-plastic friction element in a finalized plant. It is an actuator with a gain and an effort limit.
 
     Attributes:
-        code: Code of its kind, for `effect_step`.
-        actuator: Index of its actuator in the instance.
-        position: Index of its joint's position in the plant.
-        travel: Travel of that joint until it slips [rad, m].
-        fall_speed: Speed at which its slip limit is 1/e of the value at rest [rad/s, m/s]; 0 if it is constant.
-        side: -1 if the kind is applied with +x and -x exchanged, else 1.
+        code: Code of the kind of friction, for `effect_step`.
+        actuator: Index of the actuator in the model instance.
+        position: Index of the joint's position in the plant.
+        travel: Travel of the joint until the element slips [rad, m].
+        fall_speed: Speed at which the slip limit is 1/e of the limit at rest [rad/s, m/s]; 0 for a constant limit.
+        side: -1 if the directions +x and -x are exchanged, otherwise 1.
     """
 
     code: int
@@ -43,8 +44,13 @@ class Slider:
     side: float
 
     @staticmethod
-    def of(element: tuple[JointActuator, FrictionEffect, float], order: Sequence[object]) -> Slider:
-        """Returns the slider of an element of `add_friction`. `order` lists the indices of the instance's actuators."""
+    def from_element(element: tuple[JointActuator, FrictionEffect, float], order: Sequence[object]) -> Slider:
+        """Creates the slider of an element that `add_friction` returned.
+
+        Args:
+            element: Actuator, effect, and ratio of the coordinate to the position of the actuator's joint.
+            order: Indices of the actuators of the model instance, in Drake's order.
+        """
         actuator, effect, ratio = element
         side = 1.0 if effect.coefficient * ratio > 0 else -1.0
         return Slider(
@@ -62,25 +68,27 @@ def add_friction(
 ) -> list[tuple[JointActuator, FrictionEffect, float]]:
     """Adds friction to a plant that is not finalized.
 
-    The solver evaluates each element at the end of the step. So it dissipates energy in every step, for any stiffness:
+    The solver evaluates each element at the end of the step. The element therefore dissipates energy in every step, for
+    any stiffness. The kinds of friction are, with coefficient c and scale s:
 
-    - "presliding" with coefficient c and scale s: effort -c clip((x - x_s + T v) / s, +-1). x_s is the anchor from
-      `DriveStep` and T = `RELAXATION`. Below c it holds without creep. With a fall speed w the limit is
-      c exp(-(v/w)^2), Stribeck friction that vanishes while sliding. T is then 0, since the limit applies to the spring
-      only.
-    - "presliding forward": the same with 0 instead of -1, for the excess of friction towards +x over friction towards
-      -x. A negative coefficient exchanges the directions. T is 0.
-    - Where these two hold less than c, the anchor is two time steps h late. They then act like viscous friction of
-      2 h c / s, so choose a travel s well above 2 h v.
-    - "coulomb": -c clip(v / s, +-1), the smoothed sign function of an identification. Below c it creeps with a speed up
-      to s.
-    - "viscous": -c v.
+    - "presliding": effort -c clip((x - x_s + T v) / s, -1, 1). x_s is the anchor from `DriveStep`, and T is
+      `RELAXATION`. Below c, the joint sticks without creep. With a fall speed w, the limit is c exp(-(v/w)^2), i.e.
+      Stribeck friction that decreases while sliding. T is then 0, because the limit applies only to the spring.
+    - "presliding forward": as "presliding" with the limits 0 and 1 and T = 0. It represents the excess of friction
+      towards +x over friction towards -x. A negative coefficient exchanges the directions.
+    - "coulomb": effort -c clip(v / s, -1, 1), the smoothed sign function of an identification. Below c, the joint
+      creeps with a speed up to s.
+    - "viscous": effort -c v.
+
+    While the limit of a presliding element is below c, its anchor is late by two time steps h. This acts like viscous
+    friction with the coefficient 2 h c / s. Choose a scale s well above 2 h v.
 
     Returns:
-        Elements that need a `DriveStep`: actuator of the plant, its effect, and ratio of coordinate to actuator joint.
+        Elements that need a `DriveStep`: actuator in the plant, effect, and ratio of the coordinate to the position of
+        the actuator's joint.
 
     Raises:
-        StationError: An effect that the arm cannot have.
+        StationError: An effect is not valid for this arm.
     """
     followed = []
     for i, effect in enumerate(friction):
@@ -89,7 +97,7 @@ def add_friction(
             raise StationError(f"{arm.name}: effects.friction[{i}]: {fault}")
         if effect.coefficient == 0:
             continue
-        joint, ratio = drive.along(effect.coordinate)
+        joint, ratio = drive.joint_of_coordinate(effect.coordinate)
         size = abs(effect.coefficient)
         if effect.kind == "viscous":
             _add_damping(joint, size * ratio**2)
@@ -107,7 +115,7 @@ def add_friction(
 
 
 def _copy_rotor(plant: MultibodyPlant, actuator: JointActuator) -> None:
-    """Copies the rotor inertia to a new actuator. Drake uses only that of a joint's last actuator (1.51 to 1.58)."""
+    """Copies the rotor inertia to a new actuator, as Drake uses that of a joint's last actuator (1.51 to 1.58)."""
     for index in plant.GetJointActuatorIndices():
         motor = plant.get_joint_actuator(index)
         if motor.joint().index() == actuator.joint().index() and motor.default_rotor_inertia() > 0:
@@ -120,10 +128,10 @@ def _add_damping(joint: Joint, damping: float) -> None:
 
 
 class PlantEffects:
-    """Adds the effects to a plant that is not finalized, and provides their indices after it is finalized.
+    """Adds effects to a plant that is not finalized. Provides indices and matrices after `finish`.
 
     Attributes:
-        drive: Joints that were added for coordinates of the drive.
+        drive: Joints of the coordinates of the drive.
         to_actuators: Matrix (n, nq) from plant positions to positions of the arm's actuators; after `finish`.
         from_motors: Matrix (nv, n) from motor efforts to generalized forces of the plant; after `finish`.
         joint_index: Indices (n,) of the joints in the plant's q and v; after `finish`.
@@ -132,10 +140,16 @@ class PlantEffects:
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex, effects: ArmEffects) -> None:
-        """Adds `friction`, `stops` and `stretch` to the `arm` that `add_arm` added to `plant` as `instance`.
+        """Adds the effects `friction`, `stops` and `stretch` to the plant.
+
+        Args:
+            plant: Plant that is not finalized.
+            arm: Arm that `add_arm` added to the plant.
+            instance: Model instance of the arm.
+            effects: Effects of the arm.
 
         Raises:
-            StationError: An effect that the arm cannot have.
+            StationError: An effect is not valid for this arm.
         """
         self._plant, self._arm = plant, arm
         self.drive = DriveJoints(plant, arm, instance)
@@ -158,10 +172,10 @@ class PlantEffects:
         return step
 
     def finish(self, joints: PlantJoints) -> None:
-        """Computes the indices. Call it when the plant is finalized."""
+        """Computes the indices and matrices. Must be called after the plant is finalized."""
         order = [actuator.index() for actuator in joints.actuators]
         self.num_actuators = len(order)
-        self.sliders = [Slider.of(element, order) for element in self._elements]
+        self.sliders = [Slider.from_element(element, order) for element in self._elements]
         J = self._arm.transmission.matrix
         self.to_actuators: NDArray[np.float64] = np.ascontiguousarray(J @ joints.selection.T)
         self.from_motors: NDArray[np.float64] = np.ascontiguousarray(joints.selection @ J.T)

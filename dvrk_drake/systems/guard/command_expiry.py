@@ -1,4 +1,4 @@
-"""Expiry of commands by the age of the measurement that they answer, on the arm's clock and on a wall clock."""
+"""Expiry of commands. A command answers a measurement and expires by the age of that measurement."""
 
 from __future__ import annotations
 
@@ -12,51 +12,70 @@ _MAX_MEASUREMENTS = 2000
 class WallClock:
     """Wall-clock times of measurements. The wall clock continues while the process and the arm's clock are stopped.
 
-    Copies of a guard share it, since it records external events.
+    Copies of a guard share one object, because it records external events.
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
-        """Creates it with `clock`, a monotonic time [us]."""
+        """Creates an empty record.
+
+        Args:
+            clock: Function that returns a monotonic time [us].
+        """
         self.now = clock
         self._times: OrderedDict[int, int] = OrderedDict()
 
     def note(self, measured_utime: int, age: int) -> None:
-        """Records a measurement of `measured_utime` on the arm's clock, where its age is `age` [us]."""
+        """Records the current wall-clock time of a measurement.
+
+        Args:
+            measured_utime: Time of the measurement on the arm's clock [us].
+            age: Age of the measurement by the arm's clock [us].
+        """
         self._times.setdefault(measured_utime, self.now() - age)
         if len(self._times) > _MAX_MEASUREMENTS:
             self._times.popitem(last=False)
 
     def time_of(self, measured_utime: int, age: int) -> int:
-        """Returns the time of a measurement [us]. If it was not recorded: `age` by the arm's clock before now [us]."""
+        """Returns the wall-clock time of a measurement [us].
+
+        Args:
+            measured_utime: Time of the measurement on the arm's clock [us].
+            age: Age of the measurement by the arm's clock [us], used if the measurement was not recorded.
+        """
         time = self._times.get(measured_utime)
         return self.now() - age if time is None else time
 
     def forget(self) -> None:
-        """Discards all measurements, after the arm's clock went back."""
+        """Discards all measurements. Called after the arm's clock went back."""
         self._times.clear()
 
 
 class CommandExpiry:
-    """Age at which a command expires, counted from the measurement that it answers.
+    """Age limit of commands, counted from the measurement that a command answers.
 
-    The age is the larger one of two: by the arm's clock, and by the wall clock if there is one. So a command also
-    expires if the arm's clock is late or was stopped. Copies of a guard share it.
+    The age is measured by the arm's clock and, if there is one, by the wall clock. The larger value counts. A command
+    therefore also expires while the arm's clock is late or stopped. Copies of a guard share one object.
     """
 
     def __init__(self, expiry: int, wall_clock: Callable[[], int] | None) -> None:
-        """Creates it with the age limit `expiry` [us] and a monotonic `wall_clock` [us], or None."""
+        """Creates the age limit.
+
+        Args:
+            expiry: Age at which a command expires [us].
+            wall_clock: Function that returns a monotonic time [us]. None: only the arm's clock is used.
+        """
         self.expiry = expiry
         self.wall = None if wall_clock is None else WallClock(wall_clock)
 
     def wall_time(self, measured_utime: int, age: int) -> int:
-        """Returns the wall-clock time of a measurement, 0 without a wall clock; see `WallClock.time_of`."""
+        """Returns the wall-clock time of a measurement [us], or 0 without a wall clock; see `WallClock.time_of`."""
         return 0 if self.wall is None else self.wall.time_of(measured_utime, age)
 
     def fault(self, age: int, wall_utime: int) -> str:
-        """Returns the reason why a command has expired. Empty: it has not.
+        """Returns the reason why a command has expired, or "" if it has not expired.
 
         Args:
-            age: Age of the measurement that it answers, by the arm's clock [us].
+            age: Age of the measurement that the command answers, by the arm's clock [us].
             wall_utime: Wall-clock time of that measurement [us]; see `wall_time`.
         """
         clock = "the arm's clock"

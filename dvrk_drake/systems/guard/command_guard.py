@@ -1,4 +1,4 @@
-"""Command guard of an arm: checks commands and measurements without Drake or LCM, for simulated and real arms."""
+"""Command guard: checks the commands to an arm and the arm's measurements. Independent of Drake and LCM."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 #: Largest time step that the rate limits use [s]. They do not compensate for longer intervals between two steps.
 _MAX_STEP = 0.01
 
-#: Longest gap after which a measurement is compared with the previous one [s]. After a longer gap the arm may have been
-#: moved.
+#: Longest gap between two measurements that are compared [s]. During a longer gap, the arm may have been moved.
 _MAX_GAP = 0.1
 
 #: States in which a position controller regulates the arm to a target.
 _REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
 
+#: State in which the commands of each mode act.
 _ACTIVE = {
     lcmt_dvrk_command.POSITION: lcmt_dvrk_status.STATE_POSITION,
     lcmt_dvrk_command.EFFORT: lcmt_dvrk_status.STATE_EFFORT,
@@ -50,8 +50,9 @@ _ACTIVE = {
 class CommandGuard:
     """Watchdog between the sender of commands and the motors of an arm.
 
-    Call `receive` with every command and `step` once per period (1 ms). Both take the arm's clock in microseconds, the
-    clock of its status messages. `step` returns the output for this period. The caller applies it unchanged.
+    Call `receive` with every command and `step` once per period (1 ms). Both require the time of the arm's clock [us],
+    which is also the clock of the status messages. `step` returns the output for this period. The caller applies this
+    output unchanged.
 
     **States** (lcmt_dvrk_status.STATE_*) and the behaviour of the arm in each of them:
 
@@ -59,66 +60,65 @@ class CommandGuard:
     - HOLD: The arm regulates to a latched pose. This is the initial state. It needs no commands.
     - STARTING: As HOLD, while the POSITION or EFFORT commands of a sender are monitored.
     - POSITION, EFFORT: The last command acts, inside the limits of GuardLimits.
-    - FAULT: As HOLD. After a measurement fault, efforts hold the joints that have a valid position. The other joints
-      get the gravity effort of their last valid pose. As OFF if the motors had no power.
+    - FAULT: As HOLD. After a measurement fault, the guard regulates only joints with a valid position. Joints without
+      one get the gravity effort at their last valid position. If the motors had no power, FAULT is as OFF.
 
     ::
 
         HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, except from FAULT
-        HOLD --POSITION, EFFORT--> STARTING --good for start_time--> POSITION, EFFORT
-        STARTING --refused, expired, bad measurement, period too long--> HOLD
-        POSITION, EFFORT --HOLD--> HOLD; --expired, bad measurement, period too long--> HOLD until a resume
+        HOLD --POSITION, EFFORT--> STARTING --accepted for start_time--> POSITION, EFFORT
+        STARTING --refused, expired, invalid measurement, period too long--> HOLD
+        POSITION, EFFORT --HOLD--> HOLD; --expired, invalid measurement, period too long--> HOLD until a resume
         POSITION, EFFORT --the other mode--> STARTING
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
-    **Expiry**: A command expires `expiry` after the measurement that it answers (its `status_utime`). Its time of
-    arrival does not matter. Repeating the answer to one measurement does not extend its expiry. After the expiry the
-    arm holds. See `CommandExpiry`.
+    **Expiry**: A command expires `expiry` after the measurement that it answers (`status_utime` of the command). The
+    time of arrival does not matter. Repeating the answer to one measurement does not extend its expiry. After the
+    expiry, the arm holds. See `CommandExpiry`.
 
     **Measurements** are checked for finite numbers, age and plausibility (`Plausibility`). A measurement that is not
     finite or too old ends the control by commands. While the arm holds, a few such measurements in a row are tolerated.
-    More of them are a fault. A measurement that cannot be compared with an earlier one must not be far beyond a limit.
-    This applies to the first one and to the first one after a gap, OFF or a reset.
+    A longer sequence is a fault. The first measurement, and the first one after a gap, OFF or a reset, is not compared
+    with an earlier one. Its pose must not be far outside the limits.
 
-    **Period**: The guard accepts no POSITION and EFFORT commands if it was not stepped for `longest_period`, or if its
-    median period is above `slow_period`. Its limits would act too late.
+    **Period**: The guard refuses POSITION and EFFORT commands if it was not stepped for `longest_period`, or if its
+    median period is above `slow_period`. Its limits would then act too late.
 
-    **Resume**: The watchdog takes over when a command in force ends for one of these reasons. The guard then refuses
-    POSITION and EFFORT until an operator resumes, in the same way in which a fault is reset. `hold_reason` states the
-    reason. This is not a fault: the arm holds, and OFF is allowed. No resume is needed if the sender commanded HOLD
-    before it stopped sending, or if STARTING ended. `GuardSettings.resume_automatically` disables this requirement. The
-    next sender then passes through STARTING as the first one did.
+    **Resume**: If an expiry, an invalid measurement or a long period ends POSITION or EFFORT, the watchdog takes over.
+    The guard then refuses POSITION and EFFORT until an operator resumes. A resume uses the same command as the reset of
+    a fault. `hold_reason` states the reason. This is not a fault: the arm holds, and OFF is allowed. No resume is
+    needed if the sender commanded HOLD before it stopped sending, or if STARTING ended.
+    `GuardSettings.resume_automatically` disables this requirement. The next sender still passes through STARTING.
 
-    **Refused commands** (`lcmt_dvrk_status.REFUSAL_*` lists the reasons): commands that are not finite, expired on
-    arrival, out of order, duplicated, after a jump of the sender's sequence or clock, or in a mode that is not accepted
-    in this state. They do not act, and they do not extend the expiry of an older command. So a stream of bad commands
-    ends in HOLD.
+    **Refused commands** are not finite, expired on arrival, out of order, duplicated, after a jump of the sender's
+    sequence or clock, or in a mode that is not accepted in this state. `lcmt_dvrk_status.REFUSAL_*` lists the reasons.
+    A refused command does not act and does not extend the expiry of an older command. A stream of refused commands
+    therefore ends in HOLD.
 
-    **Ignored messages**: messages that are unreadable, not authentic, or of another arm, size or session. Messages of a
-    second sender are ignored while the first one still sends. They are counted separately and change nothing, so the
-    first sender stays in control. Without a key, a sender is identified by its sender_id only, which any process on the
-    network can copy.
+    **Ignored messages** are unreadable, not authentic, or for another arm, size or session. Messages of a second sender
+    are ignored while the first one still sends. Ignored messages are counted separately and have no effect, so the
+    first sender stays in control. Without a key, only the sender_id identifies a sender. Any process on the network can
+    copy it.
 
-    **OFF** drops an arm without brakes, so it must be in `modes`, and a single message is not sufficient. The arm must
-    hold, and the sender's last command must have been HOLD. The guard refuses OFF during a fault and keeps holding the
-    arm until an operator resets the fault. In an emergency, press the stop button.
+    **OFF** drops an arm without brakes. It must be listed in `modes`, and a single message is not sufficient: the arm
+    must hold, and the sender's last command must have been HOLD. The guard refuses OFF during a fault and holds the arm
+    until an operator resets the fault. In an emergency, press the stop button.
 
-    **Start check**: Commands act only after a stream without a gap of `expiry` and without a refusal for `start_time`.
-    All of them must be close to the present state:
+    **Start check**: Commands act only after `start_time` without a refusal and without a gap of `expiry`. During this
+    time, all commands must be close to the present state:
 
     - Commanded efforts must be near the measured efforts.
     - Commanded positions must be near the measured positions, including the lead of the feedforward velocity.
-    - For efforts, the pose must not be beyond a limit by more than half of the margin. The present effort must be
+    - Before efforts, the pose must not exceed a limit by more than half of the margin. The present effort must be
       inside the limit for commands and near the model's gravity effort.
 
-    A sender that starts with other values is refused, so a controller that was restarted or is in a wrong state does
-    not move the arm.
+    A controller that was restarted or is in a wrong state therefore does not move the arm.
 
-    **Faults** are latched. Causes are:
+    **Faults** are latched. The causes are:
 
     - measurements that are not plausible, not finite or too old,
-    - a pose beyond a limit by more than half of the margin while efforts act,
-    - a joint that does not follow its target or is pushed away from it,
+    - a pose that exceeds a limit by more than half of the margin while efforts act,
+    - a joint that does not follow its target or is pushed away from the target,
     - efforts that oscillate,
     - an arm clock that goes backwards or stands still,
     - an output that is not finite,
@@ -127,13 +127,13 @@ class CommandGuard:
     A reset needs a HOLD command in which the flag changes from false to true. A cause that persists triggers the fault
     again.
 
-    **Bumpless transfer**: HOLD keeps the target of the regulation. After POSITION it does so only while the arm is near
-    the target, otherwise it latches the measured pose. POSITION starts from the held pose, and EFFORT from the measured
+    **Bumpless transfer**: HOLD keeps the target of the regulation. After POSITION, it keeps the target only if the arm
+    is near it. Otherwise it latches the measured pose. POSITION starts from the held pose, and EFFORT from the measured
     effort. If EFFORT starts inside a soft wall, the effort of the wall increases over `start_time`. All transitions are
     limited in rate.
 
-    **Clocks**: The clocks of the sender and of the arm are never compared, only their advance between two commands, so
-    they need not be synchronised. After a jump of the sender's clock, commands are refused until the command in force
+    **Clocks**: The guard compares only the advance of the sender's and of the arm's clock between two commands, so the
+    clocks need not be synchronised. After a jump of the sender's clock, commands are refused until the command in force
     has expired. A forward jump of the arm's clock makes the command in force expire.
     """
 
@@ -155,16 +155,17 @@ class CommandGuard:
                 detects more faults.
             settings: Settings of the guard. None: the defaults of GuardSettings.
             modes: Accepted modes among POSITION, EFFORT and OFF. None: POSITION and EFFORT.
-            wall_clock: Monotonic time of the computer [us], by which commands expire additionally. None: the arm's
-                clock only, as for an arm in a simulated Diagram. Copies of the guard share it.
+            wall_clock: Function that returns the computer's monotonic time [us]. Commands then also expire by this
+                clock. None: only by the arm's clock, as for an arm in a simulated Diagram. Copies of the guard share
+                it.
 
         Raises:
             StationError: The session is 0, a mode is unknown, or the settings or the arm's gains are out of range.
         """
         if unknown := set(modes or ()) - {*_ACTIVE, lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD}:
-            raise StationError(f"modes must be of POSITION, EFFORT and OFF; got {sorted(unknown)}")
+            raise StationError(f"modes must be POSITION, EFFORT or OFF; got {sorted(unknown)}")
         if session_id == 0:
-            raise StationError("session_id must not be 0, which a command has that was never filled in")
+            raise StationError("session_id must not be 0, the value in a command that was not filled in")
         self.settings = settings or GuardSettings()
         self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
@@ -177,11 +178,11 @@ class CommandGuard:
         self.counts = GuardCounts()
         self._modes = tuple(_ACTIVE) if modes is None else modes
         self._expiry = CommandExpiry(round(1e6 * self.settings.expiry), wall_clock)
-        self._stepped = 0
+        self._last_wall_step = 0
         self._stream = CommandStream(
             self._expiry.expiry, round(1e6 * self.settings.clock_tolerance), self.settings.sequence_jump
         )
-        self._force = CommandInForce()
+        self._in_force = CommandInForce()
         self._powered = True
         #: Description of the error of the last measurement. Empty: no error.
         self._problem = ""
@@ -200,7 +201,7 @@ class CommandGuard:
         for name in (
             "counts",
             "_stream",
-            "_force",
+            "_in_force",
             "_follower",
             "_measured",
             "_plausibility",
@@ -208,18 +209,18 @@ class CommandGuard:
             "_oscillation",
         ):
             part = getattr(self, name)
-            twin = object.__new__(type(part))
-            twin.__dict__.update(part.__dict__)
-            setattr(other, name, twin)
+            duplicate = object.__new__(type(part))
+            duplicate.__dict__.update(part.__dict__)
+            setattr(other, name, duplicate)
         return other
 
     @property
     def accepted_modes(self) -> int:
-        """Accepted modes in the present state: bit 1 << mode is set for each of them."""
+        """Bit mask of the modes that are accepted in the present state, with bit 1 << mode for each mode."""
         if self.state == lcmt_dvrk_status.STATE_FAULT:
             return 1 << lcmt_dvrk_command.HOLD
         modes = {lcmt_dvrk_command.HOLD, *self._modes}
-        if self.state == lcmt_dvrk_status.STATE_OFF or self.waits_for:
+        if self.state == lcmt_dvrk_status.STATE_OFF or self.blocked_reason:
             modes -= set(_ACTIVE)
         if self.state not in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
             modes -= {lcmt_dvrk_command.OFF}
@@ -227,37 +228,41 @@ class CommandGuard:
 
     @property
     def sender_id(self) -> int:
-        """Identifier of the sender whose commands are in force or being monitored. 0: none."""
-        return self._stream.sender_id if self._is_watched_or_in_force() else 0
+        """Identifier of the sender whose commands act or are monitored. 0: no sender."""
+        return self._stream.sender_id if self._is_starting_or_in_force() else 0
 
     @property
     def last_sender_id(self) -> int:
-        """Identifier of the sender whose command was accepted last. 0: none."""
+        """Identifier of the sender of the last accepted command. 0: no sender."""
         return self._stream.sender_id
 
     @property
     def last_command(self) -> lcmt_dvrk_command:
         """The last accepted command."""
-        return self._force.command
+        return self._in_force.command
 
     @property
-    def waits_for(self) -> str:
-        """Reason why POSITION and EFFORT are not accepted although there is no fault. Empty: they are accepted.
+    def blocked_reason(self) -> str:
+        """Reason why POSITION and EFFORT are refused although there is no fault. Empty: they are not refused.
 
-        The reason is either `hold_reason`, until an operator resumes, or a period of the guard that is too long.
+        The reason is `hold_reason` until an operator resumes, otherwise a period of the guard that is too long.
         """
         return self.hold_reason or self._period.fault
 
     @property
     def gravity_effort(self) -> Vector:
-        """Gravity effort (n,) of the model at the last good measurement [N m, N]."""
+        """Gravity effort (n,) of the model at the last valid measurement [N m, N]."""
         return self._plausibility.gravity
 
     def receive(self, command: lcmt_dvrk_command | None, utime: int) -> int:
-        """Receives one command that arrived at `utime` [us]. None stands for an unreadable message.
+        """Checks one command and stores it if it is accepted.
+
+        Args:
+            command: Received command. None: the message was unreadable.
+            utime: Time of arrival on the arm's clock [us].
 
         Returns:
-            lcmt_dvrk_status.REFUSAL_NONE, or the reason of the refusal.
+            Reason of the refusal, lcmt_dvrk_status.REFUSAL_*. REFUSAL_NONE if the command is accepted.
         """
         self._expire(utime)
         code = foreign_refusal(command, self.arm_name, self.num_joints, self.session_id)
@@ -272,11 +277,11 @@ class CommandGuard:
         self.counts.refused += 1
         self.refusal_code = code
         if code not in OUT_OF_STREAM and self.state == lcmt_dvrk_status.STATE_STARTING:
-            self._take_over(f"a command was refused while its mode began: {describe_refusal(code)}")
+            self._take_over(f"a command was refused during the start check: {describe_refusal(code)}")
         return code
 
     def ignore(self, code: int, count: int = 1) -> None:
-        """Counts messages that were not passed to `receive` because they do not belong to the session.
+        """Counts ignored messages, including messages that were never passed to `receive`.
 
         Args:
             code: Reason why the last one was ignored, lcmt_dvrk_status.REFUSAL_*.
@@ -290,7 +295,7 @@ class CommandGuard:
 
         Args:
             utime: Present time of the arm's clock [us].
-            measured_utime: Time of the measurement of q, v and effort on the arm's clock [us]. Too old is a fault.
+            measured_utime: Time of the measurement of q, v and effort on the arm's clock [us].
             q: Measured positions (n,) [rad, m].
             v: Velocities (n,) [rad/s, m/s].
             effort: Applied motor efforts (n,) [N m, N].
@@ -307,10 +312,10 @@ class CommandGuard:
         self._measure(measured_utime, q, v, effort)
         self._expire(utime)
         self._watch_period(dt)
-        if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.beyond(self._q())):
+        if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.position_limit_fault(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
-        if self.state in _REGULATED and (away := self._follower.astray(self._q())):
-            self.report_fault(away, lcmt_dvrk_status.FAULT_FOLLOWING)
+        if self.state in _REGULATED and (deviation := self._follower.following_fault(self._q())):
+            self.report_fault(deviation, lcmt_dvrk_status.FAULT_FOLLOWING)
         self.output = self._output(min(max(dt, 0.0), _MAX_STEP))
         if not self.output.is_finite():
             self.report_fault("the guard's output is not finite", lcmt_dvrk_status.FAULT_NOT_FINITE)
@@ -331,8 +336,8 @@ class CommandGuard:
         Args:
             text: Description of the fault with its numbers. The first description is kept until the reset.
             code: lcmt_dvrk_status.FAULT_*.
-            has_power: False if the motors cannot hold the arm. The output is then as in OFF, and a reset holds the arm
-                at its measured pose, not at the earlier one.
+            has_power: False if the motors cannot hold the arm. The output is then as in OFF. A reset then holds the
+                measured pose, not the pose before the fault.
         """
         if self.state != lcmt_dvrk_status.STATE_FAULT:
             powered = self._powered
@@ -342,25 +347,25 @@ class CommandGuard:
         self._powered &= has_power
 
     def _measure(self, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> None:
-        """Checks a measurement and stores it. An error leads to HOLD or FAULT."""
+        """Checks and stores a measurement. An invalid measurement leads to HOLD or FAULT."""
         measured, plausibility = self._measured, self._plausibility
         first = measured.q is None
-        begins = plausibility.begins or measured.time_since(measured_utime) >= _MAX_GAP
-        implausible_pose = self.limits.implausible_pose if begins else None
-        self._problem = problem = measured.take(measured_utime, q, v, effort, implausible_pose)
+        is_first_in_series = plausibility.is_first or measured.time_since(measured_utime) >= _MAX_GAP
+        implausible_pose = self.limits.implausible_pose if is_first_in_series else None
+        self._problem = problem = measured.store(measured_utime, q, v, effort, implausible_pose)
         if problem:
-            if first or measured.bad > self.settings.plausibility.bad_samples:
+            if first or measured.num_invalid > self.settings.plausibility.bad_samples:
                 # Without any measurement there is no pose to hold.
                 self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not first)
                 plausibility.reject_all()
-            elif self._is_watched_or_in_force():
+            elif self._is_starting_or_in_force():
                 self._take_over(problem)
             return
         if first:
-            self._follower.latch(self._q(), np.zeros(self.num_joints))  # the arm is taken to be at rest
+            self._follower.latch(self._q(), np.zeros(self.num_joints))  # the arm is assumed to be at rest
         elif measured.dt == 0:
             return  # repeated measurement
-        if begins:
+        if is_first_in_series:
             plausibility.forget()
         commanded = self._commanded if self.state == lcmt_dvrk_status.STATE_EFFORT else None
         fault = plausibility.check(measured.dt, self._q(), measured.v, measured.effort, commanded)
@@ -372,21 +377,21 @@ class CommandGuard:
     def _watch_period(self, dt: float) -> None:
         if self._expiry.wall is not None:
             now = self._expiry.wall.now()
-            dt, self._stepped = 1e-6 * (now - self._stepped) if self._stepped else 0.0, now
-        if self._period.add(dt) and self._is_watched_or_in_force():
+            dt, self._last_wall_step = 1e-6 * (now - self._last_wall_step) if self._last_wall_step else 0.0, now
+        if self._period.add(dt) and self._is_starting_or_in_force():
             self._take_over(self._period.fault)
 
-    def _is_watched_or_in_force(self) -> bool:
+    def _is_starting_or_in_force(self) -> bool:
         return self.state in (lcmt_dvrk_status.STATE_STARTING, *_ACTIVE.values())
 
     def _q(self) -> Vector:
-        """Returns the measured pose (n,), or the last target without a measurement."""
+        """Returns the measured pose (n,), or the target if there is no measurement yet."""
         return self._follower.target if self._measured.q is None else self._measured.q
 
     def _expire(self, utime: int) -> None:
-        if not self._is_watched_or_in_force():
+        if not self._is_starting_or_in_force():
             return
-        if reason := self._expiry.fault(utime - self._force.status_utime, self._force.wall_utime):
+        if reason := self._expiry.fault(utime - self._in_force.status_utime, self._in_force.wall_utime):
             self.counts.expired += self.state != lcmt_dvrk_status.STATE_STARTING
             self._take_over(reason)
 
@@ -394,7 +399,7 @@ class CommandGuard:
         """Changes to HOLD. A resume is needed if commands acted. Has no effect in OFF and in FAULT.
 
         Args:
-            reason: Description of the reason. The first one is kept until the resume.
+            reason: Description of the reason. The first description is kept until the resume.
         """
         if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
             return
@@ -404,7 +409,7 @@ class CommandGuard:
             self.hold_reason = self.hold_reason or reason
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
-        """Returns REFUSAL_* of a command of this session, from the earlier commands and the present state."""
+        """Returns REFUSAL_* for a command of this session, given the earlier commands and the present state."""
         if self._stream.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
         if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry.expiry:
@@ -424,7 +429,7 @@ class CommandGuard:
             return lcmt_dvrk_status.REFUSAL_NONE
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
-        if command.control_mode == lcmt_dvrk_command.HOLD and self._measured.bad and not self._powered:
+        if command.control_mode == lcmt_dvrk_command.HOLD and self._measured.num_invalid and not self._powered:
             return lcmt_dvrk_status.REFUSAL_STALE  # the pose to hold is unknown
         if command.control_mode in _ACTIVE:
             return self.limits.refusal_to_start(command, self._q(), self._measured.effort, self._plausibility.gravity)
@@ -434,10 +439,10 @@ class CommandGuard:
         self.counts.accepted += 1
         resets = self._stream.accept(command, utime)
         self.counts.lost = self._stream.lost
-        mode, force = command.control_mode, self._force
-        goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
-        force.take(command)
-        force.wall_utime = self._expiry.wall_time(command.status_utime, utime - command.status_utime)
+        mode, in_force = command.control_mode, self._in_force
+        continues = self.state == lcmt_dvrk_status.STATE_STARTING and mode == in_force.command.control_mode
+        in_force.replace(command)
+        in_force.wall_utime = self._expiry.wall_time(command.status_utime, utime - command.status_utime)
         self._acted &= mode in _ACTIVE
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
@@ -456,10 +461,10 @@ class CommandGuard:
                 self._hold()
         elif self.state == _ACTIVE[mode]:
             return
-        elif not goes_on:
+        elif not continues:
             self._hold()
-            self.state, force.good_since = lcmt_dvrk_status.STATE_STARTING, utime
-        elif utime - force.good_since >= 1e6 * self.settings.start_time:
+            self.state, in_force.accepted_since = lcmt_dvrk_status.STATE_STARTING, utime
+        elif utime - in_force.accepted_since >= 1e6 * self.settings.start_time:
             self._act(mode)
 
     def _act(self, mode: int) -> None:
@@ -471,7 +476,7 @@ class CommandGuard:
             self._follower.begin_effort(self._measured.effort, self._q())
 
     def _hold(self) -> None:
-        """Changes to HOLD at the pose that is already held, otherwise at the measured pose."""
+        """Changes to HOLD. Keeps the target if the arm is regulated to it, otherwise latches the measured pose."""
         q = self._q()
         regulated = (
             self.state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_FAULT)
@@ -482,18 +487,18 @@ class CommandGuard:
         self.state, self._powered = lcmt_dvrk_status.STATE_HOLD, True
 
     def _output(self, dt: float) -> GuardOutput:
-        follower, force = self._follower, self._force
+        follower, in_force = self._follower, self._in_force
         q = self._q()
         if not self._powered:
             return follower.off(q)
         if self.state == lcmt_dvrk_status.STATE_FAULT and self._plausibility.invalid.any():
             valid = ~self._plausibility.invalid
             gravity = self._plausibility.model.gravity_effort(np.where(valid, q, self._plausibility.last_valid))
-            v = np.zeros(self.num_joints) if self._measured.bad else self._measured.v
+            v = np.zeros(self.num_joints) if self._measured.num_invalid else self._measured.v
             return follower.hold_valid_joints(q, v, valid, gravity)
         if self.state == lcmt_dvrk_status.STATE_POSITION:
-            return follower.follow_position(force.position, force.velocity, dt)
+            return follower.follow_position(in_force.position, in_force.velocity, dt)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and self._measured.utime is not None:
-            share = 1e-6 * (self._measured.utime - force.good_since) / self.settings.start_time - 1.0
-            return follower.follow_effort(force.effort, q, self._measured.v, dt, min(max(share, 0.0), 1.0))
+            share = 1e-6 * (self._measured.utime - in_force.accepted_since) / self.settings.start_time - 1.0
+            return follower.follow_effort(in_force.effort, q, self._measured.v, dt, min(max(share, 0.0), 1.0))
         return follower.hold(dt)

@@ -12,7 +12,7 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: Largest number of commands kept between two steps, for the sender in control and for all others [each].
+#: Largest number of commands kept between two steps: for the sender in control, and for all other senders together.
 _CAPACITY = 16
 #: Offsets of sequence, sender_id and session_id in an encoded command, and the start of arm_name [bytes].
 _SEQUENCE, _SENDER, _SESSION, _NAME = slice(16, 24), slice(24, 32), slice(32, 40), 48
@@ -27,20 +27,22 @@ def _sequence(data: bytes) -> int:
 class CommandInbox:
     """Buffer for encoded commands that arrived since the last step of the guard.
 
-    `put` examines only the bytes: length, type, arm, session and, with a key, the authentication code. Messages that
-    fail are counted and dropped within a few microseconds. A bounded number of the others is kept. The sender in
-    control has its own part of the buffer, so a flood of other senders does not displace its commands. Its commands
-    with the latest sequence are kept, so a flood of copies of earlier commands does not displace them either. `deliver`
-    decodes the kept messages and passes them to the guard.
+    `put` examines only the bytes: length, type, arm, session and, with a key, the authentication code. A message that
+    fails this check is counted and dropped. A bounded number of the remaining messages is kept. `deliver` decodes the
+    kept messages and passes them to the guard.
+
+    The sender in control has a separate part of the buffer, so a flood from other senders does not displace its
+    commands. That part keeps the commands with the latest sequence, so a flood of copies of earlier commands does not
+    displace them either.
     """
 
     def __init__(self, guard: CommandGuard, key: MessageKey | None = None, capacity: int = _CAPACITY) -> None:
         """Creates an empty inbox for one guard.
 
         Args:
-            guard: Guard whose arm and session the commands must address. Copies of it are accepted by `deliver`.
-            key: Key that must have signed the commands. None: codes are not verified.
-            capacity: Largest number of commands kept of the sender in control, and of all others together.
+            guard: Guard whose arm and session the commands must address. `deliver` also accepts copies of this guard.
+            key: Key that must have signed the commands. None: authentication codes are not verified.
+            capacity: Largest number of kept commands of the sender in control, and of all other senders together.
         """
         name = guard.arm_name.encode() + b"\0"
         self._fingerprint = lcmt_dvrk_command()._get_packed_fingerprint()
@@ -56,7 +58,7 @@ class CommandInbox:
         self._ignored, self._code = 0, lcmt_dvrk_status.REFUSAL_NONE
 
     def put(self, data: bytes) -> None:
-        """Stores a message of the command channel as received."""
+        """Stores the bytes of a message of the command channel."""
         code = self._refusal(data)
         if code == lcmt_dvrk_status.REFUSAL_NONE:
             messages = self._own if data[_SENDER] == self._sender else self._others
@@ -72,11 +74,11 @@ class CommandInbox:
         self._code = code
 
     def deliver(self, guard: CommandGuard, utime: int) -> None:
-        """Passes kept messages to the guard, with arrival at `utime` [us], and adds dropped ones to its counts."""
+        """Passes the kept messages to the guard, with arrival time `utime` [us], and counts the dropped messages."""
         if self._ignored:
             guard.ignore(self._code, self._ignored)
             self._ignored = 0
-        # Commands of the sender in control come first, in their order. The order between senders does not matter.
+        # Commands of the sender in control come first. The order between senders does not matter.
         for messages in (self._own, self._others):
             for data in messages:
                 guard.receive(decode(lcmt_dvrk_command, data), utime)
@@ -84,7 +86,7 @@ class CommandInbox:
         self._sender = struct.pack(">q", guard.last_sender_id)
 
     def _refusal(self, data: bytes) -> int:
-        """Returns lcmt_dvrk_status.REFUSAL_* from the bytes of a message."""
+        """Returns lcmt_dvrk_status.REFUSAL_* for the bytes of a message."""
         if data[:8] != self._fingerprint:
             return _UNREADABLE
         if data[_SESSION] != self._session:

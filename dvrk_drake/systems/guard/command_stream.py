@@ -1,4 +1,4 @@
-"""Checks of a command that do not depend on the state of the arm: its content and its position in the stream."""
+"""Checks of a command that do not depend on the state of the arm: content, and continuity of the sender's stream."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ FOREIGN = frozenset(
     }
 )
 
-#: Refusals of commands that do not continue their sender's stream, such as copies and replays. They do not interrupt
-#: it.
+#: Refusals of commands that do not continue the sender's stream, such as copies and replays. They do not interrupt the
+#: stream.
 OUT_OF_STREAM = frozenset(
     {
         lcmt_dvrk_status.REFUSAL_STALE,
@@ -39,19 +39,22 @@ OUT_OF_STREAM = frozenset(
 def is_finite(numbers: list[float]) -> bool:
     """Returns whether all numbers are finite and the sum of their magnitudes is below 1e6.
 
-    The argument is a list, because numpy takes longer for a few numbers and warns of an overflow.
+    The argument is a list, because numpy is slower for a few numbers and warns of an overflow.
     """
     return sum(map(abs, numbers)) < IMPLAUSIBLE
 
 
 def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints: int, session_id: int) -> int:
-    """Returns lcmt_dvrk_status.REFUSAL_* of a command that does not address this arm and session, else REFUSAL_NONE.
+    """Checks that a command addresses this arm and session.
 
     Args:
-        command: Received command. None: it was not readable.
-        arm_name: Name of the arm that it must address.
-        num_joints: Number of joints of that arm.
-        session_id: Session of that arm.
+        command: Received command. None: the message was unreadable.
+        arm_name: Name of the arm.
+        num_joints: Number of joints of the arm.
+        session_id: Session of the arm.
+
+    Returns:
+        Reason of the refusal, lcmt_dvrk_status.REFUSAL_*, or REFUSAL_NONE.
     """
     if command is None:
         return lcmt_dvrk_status.REFUSAL_UNREADABLE
@@ -68,7 +71,7 @@ def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints
 
 
 def content_refusal(command: lcmt_dvrk_command) -> int:
-    """Returns lcmt_dvrk_status.REFUSAL_* of a command with invalid numbers or flags, else REFUSAL_NONE."""
+    """Returns lcmt_dvrk_status.REFUSAL_* for a command with invalid numbers or flags, otherwise REFUSAL_NONE."""
     if not is_finite([*command.position, *command.velocity, *command.effort]):
         return lcmt_dvrk_status.REFUSAL_NOT_FINITE
     if command.reset_fault and command.control_mode != lcmt_dvrk_command.HOLD:
@@ -78,7 +81,15 @@ def content_refusal(command: lcmt_dvrk_command) -> int:
 
 @dataclass
 class GuardCounts:
-    """Counts of commands since the guard was created: accepted, missing, refused, ignored, and expired in force."""
+    """Counts of commands since the guard was created.
+
+    Attributes:
+        accepted: Number of accepted commands.
+        lost: Number of commands that are missing in the sequence of accepted commands.
+        refused: Number of refused commands.
+        ignored: Number of ignored messages.
+        expired: Number of commands in force that expired.
+    """
 
     accepted: int = 0
     lost: int = 0
@@ -89,16 +100,18 @@ class GuardCounts:
 
 @dataclass
 class CommandInForce:
-    """Command in force or being monitored.
+    """Command that is in force or is monitored during the start check.
 
     The numbers are copied, so that later changes of the message have no effect.
 
     Attributes:
-        command: The command.
-        position: Commanded positions (n,); the other numbers accordingly.
-        status_utime: Time of the measurement that it answers [us].
-        wall_utime: Time of that measurement on the guard's wall clock, if there is one [us].
-        good_since: Time since which its stream has been good [us].
+        command: Message of the command.
+        position: Commanded positions (n,) [rad, m].
+        velocity: Commanded velocities (n,) [rad/s, m/s].
+        effort: Commanded efforts (n,) [N m, N].
+        status_utime: Time of the measurement that the command answers [us].
+        wall_utime: Wall-clock time of that measurement [us]; 0 without a wall clock.
+        accepted_since: Time at which the start check of this stream began [us].
     """
 
     command: lcmt_dvrk_command = field(default_factory=lcmt_dvrk_command)
@@ -107,10 +120,10 @@ class CommandInForce:
     effort: Vector = field(default_factory=lambda: np.zeros(0))
     status_utime: int = 0
     wall_utime: int = 0
-    good_since: int = 0
+    accepted_since: int = 0
 
-    def take(self, command: lcmt_dvrk_command) -> None:
-        """Replaces the command by the next one of the same stream."""
+    def replace(self, command: lcmt_dvrk_command) -> None:
+        """Replaces the command by the next command of the same stream."""
         self.command, self.status_utime = command, command.status_utime
         self.position, self.velocity, self.effort = (
             np.array(numbers, float) for numbers in (command.position, command.velocity, command.effort)
@@ -119,24 +132,25 @@ class CommandInForce:
 
 @dataclass
 class CommandStream:
-    """Stream of the commands of one sender. All times are in us; arrivals are on the arm's clock.
+    """Stream of the commands of one sender. All times are in us. Times of arrival are on the arm's clock.
 
-    A sender stays in control while its commands are accepted. A second sender is refused until no command of the first
-    one has been accepted for `expiry`. A refused command does not extend the control. Otherwise a process that repeats
-    one command could prevent an operator from resuming.
+    A sender is in control while its commands are accepted. A second sender is refused until no command of the first
+    sender has been accepted for `expiry`. A refused command does not extend the control of its sender. Otherwise, a
+    process that repeats one command could prevent an operator from resuming.
 
-    Sequence and time of a command are compared with those of the last accepted command, unless that is older than
-    `expiry`. A refused command changes neither. So a spoofed sequence or time does not end the control of the genuine
-    sender. A sender whose own clock or sequence jumped restarts when its last accepted command has expired.
+    Sequence and time of a command are compared with those of the last accepted command, unless that command is older
+    than `expiry`. A refused command does not change this reference. A spoofed sequence or time therefore does not end
+    the control of the authentic sender. After a jump of its clock or sequence, a sender is accepted again when its last
+    accepted command has expired.
 
     Attributes:
-        expiry: Time after which another sender may replace a silent one. After the same time, sequence and time of the
-            last accepted command are no longer compared.
-        clock_tolerance: Allowed difference of the advance of the sender's and the arm's clock between two accepted
-            commands.
+        expiry: Time without an accepted command after which another sender is accepted, and after which sequence and
+            time of the last accepted command are no longer compared.
+        clock_tolerance: Allowed difference between the advances of the sender's and the arm's clock, from one accepted
+            command to the next.
         sequence_jump: Largest difference in sequence between two accepted commands.
-        sender_id: Identifier of the sender. 0: none yet.
-        lost: Number of commands missing between accepted ones.
+        sender_id: Identifier of the sender. 0: no sender yet.
+        lost: Number of commands missing in the sequence of accepted commands.
     """
 
     expiry: int
@@ -150,21 +164,21 @@ class CommandStream:
     _can_turn_off: bool = False
 
     def is_other_sender(self, command: lcmt_dvrk_command, utime: int) -> bool:
-        """Returns whether the command comes from another sender than the one in control."""
+        """Returns whether the command comes from another sender while a sender is in control."""
         return command.sender_id != self.sender_id != 0 and utime - self._arrival <= self.expiry
 
     def refusal(self, command: lcmt_dvrk_command, utime: int) -> int:
-        """Returns REFUSAL_* of a command that does not continue its sender's stream, or REFUSAL_NONE."""
+        """Returns REFUSAL_* for a command that does not continue the sender's stream, otherwise REFUSAL_NONE."""
         if self.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-        # The sender is the one in control; its last accepted command must be recent.
+        # The command comes from the sender in control. It is compared with the last accepted command if that is recent.
         if self._last is not None and utime - self._arrival <= self.expiry:
             step = command.sequence - self._last.sequence
             if step <= 0:
                 return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
             if step > self.sequence_jump:
                 return lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP
-            if self._jumped(command.utime - self._last.utime, utime - self._arrival):
+            if self._is_clock_jump(command.utime - self._last.utime, utime - self._arrival):
                 return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
         same_sender = command.sender_id == self.sender_id
         if command.control_mode == lcmt_dvrk_command.OFF and not (same_sender and self._can_turn_off):
@@ -172,7 +186,7 @@ class CommandStream:
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
-        """Accepts this command. Returns True if it requests a reset: reset_fault changed from false to true."""
+        """Accepts a command. Returns True if it requests a reset, i.e. if reset_fault changed from false to true."""
         if command.sender_id != self.sender_id:
             self.forget()
             self.sender_id = command.sender_id
@@ -185,9 +199,9 @@ class CommandStream:
         return resets
 
     def forget(self) -> None:
-        """Discards the sender and its last command, for an arm clock that is not reliable."""
+        """Discards the sender and its last command. Called when the arm's clock went back, or for a new sender."""
         self.sender_id, self._last = 0, None
         self._can_reset = self._can_turn_off = False
 
-    def _jumped(self, advance: int, waited: int) -> bool:
-        return advance <= 0 or abs(advance - waited) > self.clock_tolerance
+    def _is_clock_jump(self, advance: int, elapsed: int) -> bool:
+        return advance <= 0 or abs(advance - elapsed) > self.clock_tolerance

@@ -1,4 +1,4 @@
-"""Computes an arm's output in each period from the commands that its guard accepted."""
+"""Computes the output of the guard in each period from the accepted commands."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class GuardOutput:
     """Output of the guard until the next step, for n joints in the arm's order. Always finite and inside the limits.
 
     Attributes:
-        control_mode: lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
-        position: Target (n,) of the regulation in HOLD and POSITION; otherwise the measured pose [rad, m].
-        velocity: Feedforward velocity (n,) in POSITION; otherwise zero [rad/s, m/s].
-        effort: Motor effort (n,) in EFFORT; otherwise zero [N m, N].
-        joint_flags: lcmt_dvrk_status.FLAG_* (n,) of the limits that acted.
+        control_mode: Mode lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
+        position: Target (n,) [rad, m] of the regulation in HOLD and POSITION; otherwise the measured pose.
+        velocity: Feedforward velocity (n,) [rad/s, m/s] in POSITION; otherwise zero.
+        effort: Motor effort (n,) [N m, N] in EFFORT; otherwise zero.
+        joint_flags: Flags lcmt_dvrk_status.FLAG_* (n,) of the limits that acted on each joint.
     """
 
     control_mode: int
@@ -38,36 +38,37 @@ class Follower:
     """Follows commands inside the limits. Each mode starts from the present state of the arm. All arrays are (n,).
 
     Attributes:
-        target: Target of the regulation in HOLD and POSITION [rad, m].
+        target: Target (n,) [rad, m] of the regulation in HOLD and POSITION.
     """
 
     def __init__(self, limits: GuardLimits) -> None:
-        """Creates a follower at rest. No array is changed in place, so copies may share them."""
+        """Creates a follower at rest. No array is changed in place, so copies of the follower may share arrays."""
         self._limits, self._zero = limits, np.zeros(len(limits.effort_limits))
-        self.target = self._laggard = self._effort = self._kick = self._zero
+        self.target = self._filtered_target = self._effort = self._start_wall_effort = self._zero
 
     def off(self, q: Vector) -> GuardOutput:
-        """Returns the output without power, at the measured q."""
+        """Returns the output without motor power, at the measured pose q."""
         return self._output(lcmt_dvrk_command.OFF, q)
 
     def latch(self, q: Vector, v: Vector) -> None:
-        """Makes the measured q the target. The following error allows for the braking distance of an arm at speed v."""
+        """Uses the measured pose q as the target. The allowed following error includes the braking distance from v."""
         self.target = q.copy()
         speed = self._limits.speed
-        self._laggard = q + self._limits.following_time * clip(v, -speed, speed)
+        self._filtered_target = q + self._limits.following_time * clip(v, -speed, speed)
 
     def hold(self, dt: float) -> GuardOutput:
-        """Returns the output that holds the target, `dt` seconds after the last one."""
-        self._follow_late(dt)
+        """Returns the output that holds the target, `dt` seconds after the previous output."""
+        self._filter_target(dt)
         return self._output(lcmt_dvrk_command.HOLD, self.target)
 
     def hold_valid_joints(self, q: Vector, v: Vector, valid: Mask, gravity: Vector) -> GuardOutput:
-        """Returns efforts that hold the joints with a valid position. The others get their gravity effort.
+        """Returns efforts that hold the joints with a valid position. Other joints get only their gravity effort.
 
         Args:
-            q, v: Measured positions and velocities (n,) [rad, m, rad/s, m/s].
-            valid: Mask (n,) of joints with a valid position. The others get no feedback.
-            gravity: Gravity effort (n,) of the pose, with the last valid positions of the other joints [N m, N].
+            q: Measured positions (n,) [rad, m].
+            v: Measured velocities (n,) [rad/s, m/s].
+            valid: Mask (n,) of joints with a valid position.
+            gravity: Gravity effort (n,) [N m, N] at q, where invalid positions are replaced by the last valid ones.
         """
         limits = self._limits
         largest, least = limits.fault_effort, limits.fault_effort / 3
@@ -79,52 +80,70 @@ class Follower:
         return self._output(lcmt_dvrk_command.EFFORT, q, effort=effort, flags=flags)
 
     def is_near(self, q: Vector) -> bool:
-        """Returns whether q is as near to the target as the first position commands must be to the start pose."""
+        """Returns whether q is near the target. The tolerance is that of the start check for position commands."""
         return bool(np.all(np.abs(self.target - q) <= self._limits.start_position))
 
     def begin_position(self) -> None:
-        """Starts following position commands. The target starts from its present value."""
-        self._laggard = self.target
+        """Starts following position commands from the present target."""
+        self._filtered_target = self.target
 
     def follow_position(self, position: Vector, velocity: Vector, dt: float) -> GuardOutput:
-        """Returns the output `dt` seconds on, towards a position with a feedforward velocity [rad, m, rad/s, m/s]."""
+        """Returns the output for a position command, `dt` seconds after the previous output.
+
+        Args:
+            position: Commanded position (n,) [rad, m].
+            velocity: Commanded feedforward velocity (n,) [rad/s, m/s].
+            dt: Time since the previous output [s].
+        """
         self.target, flags = self._limits.limit_position(position, self.target, dt)
-        self._follow_late(dt)
+        self._filter_target(dt)
         velocity = self._limits.limit_velocity(velocity, self.target, flags)
         return self._output(lcmt_dvrk_command.POSITION, self.target, velocity=velocity, flags=flags)
 
-    def _follow_late(self, dt: float) -> None:
-        self._laggard = self._laggard + min(dt / self._limits.following_time, 1.0) * (self.target - self._laggard)
+    def _filter_target(self, dt: float) -> None:
+        self._filtered_target = self._filtered_target + min(dt / self._limits.following_time, 1.0) * (
+            self.target - self._filtered_target
+        )
 
-    def astray(self, q: Vector) -> str:
-        """Describes the joint that is furthest from its target, if this is further than allowed. Empty: none.
+    def following_fault(self, q: Vector) -> str:
+        """Describes the joint with the largest following error, or returns "" if no error exceeds the allowed one.
 
-        A position controller without feedforward lags by Kd/Kp. The arm may therefore be anywhere between the target
-        and the target filtered to first order with the time constant `following_time`, plus the allowed error.
+        A position controller without feedforward lags by Kd/Kp. Any position between the target and the target after a
+        first-order low-pass filter with time constant `following_time` is therefore accepted. The allowed error is
+        added on both sides.
         """
-        ahead = q - np.maximum(self.target, self._laggard)
-        behind = np.minimum(self.target, self._laggard) - q
+        ahead = q - np.maximum(self.target, self._filtered_target)
+        behind = np.minimum(self.target, self._filtered_target) - q
         share = np.maximum(ahead, behind) / self._limits.following_error
         j = int(np.argmax(share))
         if not share[j] > 1.0:
             return ""
+        name, unit = self._limits.names[j], self._limits.unit(j)
         return (
-            f"{self._limits.names[j]} = {q[j]:.4g} does not follow {self.target[j]:.4g}; "
-            f"{self._limits.following_error[j]:.3g} away is allowed"
+            f"{name} is at {q[j]:.4g} {unit} and does not follow its target {self.target[j]:.4g} {unit} "
+            f"(allowed difference {self._limits.following_error[j]:.3g} {unit})"
         )
 
     def begin_effort(self, effort: Vector, q: Vector) -> None:
-        """Starts following effort commands, from the measured effort at the pose q [N m, N, rad, m]."""
+        """Starts following effort commands from the measured `effort` (n,) [N m, N] at the pose q (n,) [rad, m]."""
         limit = self._limits.command_limits
         self._effort = clip(effort, -limit, limit)
-        # Initial effort of the walls on an arm at rest. `follow_effort` subtracts a decreasing share of it.
-        self._kick = self._limits.wall_effort(q, self._zero)[0]
+        # Effort of the walls at the start, for an arm at rest. `follow_effort` subtracts a decreasing share of it.
+        self._start_wall_effort = self._limits.wall_effort(q, self._zero)[0]
 
-    def follow_effort(self, effort: Vector, q: Vector, v: Vector, dt: float, begun: float) -> GuardOutput:
-        """Returns the output `dt` seconds on, towards an effort at q, v. `begun` is the elapsed share of the start."""
+    def follow_effort(self, effort: Vector, q: Vector, v: Vector, dt: float, start_share: float) -> GuardOutput:
+        """Returns the output for an effort command, `dt` seconds after the previous output.
+
+        Args:
+            effort: Commanded effort (n,) [N m, N].
+            q: Measured positions (n,) [rad, m].
+            v: Measured velocities (n,) [rad/s, m/s].
+            dt: Time since the previous output [s].
+            start_share: Elapsed share (0..1) of the time in which the effort of the walls increases.
+        """
         self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
-        left_out = None if begun == 1.0 else (1.0 - begun) * self._kick
-        applied, walls = self._limits.restrain_effort(self._effort, q, v, left_out)
+        withheld = None if start_share == 1.0 else (1.0 - start_share) * self._start_wall_effort
+        applied, walls = self._limits.restrain_effort(self._effort, q, v, withheld)
         return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, flags=flags | walls)
 
     def _output(
@@ -136,7 +155,7 @@ class Follower:
         effort: Vector | None = None,
         flags: Flags | None = None,
     ) -> GuardOutput:
-        """Returns an output with arrays of its own, which the caller may change."""
+        """Returns an output with separate arrays, which the caller may change."""
         return GuardOutput(
             mode,
             position.copy(),

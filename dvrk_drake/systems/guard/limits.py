@@ -18,6 +18,7 @@ Vector = NDArray[np.float64]
 Flags = NDArray[np.int8]
 Mask = NDArray[np.bool_]
 
+#: Tolerance of the check of coupled limits for rounding errors [rad, m].
 _ROUNDING = 1e-12
 
 _CLAMPED, _RATE_LIMITED = np.int8(lcmt_dvrk_status.FLAG_EFFORT_CLAMPED), np.int8(lcmt_dvrk_status.FLAG_RATE_LIMITED)
@@ -27,44 +28,46 @@ _WALL_GAIN = 4.0
 
 
 def clip(x: Vector, lower: ArrayLike, upper: ArrayLike) -> Vector:
-    """Returns x (n,) limited to lower and upper. np.clip takes several times as long for small arrays."""
+    """Returns x (n,) limited to the range from lower to upper. Faster than np.clip for small arrays."""
     return np.minimum(np.maximum(x, lower), upper)
 
 
 def is_any(mask: Mask) -> bool:
-    """Returns whether any element of the mask (n,) is true. mask.any() takes several times as long for small arrays."""
+    """Returns whether any element of the mask (n,) is true. Faster than mask.any() for small arrays."""
     return True in mask.tolist()
 
 
 class GuardLimits:
-    """Limits of one arm with n joints, in its order of joints.
+    """Limits of one arm with n joints, in the arm's order of joints.
 
-    **Effort commands** are limited by a soft wall before each position limit lower <= A q <= upper. This applies to the
-    joint ranges and to the coupled limits. The wall is a spring and damper along the coordinate of the limit,
-    c = A_k q:
+    **Effort commands.** A soft wall acts before each position limit lower <= A q <= upper, i.e. before the limits of
+    the joints and the coupled limits. The wall is a spring and damper along the coordinate of the limit, c = A_k q:
 
-        lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda,
+        lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda
 
-    F_k is the effort that exceeds the sum of all motors that can push along c. depth is the position of c + T_k dc/dt
-    in the wall: 0 at its beginning, 1 at the limit. T_k is the ratio Kd/Kp of the joint's position controller, so the
-    wall acts earlier on a joint that approaches fast. The wall is as wide as the margin. It is wider where its gains
-    would exceed four times those of the joint's position controller, because larger gains chatter with a delay of one
-    period. At half of the width, no outward effort remains. At the limit, the full motor effort is directed inward.
+    - F_k is the largest ratio of effort limit to |A_kj| among the joints j of the limit. At a depth of 1/2, the wall
+      therefore cancels the full motor effort of each of these joints.
+    - depth is the position of c + T_k dc/dt in the wall: 0 where the wall begins, 1 at the limit.
+    - T_k is the ratio Kd/Kp of the joint's position controller. The wall therefore acts earlier on a fast joint.
 
-    The wall only pushes the arm back and never pulls it. It also acts without commanded efforts, e.g. on a falling arm.
-    Joints above their speed limit are braked. Above 1.25 times the limit, no effort accelerates them further. Commands
-    are clamped and limited in rate before the wall acts. The effort of the wall is not delayed.
+    At the limit, the full motor effort is directed inward. The wall is as wide as the margin, or wider if its gains
+    would otherwise exceed four times those of the position controller. Larger gains cause chatter with a delay of one
+    period.
+
+    The wall only pushes inward. It also acts without commanded efforts, e.g. on a falling arm. Joints above their speed
+    limit are braked. Above 1.25 times the speed limit, no effort accelerates them further. Commands are clamped and
+    limited in rate before the wall acts. The effort of the wall is not limited in rate.
 
     **Position commands** move a target that is limited in rate and stays inside the limits. A target that starts
-    outside moves no further outward. With a feedforward velocity v, a position controller settles Kd/Kp v beyond a
-    constant target. The velocity is therefore limited until that point is inside the limits as well.
+    outside moves no further outward. With a feedforward velocity v, a position controller settles at a distance
+    Kd/Kp v beyond a constant target. The velocity is therefore reduced until that point is also inside the limits.
     """
 
     def __init__(self, arm: Arm, settings: GuardSettings) -> None:
         """Creates the limits of `arm`.
 
         Raises:
-            StationError: A number of the arm is not finite or out of range, see `Arm.check`.
+            StationError: A number of the arm is not finite or out of range; see `Arm.check`.
         """
         n = arm.num_joints
         try:
@@ -99,19 +102,22 @@ class GuardLimits:
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
-    def beyond(self, q: Vector) -> str:
-        """Describes the position limit that q (n,) exceeds most, by more than half of its margin. Empty: none."""
+    def position_limit_fault(self, q: Vector) -> str:
+        """Describes the limit that q (n,) exceeds most, or returns "" if the excess is at most half of the margin."""
         c = self.A.dot(q)
         excess = np.abs(c - self._middle) - self._allowed
         k = int(excess.argmax())
         if not excess[k] > 0:
             return ""
-        return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
+        return (
+            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, outside its limits "
+            f"{self.lower[k]:.4g}..{self.upper[k]:.4g} {self.unit(k)}"
+        )
 
     def implausible_pose(self, q: Vector) -> str:
-        """Describes the first position limit that q (n,) exceeds by more than half of its range. Empty: none.
+        """Describes the first limit that q (n,) exceeds by more than half of its range, or returns "" if there is none.
 
-        An arm may rest slightly beyond a limit, because limits depend on calibration. Half of the range is far beyond
+        An arm may rest slightly outside a limit, because limits depend on calibration. Half of the range is far beyond
         any mechanical stop.
         """
         c = self.A @ q
@@ -119,19 +125,30 @@ class GuardLimits:
         if not far.size:
             return ""
         k = int(far[0])
-        unit = "mm" if k < len(self._prismatic) and self._prismatic[k] else "degrees"
+        wrong_unit = "mm" if self.unit(k) == "m" else "degrees"
         return (
-            f"{self.names[k]} = {c[k]:.4g} is far beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}; "
-            f"{unit} or wrong zero?"
+            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, far outside its limits "
+            f"{self.lower[k]:.4g}..{self.upper[k]:.4g} {self.unit(k)}; check its unit ({wrong_unit}?) and its zero"
         )
 
-    def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
-        """Returns REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,).
+    def unit(self, k: int) -> str:
+        """Returns the unit of the coordinate of limit `k`: "m" for a prismatic joint, otherwise "rad"."""
+        return "m" if k < len(self._prismatic) and self._prismatic[k] else "rad"
 
-        `gravity` (n,) is the model's gravity effort at q. The result is REFUSAL_NONE for an accepted command.
+    def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
+        """Checks a command that would begin to act in the present state.
+
+        Args:
+            command: POSITION or EFFORT command.
+            q: Measured positions (n,) [rad, m].
+            effort: Measured efforts (n,) [N m, N].
+            gravity: Gravity effort (n,) of the model at q [N m, N].
+
+        Returns:
+            Reason of the refusal, lcmt_dvrk_status.REFUSAL_START_*, or REFUSAL_NONE.
         """
         if command.control_mode == lcmt_dvrk_command.EFFORT:
-            if self.beyond(q):
+            if self.position_limit_fault(q):
                 return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
             if not np.all(np.abs(effort - gravity) <= self.start_gravity):
                 return lcmt_dvrk_status.REFUSAL_START_GRAVITY
@@ -144,9 +161,15 @@ class GuardLimits:
         return lcmt_dvrk_status.REFUSAL_START_FAR if np.any(far) else lcmt_dvrk_status.REFUSAL_NONE
 
     def follow_effort(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
-        """Returns the effort (n,) that follows `command`, clamped and limited in rate, and the joint flags.
+        """Clamps an effort command and limits its rate.
 
-        All arrays are (n,) [N m, N] and finite. `last` is the effort `dt` seconds before, inside the effort limits.
+        Args:
+            command: Commanded effort (n,) [N m, N], finite.
+            last: Previous effort (n,) [N m, N], inside the effort limits.
+            dt: Time since the previous effort [s].
+
+        Returns:
+            Effort (n,) [N m, N] and joint flags (n,).
         """
         clamped = clip(command, -self.command_limits, self.command_limits)
         step = self._effort_rate * dt
@@ -156,7 +179,7 @@ class GuardLimits:
         return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
 
     def wall_effort(self, q: Vector, v: Vector) -> tuple[Vector, Flags]:
-        """Returns the effort (n,) of the walls at q, v (n,) [N m, N], and the joint flags."""
+        """Returns the effort (n,) [N m, N] of the walls at q, v (n,) and the joint flags (n,)."""
         flags = np.zeros(len(q), np.int8)
         c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
         if not is_any(np.abs(c - self._middle) > self._free):
@@ -168,17 +191,23 @@ class GuardLimits:
         return walls @ self.A, flags
 
     def restrain_effort(
-        self, effort: Vector, q: Vector, v: Vector, left_out: Vector | None = None
+        self, effort: Vector, q: Vector, v: Vector, withheld: Vector | None = None
     ) -> tuple[Vector, Flags]:
-        """Returns `effort` plus the efforts of the walls and of the speed limit at q, v, and the joint flags.
+        """Adds the efforts of the walls and of the speed limit. They are not limited in rate, to avoid a delay.
 
-        All arrays are (n,). The rate of these efforts is not limited: they must not be delayed, and they are continuous
-        in the state. `left_out` (n,) is subtracted from the effort of the walls, at most to zero.
+        Args:
+            effort: Effort (n,) [N m, N] that follows the command.
+            q: Measured positions (n,) [rad, m].
+            v: Measured velocities (n,) [rad/s, m/s].
+            withheld: Effort (n,) [N m, N] that is subtracted from the effort of the walls, at most to zero, or None.
+
+        Returns:
+            Effort (n,) [N m, N] inside the effort limits, and joint flags (n,).
         """
         limit = self.effort_limits
         added, flags = self.wall_effort(q, v)
-        if left_out is not None:
-            added = added - clip(left_out, np.minimum(added, 0.0), np.maximum(added, 0.0))
+        if withheld is not None:
+            added = added - clip(withheld, np.minimum(added, 0.0), np.maximum(added, 0.0))
         too_fast = np.abs(v) > self.speed
         if is_any(too_fast):
             added = added - 4 * limit * np.sign(v) * clip(np.abs(v) / self.speed - 1, 0.0, 0.5)
@@ -186,7 +215,7 @@ class GuardLimits:
         return clip(effort + added, -limit, limit), flags
 
     def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
-        """Returns the target (n,) for `command`, `dt` seconds after the target `last`, and the joint flags."""
+        """Returns the target (n,) for `command` (n,), `dt` seconds after the target `last`, and the joint flags."""
         step = self.speed * dt
         target = clip(command, last - step, last + step)
         flags = np.where(target != command, lcmt_dvrk_status.FLAG_RATE_LIMITED, 0).astype(np.int8)
@@ -194,16 +223,20 @@ class GuardLimits:
         return inside, flags | limited
 
     def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
-        """Returns the feedforward velocity (n,) at `target`: the command if the position is not limited, else 0."""
+        """Returns the limited feedforward velocity (n,) at `target` (n,). It is zero for joints with `flags`."""
         velocity = np.where(flags == 0, clip(command, -self.speed, self.speed), 0.0)
-        wanted = self._look_ahead * velocity
-        ahead, _ = self._inside(target + wanted, target)
-        cut = ahead != target + wanted
-        part = np.divide(ahead - target, wanted, out=np.ones_like(wanted), where=cut & (wanted != 0))
-        return velocity * clip(part, 0, 1)
+        lead = self._look_ahead * velocity
+        ahead, _ = self._inside(target + lead, target)
+        cut = ahead != target + lead
+        share = np.divide(ahead - target, lead, out=np.ones_like(lead), where=cut & (lead != 0))
+        return velocity * clip(share, 0, 1)
 
     def _inside(self, target: Vector, last: Vector) -> tuple[Vector, Flags]:
-        """Returns `target` (n,) limited to the ranges, or no further outside than `last`, and the joint flags."""
+        """Limits `target` (n,) to the position limits. A target outside them may not exceed `last` (n,).
+
+        Returns:
+            Limited target (n,) and joint flags (n,).
+        """
         n = len(last)
         flags = np.zeros(n, np.int8)
         c = self.A @ last
@@ -216,11 +249,11 @@ class GuardLimits:
             allowed = clip(change, lower[k] - c[k], upper[k] - c[k])
             if allowed != change:
                 # All joints of this limit move by the same fraction, so that they stop on it together.
-                part = np.where(row != 0, allowed / change, 1.0)
-                inside = last + part * (inside - last)
+                share = np.where(row != 0, allowed / change, 1.0)
+                inside = last + share * (inside - last)
                 flags[row != 0] |= lcmt_dvrk_status.FLAG_COUPLED_LIMIT
         c = self.A @ inside
         if np.any((c > upper + _ROUNDING) | (c < lower - _ROUNDING)):
-            # Corrections of coupled limits that share joints can cancel each other. The target is then kept.
+            # Corrections for coupled limits that share joints can conflict. The target then does not move.
             return last.copy(), flags
         return inside, flags

@@ -1,4 +1,4 @@
-"""Monitors of the guard itself: period of its steps and oscillation of its efforts."""
+"""Monitors of the guard: period of the steps and oscillation of the efforts."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ if TYPE_CHECKING:
 #: Number of periods for the median.
 _PERIODS = 100
 
-#: Time constant [s] of the subtracted mean effort. Variations slower than about 1 Hz count as motion.
+#: Time constant [s] of the mean effort that is subtracted. Variations slower than about 1 Hz are not oscillations.
 _MEAN_TIME = 0.2
 
 
 class PeriodMonitor:
-    """Monitor of the last 100 periods between two steps of the guard: median and longest.
+    """Monitor of the period between two steps of the guard: the last period, and the median of the last 100.
 
     Attributes:
-        fault: Description of the fault of the last periods. Empty: none.
+        fault: Description of the fault of the last periods, or "".
     """
 
     def __init__(self, settings: GuardSettings) -> None:
         """Creates a monitor without any period."""
         self._slow_period, self._longest_period = settings.slow_period, settings.longest_period
-        # One bit per period, set for a slow one: an int is fast to copy, shift and count.
+        # One bit per period, set for a slow period. An int is fast to copy, shift and count.
         self._slow = 0
         self.fault = ""
 
     def add(self, period: float) -> str:
-        """Adds one period [s] and returns `fault`."""
+        """Adds one period [s]. Returns the description of a fault, or ""."""
         self._slow = (self._slow << 1 | (period > self._slow_period)) & ((1 << _PERIODS) - 1)
         self.fault = ""
         if period > self._longest_period:
             self.fault = (
-                f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are {1e3 * self._longest_period:g}"
+                f"the guard was not stepped for {1e3 * period:.0f} ms; {1e3 * self._longest_period:g} ms are allowed"
             )
         elif self._slow.bit_count() > _PERIODS // 2:
-            self.fault = f"the guard's period has a median above the allowed {1e3 * self._slow_period:g} ms"
+            self.fault = f"the median period of the guard is above the allowed {1e3 * self._slow_period:g} ms"
         return self.fault
 
 
@@ -65,7 +65,11 @@ class OscillationMonitor:
         self._mean = None
 
     def add(self, effort: Vector, dt: float) -> int | None:
-        """Adds an effort (n,) [N m, N] commanded for `dt` [s]. Returns the index of an oscillating joint, or None."""
+        """Adds an effort (n,) [N m, N] that is commanded for `dt` [s].
+
+        Returns:
+            Index of an oscillating joint, or None if no joint oscillates.
+        """
         scaled = self._scale * effort
         if self._mean is None:
             self._mean = scaled

@@ -1,4 +1,4 @@
-"""Plausibility checks of finite, recent measurements that may be wrong: stuck, jumping or inconsistent."""
+"""Plausibility checks of measurements that are finite and recent but may be stuck, jumping or inconsistent."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from dvrk_drake.systems.guard.settings import PlausibilitySettings
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
-#: Period of evaluating the mass matrix [s]. It changes slowly, and its evaluation takes as long as a step of the guard.
+#: Period in which the mass matrix is evaluated [s]. An evaluation takes as long as a step of the guard.
 _MASS_MATRIX_PERIOD = 0.05
 
-#: Time after power on in which an arm that rests on an object may take up its effort without a motion [s].
+#: Time after power on in which the effort of an arm that lies on an object may change without a motion [s].
 _POWER_ON = 0.25
 
-#: Encoder counts by which measured positions may deviate in addition to the tolerances.
+#: Number of encoder counts that is added to the tolerances of positions.
 _COUNTS = 3.0
 
 
@@ -28,24 +28,26 @@ class ArmModel(Protocol):
     """Protocol of the arm model that the guard uses, such as `dvrk_drake.dynamics.identified_model.ControlModel`."""
 
     def gravity_effort(self, q: Vector) -> Vector:
-        """Returns the effort (n,) [N m, N] that compensates gravity at q (n,) [rad, m]."""
+        """Returns the effort (n,) [N m, N] that compensates gravity at the pose q (n,) [rad, m]."""
 
     def mass_matrix(self, q: Vector) -> NDArray[np.float64]:
-        """Returns the mass matrix (n, n) at q (n,)."""
+        """Returns the mass matrix (n, n) at the pose q (n,)."""
 
 
 @dataclass(slots=True)
 class Sample:
-    """One measurement of n joints with related quantities. SI units; prismatic joints in m and N.
+    """Measurement of n joints with derived quantities.
 
     Attributes:
         dt: Time since the previous measurement [s].
-        q, v: Measured positions and velocities (n,).
-        step: Change of position (n,) since the previous measurement.
-        speed: Larger magnitude (n,) of the velocities of both measurements.
-        effort: Measured effort (n,) of the motors.
-        net_effort: Measured effort (n,) minus the model's gravity effort.
-        commanded: Effort (n,) that the guard commanded before, or None while it commands positions.
+        q: Measured positions (n,) [rad, m].
+        v: Measured velocities (n,) [rad/s, m/s].
+        step: Change of position (n,) [rad, m] since the previous measurement.
+        speed: Larger magnitude (n,) [rad/s, m/s] of the velocities of this and the previous measurement.
+        effort: Measured effort (n,) [N m, N] of the motors.
+        net_effort: Measured effort (n,) [N m, N] minus the gravity effort of the model.
+        commanded: Effort (n,) [N m, N] that the guard commanded in the previous step, or None if it commanded no
+            effort.
     """
 
     dt: float
@@ -59,25 +61,25 @@ class Sample:
 
 
 class Check(Protocol):
-    """Protocol of one plausibility check. It has no state of its own, as Drake copies the guard at every update.
+    """Protocol of one plausibility check. The caller keeps the state, because Drake copies the guard at every update.
 
     Attributes:
-        text: Description of the error of a joint that the check finds.
-        about_position: True if the position of such a joint is invalid.
+        text: Description of the error that the check detects.
+        about_position: True if the position of a joint with this error is invalid.
     """
 
     text: str
     about_position: bool
 
     def begin(self, sample: Sample) -> Any:
-        """Returns the state before `sample`, the first sample."""
+        """Returns the initial state, given the first sample."""
 
     def check(self, sample: Sample, state: Any) -> tuple[Any, Mask]:
         """Returns the next state and a mask (n,) of the implausible joints."""
 
 
 class PositionJump:
-    """Check of position steps that no joint can make: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
+    """Check for impossible position steps: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
 
     text, about_position = "the position jumps", True
 
@@ -86,61 +88,61 @@ class PositionJump:
         self._tolerance, self._fastest, self._jitter = tolerance, 1.5 * speed_limit, settings.jitter
 
     def begin(self, sample: Sample) -> None:
-        """Returns None: this check has no state."""
+        """Returns None, because this check has no state."""
 
     def check(self, sample: Sample, state: None) -> tuple[None, Mask]:
         """See `Check.check`."""
-        reach = (sample.dt + self._jitter) * np.minimum(sample.speed, self._fastest)
-        return None, np.abs(sample.step) > self._tolerance + reach
+        allowed = (sample.dt + self._jitter) * np.minimum(sample.speed, self._fastest)
+        return None, np.abs(sample.step) > self._tolerance + allowed
 
 
 class VelocityConsistency:
     """Check that velocities agree with the change of position.
 
-    The difference e of the change of position and the integrated velocity decays with the time constant T,
+    The difference e between the change of position and the integrated velocity decays with the time constant T:
 
-        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + r T + delay s.
+        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + r T + delay s
 
-    s is the largest recent speed, which decays in the same way: a velocity estimate with a delay deviates while the
-    joint accelerates. r is the error of a velocity that is estimated from the time between two encoder counts.
+    - s is the largest recent speed, which decays in the same way. This term accounts for the delay of the velocity
+      estimate while the joint accelerates.
+    - r is the error of a velocity that is estimated from the time between two encoder counts.
     """
 
     text, about_position = "position and velocity disagree", True
 
     def __init__(self, settings: PlausibilitySettings, tolerance: Vector, counts: Vector) -> None:
-        """Creates the check with tolerances and encoder counts of the joints, both (n,) [rad, m]."""
+        """Creates the check with tolerances (n,) and encoder counts (n,) of the joints [rad, m]."""
         self._delay, self._memory = settings.velocity_delay, settings.velocity_memory
         self._tolerance = tolerance + self._memory * settings.velocity_counts * counts
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector]:
-        """Returns the difference e and the speed s, both (n,)."""
+        """Returns the difference e (n,) and the speed s (n,)."""
         return np.zeros_like(sample.q), sample.speed
 
     def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
         """See `Check.check`."""
-        keep = max(1.0 - sample.dt / self._memory, 0.0)
-        error = keep * state[0] + sample.step - sample.dt * sample.v
-        speed = np.maximum(keep * state[1], sample.speed)
+        decay = max(1.0 - sample.dt / self._memory, 0.0)
+        error = decay * state[0] + sample.step - sample.dt * sample.v
+        speed = np.maximum(decay * state[1], sample.speed)
         return (error, speed), np.abs(error) > self._tolerance + self._delay * speed
 
 
 class FrozenPosition:
-    """Check of positions that stay constant while the effort on the joint changes.
+    """Check for positions that stay constant while the effort on the joint changes.
 
-    Between the motor encoders and the links there are elastic cables and structure. A change of the effort by a
-    considerable part of its limit therefore turns the encoder by at least one count. This also holds for a joint that
-    presses against a stop or is held by a hand.
+    Cables and structure between the motor encoders and the links are elastic. A large change of the effort therefore
+    turns the encoder by at least one count, even if the joint presses against a stop or is held by a hand.
     """
 
     text, about_position = "the position does not change although the effort does", True
 
     def __init__(self, settings: PlausibilitySettings, effort_limits: Vector, counts: Vector) -> None:
-        """Creates the check with effort limits [N m, N] and encoder counts [rad, m] of the joints, both (n,)."""
+        """Creates the check with effort limits (n,) [N m, N] and encoder counts (n,) [rad, m] of the joints."""
         self._allowed = settings.frozen_effort * effort_limits
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, float]:
-        """Returns effort at the last position change, time of excessive difference (n,), and time since the start."""
+        """Returns effort (n,) at the last position change, time (n,) of excessive difference, and time since start."""
         return sample.net_effort, np.zeros_like(sample.q), 0.0
 
     def check(self, sample: Sample, state: tuple[Vector, Vector, float]) -> tuple[tuple[Vector, Vector, float], Mask]:
@@ -156,15 +158,15 @@ class Response:
     """Check that accelerations agree with the efforts.
 
     The unexplained effort r = filter(tau - G(q)) - M(q) filter(vd) contains friction, external forces, model errors,
-    and errors of sensors or motors. With a first-order filter of time constant T, filter(vd) = (v - filter(v)) / T
-    needs no differentiation. A lasting part is attributed to the model and subtracted. Coriolis terms are omitted. They
-    are small at the speeds that the guard allows.
+    and errors of sensors or motors. With a first-order low-pass filter of time constant T,
+    filter(vd) = (v - filter(v)) / T, so the velocity is not differentiated. The slowly varying part of r is attributed
+    to model errors and subtracted. Coriolis terms are omitted, because they are small at the allowed speeds.
     """
 
     text, about_position = "the motion does not follow from the effort", True
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm, model: ArmModel) -> None:
-        """Creates the check for the joints of `arm` with its model."""
+        """Creates the check for the joints of `arm` with the model of that arm."""
         hand_effort = arm.per_joint(settings.hand_effort, 10 * settings.hand_effort)
         self._allowed, self._time = settings.response * arm.effort_limits + hand_effort, settings.response_time
         self._memory, self._model = settings.response_memory, model
@@ -185,14 +187,14 @@ class Response:
         velocity = velocity + gain * (sample.v - velocity)
         unexplained = effort - M.dot(sample.v - velocity) - lasting
         lasting = lasting + min(sample.dt / self._memory, 1.0) * unexplained
-        # Negated comparison, so that an effort that is NaN is unexplained, too.
+        # Negated comparison, so that NaN counts as implausible.
         return (effort, velocity, lasting, M, age), ~(np.abs(unexplained) <= self._allowed)
 
 
 class SilentEffort:
-    """Check that measured efforts follow the commanded ones. Finds sensors that read zero and motors without power."""
+    """Check that measured efforts follow the commanded ones. Detects silent sensors and motors without power."""
 
-    text, about_position = "the measured effort does not show the commanded one", False
+    text, about_position = "the measured effort does not follow the commanded effort", False
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm) -> None:
         """Creates the check for the joints of `arm`."""
@@ -202,7 +204,7 @@ class SilentEffort:
         self._largest = np.array([arm.effects.saturation.get(name, np.inf) for name in arm.joint_names])
 
     def begin(self, sample: Sample) -> Vector:
-        """Returns the time (n,) for which the commanded effort has not appeared [s]."""
+        """Returns the time (n,) [s] for which the measured effort has not followed the commanded one."""
         return np.zeros_like(sample.q)
 
     def check(self, sample: Sample, state: Vector) -> tuple[Vector, Mask]:
@@ -210,15 +212,15 @@ class SilentEffort:
         if sample.commanded is None:
             state = 0.0 * state
         else:
-            hidden = self._hidden(sample.commanded, sample.effort)
-            if is_any(hidden):
-                # Coupled actuators may be unable to apply the effort although each joint is inside its limit.
+            missing = self._is_missing(sample.commanded, sample.effort)
+            if is_any(missing):
+                # Coupled actuators may saturate although each joint effort is inside its limit.
                 actuators = np.clip(sample.commanded @ self._J_inverse, -self._largest, self._largest)
-                hidden &= self._hidden(actuators @ self._J, sample.effort)
-            state = hidden * (state + sample.dt)
+                missing &= self._is_missing(actuators @ self._J, sample.effort)
+            state = missing * (state + sample.dt)
         return state, state > self._time
 
-    def _hidden(self, commanded: Vector, effort: Vector) -> Mask:
+    def _is_missing(self, commanded: Vector, effort: Vector) -> Mask:
         size = np.abs(commanded)
         return (size > self._commanded) & (commanded * effort < self._least * size)
 
@@ -227,10 +229,10 @@ class Plausibility:
     """All plausibility checks of an arm's measurements, applied sample by sample.
 
     Attributes:
-        gravity: The model's gravity effort (n,) at the last sample [N m, N].
-        invalid: Mask (n,) of joints without a valid position since the last `restart`.
-        fault: Description of the error of the last sample. Empty: no error.
-        last_valid: Positions (n,) of the `invalid` joints before their fault [rad, m]; undefined for the others.
+        gravity: Gravity effort (n,) [N m, N] of the model at the last sample.
+        invalid: Mask (n,) of joints whose position was found invalid since the last `restart`.
+        fault: Description of the error of the last sample, or "".
+        last_valid: Last valid positions (n,) [rad, m] of the `invalid` joints; undefined for all other joints.
     """
 
     def __init__(self, arm: Arm, model: ArmModel, settings: PlausibilitySettings, speed_limit: Vector) -> None:
@@ -239,8 +241,8 @@ class Plausibility:
         Args:
             arm: Arm with n joints.
             model: Model of that arm as mounted.
-            settings: Tolerances.
-            speed_limit: Speed limits (n,) that the guard enforces [rad/s, m/s].
+            settings: Tolerances of the checks.
+            speed_limit: Speed limits (n,) [rad/s, m/s] that the guard enforces.
         """
         self.model, self._names = model, arm.joint_names
         counts = arm.encoder_counts()
@@ -259,29 +261,31 @@ class Plausibility:
         self.restart()
 
     def restart(self) -> None:
-        """Marks all positions as valid and restarts the checks with the next sample."""
+        """Marks all positions as valid. The checks restart with the next sample."""
         self.invalid, self.fault = self._none, ""
         self.forget()
 
     @property
-    def begins(self) -> bool:
-        """Returns whether the next sample is compared with no previous sample."""
+    def is_first(self) -> bool:
+        """True if the next sample will not be compared with a previous sample."""
         return self._before is None
 
     def forget(self) -> None:
-        """Excludes the previous samples from the comparison with the next one."""
+        """Discards the previous samples, so that the next sample is not compared with them."""
         self._before: tuple[Vector, Vector] | None = None
 
     def check(self, dt: float, q: Vector, v: Vector, effort: Vector, commanded: Vector | None) -> str:
-        """Checks one measurement. All arrays are (n,), finite and not changed in place.
+        """Checks one measurement. All arrays must be finite, and the caller must not change them afterwards.
 
         Args:
             dt: Time since the previous measurement [s].
-            q, v, effort: Measured positions, velocities and efforts.
-            commanded: Effort that the guard commanded before, or None.
+            q: Measured positions (n,) [rad, m].
+            v: Measured velocities (n,) [rad/s, m/s].
+            effort: Measured efforts (n,) [N m, N].
+            commanded: Effort (n,) [N m, N] that the guard commanded in the previous step. None: it commanded no effort.
 
         Returns:
-            `fault`.
+            Description of the detected error, or "" if the measurement is plausible.
         """
         self.gravity, self.fault = self.model.gravity_effort(q), ""
         speed = np.abs(v)
@@ -297,7 +301,7 @@ class Plausibility:
             self._states = [state for state, _ in results]
             if any(is_any(joints) for _, joints in results):
                 for check, (_, joints) in zip(self._checks, results, strict=True):
-                    self._find(check, joints)
+                    self._report(check, joints)
             self._pose_age += dt
             if self._pose_age > self._detection_time:
                 self._poses, self._pose_age = (self._poses[1], q), 0.0
@@ -305,10 +309,10 @@ class Plausibility:
         return self.fault
 
     def reject_all(self) -> None:
-        """Marks the positions of all joints as invalid, for lost measurements."""
+        """Marks the positions of all joints as invalid. Called when measurements are lost."""
         self._reject(~self._none)
 
-    def _find(self, check: Check, joints: Mask) -> None:
+    def _report(self, check: Check, joints: Mask) -> None:
         if not is_any(joints):
             return
         if not self.fault:
@@ -317,6 +321,6 @@ class Plausibility:
             self._reject(joints)
 
     def _reject(self, joints: Mask) -> None:
-        # An error began before its detection. The last valid pose is the one at that earlier time.
+        # An error begins before it is detected. The last valid pose is therefore an earlier one.
         self.last_valid = np.where(joints & ~self.invalid, self._poses[0], self.last_valid)
         self.invalid = self.invalid | joints

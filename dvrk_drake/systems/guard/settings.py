@@ -1,6 +1,6 @@
 """Settings of a command guard, as a schema for yaml_load_typed.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
 from dataclasses import dataclass, field
@@ -11,29 +11,29 @@ from dvrk_drake.models.schema_fault import number_fault, within
 
 @dataclass
 class PlausibilitySettings:
-    """Tolerances of the plausibility checks of measurements, see `dvrk_drake.systems.guard.plausibility`.
+    """Tolerances of the plausibility checks of measurements; see `dvrk_drake.systems.guard.plausibility`.
 
     Attributes:
-        position_tolerance: Tolerance of position steps and of the difference of positions and integrated velocities
-            [rad; a tenth of the number in m on a prismatic joint]. Three encoder counts are added.
+        position_tolerance: Tolerance of position steps, and of the difference between positions and integrated
+            velocities [rad; a tenth of the number in m for a prismatic joint]. Three encoder counts are added.
         jitter: Largest error of the time between two measurements [s].
         velocity_delay: Largest delay of the velocity estimate [s].
-        velocity_counts: Error of the velocity as a rate of encoder counts [1/s]. An estimate from the time between two
-            counts keeps its last value for a while when no count arrives.
+        velocity_counts: Error of the velocity as a rate of encoder counts [1/s]. A velocity that is estimated from the
+            time between two counts keeps its last value until the next count.
         velocity_memory: Time constant of the comparison of positions and velocities [s].
-        frozen_effort: Change of effort that must change a position, as a fraction of the effort limit.
+        frozen_effort: Change of effort that must cause a change of position, as a fraction of the effort limit.
         frozen_time: Longest time for which a position may stay constant under that change [s].
         frozen_speed: Lowest speed at which a joint is expected to move by an encoder count [rad/s, m/s].
-        response: Allowed unexplained effort beyond `hand_effort`, as a fraction of the effort limit.
-        hand_effort: Effort of a hand on a wrist joint, or of a model error [N m; ten times the number in N on a
+        response: Allowed unexplained effort in addition to `hand_effort`, as a fraction of the effort limit.
+        hand_effort: Allowed effort of a hand on a joint, or of a model error [N m; ten times the number in N for a
             prismatic joint].
         response_time: Time constant of the filters of effort and acceleration [s].
         response_memory: Time constant with which lasting unexplained effort is attributed to the model [s].
-        start_gravity: Allowed difference of measured effort and gravity effort at the start of efforts, as a fraction
-            of the effort limit, in addition to the arm's dry friction and `hand_effort`.
-        silent_effort: Commanded effort that must appear in the measured one, as a fraction of the effort limit.
-        silent_time: Time within which it must appear [s].
-        detection_time: Age of the pose that is taken as valid when a fault is detected [s].
+        start_gravity: Allowed difference of measured effort and gravity effort when effort commands start, as a
+            fraction of the effort limit. The arm's dry friction and `hand_effort` are added.
+        silent_effort: Commanded effort that the measured effort must follow, as a fraction of the effort limit.
+        silent_time: Time within which the measured effort must follow [s].
+        detection_time: Least age of the pose that is used as the last valid one when a fault is detected [s].
         bad_samples: Number of consecutive measurements that may be late or not finite while the arm holds.
     """
 
@@ -60,38 +60,39 @@ class PlausibilitySettings:
 class GuardSettings:
     """Settings of a command guard.
 
-    The range of each setting is next to it. Values outside disable the protection or reject all commands.
+    The range of each setting is stated next to the setting. Values outside the range would disable the protection or
+    reject all commands.
 
     Attributes:
-        expiry: Age at which a command expires, counted from the measurement that it answers [s]. Another sender may
-            take over after the same time without a command.
+        expiry: Age at which a command expires, counted from the measurement that it answers [s]. Another sender is
+            accepted after the same time without a command.
         measurement_age: Largest age of a valid measurement [s].
-        start_time: Time for which commands must be good before they act [s].
-        clock_tolerance: Allowed difference of the advance of a sender's clock and the arm's between two commands [s].
-        sequence_jump: Largest increment of the sequence of a sender's commands. 1000 is one second at 1 kHz. A command
-            beyond it is refused.
-        start_effort: Allowed difference of the first commanded efforts from the present ones, as a fraction of the
+        start_time: Time of the start check, during which all commands must be accepted before they act [s].
+        clock_tolerance: Allowed difference between the advances of the sender's and the arm's clock, from one command
+            to the next [s].
+        sequence_jump: Largest increment of the sequence from one command to the next. 1000 is one second at 1 kHz.
+        start_effort: Allowed difference of the first commanded efforts from the measured efforts, as a fraction of the
             effort limit.
         margin: Least width of the soft wall before each position limit [rad]. It is also the allowed difference of the
-            first commanded positions from the present pose. While efforts act, half of it beyond a limit is a fault.
-            It is at most `margin_fraction` of the range, which applies to short or prismatic joints.
-        margin_fraction: See `margin`.
-        effort_fraction: Fraction of each effort limit that effort commands may use. Soft wall and brake always have
-            the whole limit.
+            first commanded positions from the measured pose. While efforts act, a pose that exceeds a limit by more
+            than half of the margin is a fault.
+        margin_fraction: Largest margin as a fraction of the joint's range. Relevant for short or prismatic joints.
+        effort_fraction: Fraction of each effort limit that effort commands may use. Soft wall and brake always use the
+            whole limit.
         effort_rise_time: Shortest time in which the commanded effort grows from zero to its limit [s].
-        traverse_time: Shortest time in which a joint may cross its range [s]. It defines the speed limit: commanded
-            positions move no faster, and while efforts act the joint is braked above it.
+        traverse_time: Shortest time in which a joint may cross its range [s]. This defines the speed limit. Commanded
+            positions move no faster. While efforts act, a joint above the speed limit is braked.
         following_error: Allowed distance of a joint from its commanded position, as a fraction of its range.
         following_time: Allowed lag of the arm's position controller [s], Kd/Kp for a PD controller.
-        fault_effort: Effort of held joints after a measurement fault, as a fraction of the effort limit. If gravity
-            needs nearly as much or more, a third of it in addition to the gravity effort.
+        fault_effort: Largest effort of held joints after a measurement fault, as a fraction of the effort limit. If
+            gravity needs more than two thirds of this effort, the limit is the gravity effort plus a third of it.
         slow_period: Largest median of the last 100 periods between two steps of the guard [s].
         longest_period: Largest time between two steps of the guard [s].
         oscillation: Alternating part of the commanded effort that counts as a reversal, as a fraction of the effort
             limit.
         oscillation_reversals: Allowed number of reversals, weighted exponentially with `oscillation_time`.
         oscillation_time: See `oscillation_reversals` [s].
-        resume_automatically: Allows commands to act again after the watchdog took over without an operator's reset.
+        resume_automatically: If true, commands may act again after the watchdog took over, without an operator.
         plausibility: Tolerances of the checks of measurements.
     """
 

@@ -20,10 +20,10 @@ from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class TolerantSerializer(PySerializer):
-    """Serializer that keeps the last message if a new one is unreadable or unwanted, and signs messages with a key.
+    """Serializer that keeps the last message if a new one is rejected, and signs messages with a key.
 
-    Drake's serializer for Python types passes the decoder's exception through `HandleSubscriptions`. Any process on the
-    network could then stop this one.
+    With Drake's serializer for Python types, `HandleSubscriptions` raises the exception of the decoder. Any process on
+    the network could then stop this process.
     """
 
     def __init__(
@@ -37,15 +37,16 @@ class TolerantSerializer(PySerializer):
 
         Args:
             message_type: Type of the message.
-            read: Function that returns the message in the received bytes, or None to ignore it. Default: the decoder.
-            key: Key that signs the messages to be sent.
+            read: Function that returns the message in the received bytes, or None to ignore the message. None: the
+                decoder of `message_type`.
+            key: Key that signs sent messages. None: messages are not signed.
         """
         super().__init__(message_type)
         self._read = read or (lambda data: decode(message_type, data))
         self._key = key
 
     def Deserialize(self, buffer: bytes, abstract_value: AbstractValue) -> None:
-        """Sets the value if the buffer holds a wanted message."""
+        """Sets the value if the buffer contains an accepted message."""
         message = self._read(buffer)
         if message is not None:
             abstract_value.set_value(message)
@@ -59,15 +60,15 @@ class TolerantSerializer(PySerializer):
 def connect_arm(
     builder: DiagramBuilder, arm: Arm, driver: DvrkDriver, lcm: DrakeLcmInterface | None = None
 ) -> tuple[DvrkStatusReceiver, DvrkCommandSender]:
-    """Adds the controller's end of both channels of `arm`. A command is sent every `driver.status_period`.
+    """Adds the systems that receive the status of an arm and send a command every `driver.status_period`.
 
     Args:
         builder: Builder of the Diagram.
-        arm: Arm of the channels. Messages that do not continue the first received session are ignored, see
+        arm: Arm of the channels. Messages that do not continue the first received session are ignored; see
             `StatusFilter`.
         driver: Configuration of the driver. Its key verifies statuses and signs commands.
-        lcm: LCM interface whose `HandleSubscriptions` the caller calls. None: a new one at `driver.lcm_url`, which a
-            Simulator handles.
+        lcm: LCM interface whose `HandleSubscriptions` the caller calls. None: a new interface at `driver.lcm_url`,
+            which the Simulator handles.
 
     Returns:
         Receiver of the status and sender of the command.
@@ -79,7 +80,7 @@ def connect_arm(
     statuses = StatusFilter(arm.name, arm.num_joints, key)
     if lcm is None:
         lcm = builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm=DrakeLcm(driver.lcm_url)))
-    serializer = TolerantSerializer(lcmt_dvrk_status, read=lambda data: statuses.take(data, time.monotonic()))
+    serializer = TolerantSerializer(lcmt_dvrk_status, read=lambda data: statuses.accept(data, time.monotonic()))
     subscriber = builder.AddNamedSystem("status_subscriber", LcmSubscriberSystem(status_channel(arm), serializer, lcm))
     receiver = builder.AddNamedSystem("status_receiver", DvrkStatusReceiver(arm))
     sender = builder.AddNamedSystem("command_sender", DvrkCommandSender(arm))

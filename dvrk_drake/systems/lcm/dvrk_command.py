@@ -1,4 +1,4 @@
-"""Systems for the command channel of an arm: the controller's sender, and the arm's receiver with its command guard."""
+"""Systems for the command channel of an arm: sender of the controller, and receiver of the arm with a command guard."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MODES = (lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD, lcmt_dvrk_command.POSIT
 
 
 def draw_id() -> int:
-    """Returns a random sender_id or session_id. It is never 0 and practically unique."""
+    """Returns a random sender_id or session_id, which is not 0 and practically unique."""
     return 1 + secrets.randbelow(2**62)
 
 
@@ -41,18 +41,23 @@ class DvrkCommandSender(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `lcmt_dvrk_status`: status to answer. The command carries its session, time and sequence. The arm refuses a
-      command that is repeated without a new status as sent twice. So without new statuses, the arm holds.
-    - `effort` (n) and `desired_state` (2n: q, then v): commanded values.
-    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Others mean HOLD. Unconnected: EFFORT if
-      `effort` is connected, else POSITION if `desired_state` is, else HOLD.
-    - `reset_fault` (1): not zero requests to reset a fault, or to resume after the watchdog took over. The mode is then
-      HOLD.
-    - `lcmt_dvrk_command`: the message. It is HOLD whenever the commanded values are not connected or not finite.
+    - `lcmt_dvrk_status`: status to answer. The command contains the session, time and sequence of this status. The arm
+      refuses a second command for the same status, so it holds if there are no new statuses.
+    - `effort` (n): commanded efforts. `desired_state` (2n): commanded q, then v.
+    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Other values mean HOLD. Unconnected: EFFORT
+      if `effort` is connected, otherwise POSITION if `desired_state` is connected, otherwise HOLD.
+    - `reset_fault` (1): a value other than zero requests the reset of a fault, or a resume after the watchdog took
+      over. The mode is then HOLD.
+    - `lcmt_dvrk_command`: command message. The mode is HOLD if the commanded values are unconnected or not finite.
     """
 
     def __init__(self, arm: Arm, sender_id: int | None = None) -> None:
-        """Creates the sender of a controller of `arm`. Without a `sender_id`, a random one is used."""
+        """Creates the sender.
+
+        Args:
+            arm: Controlled arm.
+            sender_id: Identifier of the sender. None: a random identifier.
+        """
         super().__init__()
         n = arm.num_joints
         self._arm_name, self._num_joints = arm.name, n
@@ -68,7 +73,7 @@ class DvrkCommandSender(LeafSystem):
 
     @property
     def sender_id(self) -> int:
-        """Identifier by which the arm distinguishes this sender from others."""
+        """Identifier by which the arm distinguishes this sender from other senders."""
         return self._sender_id
 
     def _calc_command(self, context: Context, output: AbstractValue) -> None:
@@ -81,10 +86,10 @@ class DvrkCommandSender(LeafSystem):
         command.num_joints = n
         effort = self._effort.Eval(context) if self._effort.HasValue(context) else np.full(n, np.nan)
         desired = self._desired.Eval(context) if self._desired.HasValue(context) else np.full(2 * n, np.nan)
-        asked = {lcmt_dvrk_command.EFFORT: effort, lcmt_dvrk_command.POSITION: desired}
+        requested = {lcmt_dvrk_command.EFFORT: effort, lcmt_dvrk_command.POSITION: desired}
         mode = self._mode(context)
         command.reset_fault = self._reset.HasValue(context) and bool(self._reset.Eval(context)[0])
-        if command.reset_fault or (mode in asked and not is_finite(asked[mode].tolist())):
+        if command.reset_fault or (mode in requested and not is_finite(requested[mode].tolist())):
             mode = lcmt_dvrk_command.HOLD
         command.control_mode = mode
         zero = np.zeros(n)
@@ -103,9 +108,10 @@ class DvrkCommandSender(LeafSystem):
 
 
 class DvrkCommandReceiver(LeafSystem):
-    """Receives commands for one arm, checks them with its guard, and outputs the resulting efforts and targets.
+    """Receives commands for one arm, checks them with a guard, and outputs the resulting efforts and targets.
 
-    It holds the measured pose until a command acts, like Drake's receivers, and whenever the guard takes over.
+    Until a command acts, the measured pose is held, as in Drake's receivers. It is also held when the guard takes over.
+
     .. pydrake_system::
 
         name: DvrkCommandReceiver
@@ -123,26 +129,25 @@ class DvrkCommandReceiver(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `lcmt_dvrk_command`: a command, e.g. from an LcmSubscriberSystem. Repeated messages are received once. Drake keeps
-      only the newest message of a channel, and not the bytes that a key could verify. A process that moves an arm
-      passes every message to `Receive` instead.
+    - `lcmt_dvrk_command`: command, e.g. from an LcmSubscriberSystem. A repeated message is received only once. Drake
+      keeps only the newest message of a channel, without the bytes that a key could verify. A process that moves an arm
+      must therefore pass every message to `Receive` instead.
     - `state_estimated` (2n): measured q, then v. `effort_measured` (n): applied motor efforts.
-    - `position_control_effort` (n): present effort of the arm's own position controller.
-    - `gravity_effort` (n): the arm's own gravity compensation. If connected, it is added to commanded efforts, and
-      commands are interpreted without it.
-    - `control_mode` (1): mode in force: lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
-    - `desired_state` (2n): target of that position controller; the measured pose at rest while efforts act.
-    - `effort` (n): motor efforts to apply. They are zero when off. In EFFORT they are the guarded command, with the
-      arm's own gravity compensation inside the effort limits. Otherwise they are `position_control_effort`, or the
-      gravity effort of the last good measurement where that is not finite.
+    - `position_control_effort` (n): present effort of the position controller in the arm's driver.
+    - `gravity_effort` (n): gravity compensation of the arm's driver. If connected, it is added to commanded efforts and
+      subtracted from `effort_measured`.
+    - `control_mode` (1): mode in force, lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
+    - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose at rest.
+    - `effort` (n): motor efforts to apply, inside the effort limits. Zero in OFF. In EFFORT: output of the guard plus
+      `gravity_effort`. Otherwise: `position_control_effort`, or the model's gravity effort if that is not finite.
     - `guard`: the CommandGuard, read-only.
 
-    The measurement is always recent. The guard is abstract state that is updated once per period of the clock. Drake
-    updates it before it steps discrete plants at the same time, so a command acts in the step that follows it.
+    The guard is abstract state, which is updated once per period of the clock. Drake updates it before it steps
+    discrete plants at the same time, so a command acts in the next step of the plant.
 
     Attributes:
-        stalled: True stops the guard, as in a bridge whose process is stopped. Messages then wait in the inbox, and the
-            outputs keep the guard's last values.
+        stalled: If true, the guard is not stepped, as in a bridge whose process is stopped. Messages then wait in the
+            inbox, and the outputs keep their last values.
     """
 
     def __init__(
@@ -157,8 +162,8 @@ class DvrkCommandReceiver(LeafSystem):
         Args:
             arm: Arm that defines the number of joints and their effort limits.
             guard: Guard in its initial state. Each context has its own copy.
-            clock: Clock of the arm, whose period is that of the guard. None: ArmClock().
-            key: Key that must have signed the messages for `Receive`. None: not verified.
+            clock: Clock of the arm, with the period of the guard. None: ArmClock().
+            key: Key that must have signed the messages for `Receive`. None: signatures are not verified.
         """
         super().__init__()
         n = arm.num_joints
@@ -171,7 +176,7 @@ class DvrkCommandReceiver(LeafSystem):
         self._position_control = self.DeclareVectorInputPort("position_control_effort", n)
         self._gravity = self.DeclareVectorInputPort("gravity_effort", n)
         self._guard = self.DeclareAbstractState(AbstractValue.Make(guard))
-        self._taken = self.DeclareAbstractState(AbstractValue.Make((0, 0, 0)))
+        self._last_command_id = self.DeclareAbstractState(AbstractValue.Make((0, 0, 0)))
         own = {self.abstract_state_ticket(self._guard)}
         self.DeclareVectorOutputPort("control_mode", 1, self._calc_control_mode, own)
         self.DeclareVectorOutputPort("desired_state", 2 * n, self._calc_desired_state, own)
@@ -198,9 +203,9 @@ class DvrkCommandReceiver(LeafSystem):
         self._inbox.deliver(guard, utime)
         if self._command.HasValue(context):
             command = self._command.Eval(context)
-            taken = (command.sender_id, command.sequence, command.utime)
-            if taken != context.get_abstract_state(int(self._taken)).get_value():
-                state.get_mutable_abstract_state(int(self._taken)).set_value(taken)
+            command_id = (command.sender_id, command.sequence, command.utime)
+            if command_id != context.get_abstract_state(int(self._last_command_id)).get_value():
+                state.get_mutable_abstract_state(int(self._last_command_id)).set_value(command_id)
                 guard.receive(command, utime)
         q_v = self._state.Eval(context)
         effort = self._effort.Eval(context)

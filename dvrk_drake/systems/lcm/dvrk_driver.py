@@ -1,6 +1,6 @@
 """Configuration of an arm's driver over LCM, as a schema for yaml_load_typed.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
 from dataclasses import dataclass, field
@@ -27,15 +27,16 @@ class DvrkDriver:
 
     Attributes:
         lcm_url: URL of the LCM network. Empty: LCM_DEFAULT_URL of the environment, or LCM's default.
-        status_period: Period in which the arm sends its status and controllers answer [s].
-        control_modes: Modes that the arm accepts besides hold: position, effort, "off" (quoted, since YAML reads off as
-            false). An arm that is off falls, so it is not in the default.
+        status_period: Period in which the arm sends a status and a controller answers [s].
+        control_modes: Modes that the arm accepts in addition to hold: position, effort, "off" (in quotes, because YAML
+            reads off as false). "off" is not in the default, because an arm falls when it is off.
         key_file: Key that must sign commands and that signs statuses, created by `dvrk-drake key`. The path is relative
             to the driver's YAML file. Empty: messages are not authenticated, and any process on the network can
             command the arm.
-        gravity_compensation: The arm adds its own gravity compensation to commanded efforts, as a dVRK does on request.
-        model: File of the identified model with which the guard checks measurements, relative to the driver's YAML
-            file. Empty: the model of the arm's SDF.
+        gravity_compensation: If true, the arm adds its own gravity compensation to commanded efforts (an option of a
+            dVRK).
+        model: File of the identified model with which the guard checks measurements. The path is relative to the
+            driver's YAML file. Empty: the model of the arm's SDF.
         guard: Settings of the command guard.
     """
 
@@ -54,7 +55,7 @@ class DvrkDriver:
         """Checks the values. Call it again after setting fields one by one, as yaml_load_typed does.
 
         Raises:
-            StationError: An unknown control mode, a period out of its range, or an invalid setting of the guard.
+            StationError: A control mode is unknown, the period is out of range, or a setting of the guard is invalid.
         """
         self.guard.check()
         if any(mode not in _MODES for mode in self.control_modes):
@@ -73,7 +74,7 @@ class DvrkDriver:
         """Returns the model in the file `model`, or None if there is none.
 
         Raises:
-            ModelError: The file cannot be read, or is not a model of `arm`.
+            ModelError: The file cannot be read, or the model is not valid for `arm`.
         """
         return IdentifiedModel.load(self.model, arm) if self.model else None
 
@@ -81,7 +82,7 @@ class DvrkDriver:
         """Returns the key in `key_file`, or None if there is none.
 
         Raises:
-            KeyFileError: As `MessageKey.load`.
+            KeyFileError: The key cannot be used; see `MessageKey.load`.
         """
         return MessageKey.load(self.key_file) if self.key_file else None
 

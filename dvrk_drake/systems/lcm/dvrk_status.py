@@ -1,4 +1,4 @@
-"""Systems for the status channel of an arm: the arm's sender with its clock, and the controller's receiver."""
+"""Systems for the status channel of an arm: sender of the arm with a clock, and receiver of the controller."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ArmClock:
 
 
 class DvrkStatusSender(LeafSystem):
-    """Computes the status message of one arm, its measurements and the state of its guard, for an LcmPublisherSystem.
+    """Computes the status message of one arm for an LcmPublisherSystem: measurements and the state of the guard.
 
     .. pydrake_system::
 
@@ -50,10 +50,11 @@ class DvrkStatusSender(LeafSystem):
         output_ports:
         - lcmt_dvrk_status
 
-    - `state_estimated` (2n): q, then v; `effort_measured`, `effort_commanded` (n): applied and commanded motor efforts
-      [rad, rad/s, N m; m, m/s, N on a prismatic joint].
+    - `state_estimated` (2n): q, then v [rad, rad/s; m, m/s on a prismatic joint].
+    - `effort_measured` (n): applied motor efforts [N m, N].
+    - `effort_commanded` (n): commanded motor efforts [N m, N].
     - `guard`: the CommandGuard, from DvrkCommandReceiver.
-    - `lcmt_dvrk_status`: the message. Its sequence is the number of periods since time zero.
+    - `lcmt_dvrk_status`: status message. The sequence is the number of periods since time zero.
     """
 
     def __init__(
@@ -67,8 +68,8 @@ class DvrkStatusSender(LeafSystem):
         """Creates the sender of `arm`.
 
         Args:
-            arm: Arm that the message names.
-            guard: Guard of that arm, which defines the type of the port.
+            arm: Arm of the status.
+            guard: Guard of the arm, which defines the type of the port.
             clock: Clock that provides the time and the number of periods. None: ArmClock().
             gravity_compensation: True if the arm adds its own gravity compensation to commanded efforts.
         """
@@ -101,10 +102,10 @@ class DvrkStatusSender(LeafSystem):
 
 
 def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
-    """Sets the fields of `status` that describe the state of a guard. Bridges use it as well."""
+    """Sets the fields of `status` that describe the state of a guard. A bridge can call this function as well."""
     status.session_id = guard.session_id
     status.guard_state, status.accepted_modes = guard.state, guard.accepted_modes
-    status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.waits_for
+    status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.blocked_reason
     status.command_sender_id = guard.sender_id
     status.command_sequence, status.command_utime = guard.last_command.sequence, guard.last_command.utime
     counts = guard.counts
@@ -129,9 +130,9 @@ class DvrkStatusReceiver(LeafSystem):
         - state_estimated
         - effort_measured
 
-    `state_estimated` has 2n numbers, q, then v, the others n, in the arm's order [rad, rad/s, N m; m, m/s, N on a
-    prismatic joint]. Without a message of this arm, as before the first one, all of them are NaN, because zero would be
-    a valid pose.
+    `state_estimated` has 2n numbers: q, then v. All other outputs have n numbers, in the arm's order [rad, rad/s, N m;
+    m, m/s, N on a prismatic joint]. Before the first message of this arm, all outputs are NaN, because zero would be a
+    valid pose.
     """
 
     def __init__(self, arm: Arm) -> None:

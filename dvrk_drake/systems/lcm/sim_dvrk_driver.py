@@ -22,7 +22,7 @@ from dvrk_drake.systems.lcm.dvrk_status import ArmClock, DvrkStatusSender
 
 
 class SimDvrkDriver(Diagram):
-    """Simulation of an arm's own controller: command guard, position controller and status.
+    """Simulation of an arm's driver: command guard, position controller and status.
 
     .. pydrake_system::
 
@@ -35,8 +35,8 @@ class SimDvrkDriver(Diagram):
         - effort_commanded
         - lcmt_dvrk_status
 
-    The ports are those of DvrkCommandReceiver and DvrkStatusSender. The position controller holds the arm whenever no
-    command acts. It is a GravityPidController with the model's gravity. The one of a real arm has to overcome friction.
+    The ports are those of DvrkCommandReceiver and DvrkStatusSender. The position controller is a GravityPidController.
+    It holds the arm while no command acts. The position controller of a real arm also has to overcome friction.
     """
 
     def __init__(
@@ -52,16 +52,17 @@ class SimDvrkDriver(Diagram):
         """Creates the driver of `arm`.
 
         Args:
-            arm: Arm as simulated, including its mounting.
+            arm: Simulated arm with its mounting.
             driver: Configuration of the driver.
-            model: Model of the simulated arm, which the position controller compensates. None: the model of the arm's
-                SDF. The guard checks measurements with the driver's model, or else with this one.
-            start_utime: The arm's clock at time zero of the context [us].
-            wall_clock: Wall clock of the guard [us]. None: commands expire by the context's time only.
-            key: Key that must have signed the messages for `Receive`. None: not verified.
+            model: Model for the gravity compensation of the position controller. None: the model of the arm's SDF. The
+                guard checks measurements with `driver.model` if it is set, otherwise with this model.
+            start_utime: Time of the arm's clock at time zero of the context [us].
+            wall_clock: Function that returns the wall-clock time [us] for the guard. None: commands expire only by the
+                time of the context.
+            key: Key that must have signed the messages for `Receive`. None: signatures are not verified.
 
         Raises:
-            ModelError: The driver's model cannot be read, or is of another arm.
+            ModelError: The driver's model cannot be read, or is not valid for this arm.
         """
         super().__init__()
         clock = ArmClock(start_utime, driver.status_period)
@@ -109,9 +110,9 @@ class SimDvrkDriver(Diagram):
         self._receiver.Receive(data)
 
     def SetStalled(self, stalled: bool) -> None:
-        """Stops the guard, as in a bridge whose process is stopped, or restarts it.
+        """Stops or restarts the guard, to simulate a bridge whose process is stopped.
 
-        While it is stopped, no command is received and the motors keep their last efforts.
+        While the guard is stopped, no command is received and the motors keep their last efforts.
         """
         self._receiver.stalled = stalled
 
@@ -131,21 +132,23 @@ def apply_driver_config(
     subscribe: bool = True,
     wall_clock: Callable[[], int] | None = None,
 ) -> SimDvrkDriver:
-    """Connects a simulated station to LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> reports its state.
+    """Connects a simulated station to LCM, with commands on DVRK_COMMAND_<ARM> and statuses on DVRK_STATUS_<ARM>.
 
     Args:
-        driver: Configuration of the driver; its `lcm_url` is not used. Its key verifies commands and signs statuses.
-        station: Station in `builder`, with its effort input unconnected.
+        driver: Configuration of the driver. `driver.lcm_url` is not used. The driver's key verifies commands and signs
+            statuses.
+        station: Station in `builder` with an unconnected effort input.
         lcm: LCM interface whose `HandleSubscriptions` the caller calls, e.g. an LcmInterfaceSystem or a loop.
         builder: Builder of the Diagram.
         model: See SimDvrkDriver.
-        start_utime: The arm's clock at time zero of the context [us].
-        subscribe: True receives commands from `lcm`, which over UDP keeps the newest one between two calls of
-            `HandleSubscriptions`. False: the caller passes every message to `SimDvrkDriver.Receive`.
-        wall_clock: Wall clock of the guard [us], for a simulation that is stepped by the wall clock.
+        start_utime: Time of the arm's clock at time zero of the context [us].
+        subscribe: If true, commands are received from `lcm`. Over UDP, it keeps only the newest command between two
+            calls of `HandleSubscriptions`. If false, the caller passes every message to `SimDvrkDriver.Receive`.
+        wall_clock: Function that returns the wall-clock time [us] for the guard, for a simulation that is stepped by
+            the wall clock. None: commands expire only by the time of the context.
 
     Returns:
-        The driver that was added.
+        Added driver.
 
     Raises:
         KeyFileError: The driver's key cannot be used.

@@ -1,4 +1,4 @@
-"""`check` of channels: lags, signs, noise, units of velocities and efforts are found with their size."""
+"""Checks of the channels of a motion: lag, sign, noise and unit of velocities and efforts."""
 
 from dataclasses import replace
 
@@ -15,37 +15,37 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(("gain", "lag"), [(1.18, 0.0), (1.0, 0.010), (1.07, 0.008), (-1.0, 0.0), (180 / np.pi, 0.0)])
-def test_velocities_that_disagree(gain, lag):
+def test_detects_a_wrong_velocity_gain_or_lag(gain, lag):
     whole = clean_motion("mtmr")
     late = changed(whole, "qd", 5, lambda x: gain * np.interp(whole.t - lag, whole.t, x))
     kinds = found(late, "mtmr")
-    # Only the first four joints of an MTM share motors, so this joint is one channel.
+    # Only the first four joints of an MTM share motors, so actuator 6 drives one joint.
     assert [f.joints for f in kinds["velocity disagrees"]] == [(5,)]
     report = check_recording(late, load_arm("mtmr"))
     assert report.joints[5].velocity_gain == pytest.approx(gain, rel=5e-3)
     assert report.joints[5].velocity_lag == pytest.approx(lag, abs=3e-4)
 
 
-def test_velocities_that_are_always_zero():
+def test_detects_velocities_that_are_always_zero():
     whole = clean_motion()
     assert len(found(replace(whole, qd=0 * whole.qd))["velocity disagrees"]) == 7
 
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("lag", [0.010, -0.010, 0.020])
-def test_late_efforts(name, lag):
+def test_detects_the_lag_of_efforts(name, lag):
     report = check_recording(clean_motion(name, effort_lag=lag), load_arm(name))
     lags = [joint.effort_lag for joint in report.joints]
     assert sum(value is not None for value in lags) >= 5
     for value in lags:
         if value is not None:
-            # Inertia that depends on the pose is not in the fit; a lag of 3 ms is what it may look like.
+            # The fit does not contain pose-dependent inertia, which can cause a lag error of about 3 ms.
             assert value == pytest.approx(lag, abs=0.0035)
 
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("joint", range(7))
-def test_wrong_sign_of_an_effort_is_refused(name, joint):
+def test_refuses_an_effort_with_the_wrong_sign(name, joint):
     arm = load_arm(name)
     motors = clean_motion(name).in_actuator_coordinates(arm)
     refusals = found(changed(motors, "tau", joint, lambda x: -x), name)["effort sign"]
@@ -53,7 +53,7 @@ def test_wrong_sign_of_an_effort_is_refused(name, joint):
     assert refusals[0].severity == "refusal"
 
 
-def test_narrow_band_noise():
+def test_detects_narrow_band_noise():
     generator = np.random.default_rng(6)
     whole = clean_motion()
     white = generator.normal(size=len(whole))
@@ -65,8 +65,8 @@ def test_narrow_band_noise():
     assert bands[0].size == pytest.approx(0.15, rel=0.15)
 
 
-def test_louder_noise_lowers_the_cut_off_to_what_moves():
-    """The motion ends at its fifth harmonic, 0.83 Hz; only friction's reversals are above."""
+def test_larger_noise_lowers_the_cut_off():
+    """The motion has no frequencies above 0.83 Hz. Only friction has higher frequencies."""
     report = check_recording(clean_motion(), load_arm("psm"))
     louder = changed(
         clean_motion(), "tau", 0, lambda x: x + np.random.default_rng(8).normal(size=len(x)) * 0.5 * np.std(x)
@@ -76,7 +76,7 @@ def test_louder_noise_lowers_the_cut_off_to_what_moves():
     assert 2.0 <= noisy.joints[0].effort_cut_off < 10.0
 
 
-def test_saturated_effort():
+def test_detects_a_saturated_effort():
     whole = clean_motion()
     limit = np.quantile(whole.tau[:, 0], 0.95)
     finding = found(changed(whole, "tau", 0, lambda x: np.minimum(x, limit)))["saturated effort"][0]
@@ -84,16 +84,16 @@ def test_saturated_effort():
     assert finding.size == pytest.approx(0.05, abs=0.015)
 
 
-def test_effort_saturated_both_ways_is_one_finding():
+def test_saturation_at_both_limits_is_one_finding():
     whole = clean_motion()
     limit = np.quantile(np.abs(whole.tau[:, 0]), 0.8)
     (finding,) = found(changed(whole, "tau", 0, lambda x: np.clip(x, -limit, limit)))["saturated effort"]
-    assert f"at {limit:.4g} in" in finding.what and f"at {-limit:.4g} in" in finding.what
+    assert f"at {limit:.4g} N m in" in finding.what and f"at {-limit:.4g} N m in" in finding.what
 
 
 @pytest.mark.parametrize("step", [0.0, 1e-3])
-def test_a_standing_arm_is_not_saturated(step):
-    """Its efforts are constant, or change between two steps of a converter."""
+def test_constant_efforts_at_rest_are_not_saturated(step):
+    """The efforts are constant, or change by one step of a converter."""
     whole, arm = clean_motion(), load_arm("psm")
     tau = np.tile(0.05 * arm.effort_limits, (len(whole), 1))
     tau[::7] += step
@@ -102,21 +102,21 @@ def test_a_standing_arm_is_not_saturated(step):
     assert len(kinds["never moves"]) == arm.num_joints and "saturated effort" not in kinds
 
 
-def test_efforts_in_another_unit_are_refused():
+def test_refuses_efforts_in_another_unit():
     assert found(changed(clean_motion(), "tau", 1, lambda x: 1000 * x))["unusable"][0].severity == "refusal"
 
 
-def test_positions_in_degrees_are_refused():
+def test_refuses_positions_in_degrees():
     whole = clean_motion()
     degrees = replace(whole, q=np.where(load_arm("psm").prismatic, whole.q, np.degrees(whole.q)))
     assert "degrees" in found(degrees)["unusable"][0].what
 
 
-def test_millimetres_are_refused():
+def test_refuses_positions_in_millimetres():
     assert "millimetres" in found(changed(clean_motion(), "q", 2, lambda x: 1000 * x))["unusable"][0].what
 
 
-def test_spikes_of_an_effort_are_refused_in_a_motion():
+def test_refuses_effort_spikes_in_a_motion():
     def spike(tau):
         tau = tau.copy()
         tau[[300, 700]] = 500.0

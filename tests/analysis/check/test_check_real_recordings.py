@@ -1,4 +1,4 @@
-"""`check` of recordings of real arms: what their README says of them is found."""
+"""Checks of recordings of real arms: the findings agree with the README of the recordings."""
 
 import numpy as np
 import pytest
@@ -17,17 +17,17 @@ def real_motion(shared_data):
         path = shared_data / "trajectories" / f"{name}.csv"
         if not path.is_file():
             pytest.skip(f"needs {path}")
-        return wpi_in_joint_coordinates(read_wpi_csv(path), simulated_effects(name))
+        return wpi_in_joint_coordinates(read_wpi_csv(path), arm_of(name))
 
     return motion
 
 
 @pytest.fixture(scope="module")
 def real(real_motion):
-    return lambda name: check_recording(real_motion(name), simulated_effects(name))
+    return lambda name: check_recording(real_motion(name), arm_of(name))
 
 
-def simulated_effects(name):
+def arm_of(name):
     return load_arm(name.split("_")[0].replace("mtm", "mtmr"))
 
 
@@ -70,18 +70,18 @@ def test_real_psm(real):
 
 
 @pytest.mark.parametrize("name", ["psm_one", "psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion"])
-def test_real_insertion_has_noise_and_a_late_effort(real, name):
+def test_real_insertion_has_noise_and_effort_lag(real, name):
     kinds = kinds_of(real(name))
     assert (2,) in [f.joints for f in kinds["narrow-band noise"]]
-    # A study of these recordings found three quarters of a sample at 200 Hz.
+    # An analysis of these recordings found a lag of 0.75 samples at 200 Hz.
     lag = next(f for f in kinds["effort lag"] if f.joints == (2,))
     assert lag.size == pytest.approx(0.75 / 200, abs=0.002)
 
 
 @pytest.mark.parametrize("name", ["mtm_one", "psm_one"])
 @pytest.mark.parametrize("joint", [0, 2, 4, 6])
-def test_real_motor_with_the_wrong_sign_is_refused(real_motion, name, joint):
-    arm = simulated_effects(name)
+def test_refuses_a_wrong_sign_in_a_real_motion(real_motion, name, joint):
+    arm = arm_of(name)
     motors = changed(real_motion(name).in_actuator_coordinates(arm), "tau", joint, lambda x: -x)
     refusals = check_recording(motors, arm).refusals
     assert [(f.kind, f.joints) for f in refusals] == [("effort sign", (joint,))]

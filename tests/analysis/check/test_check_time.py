@@ -1,4 +1,4 @@
-"""`check` of times: repeated rows, jitter, gaps, wrong units are found with their size."""
+"""Checks of the times of a motion: repeated rows, jitter, gaps and wrong units."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from dvrk_drake.models.arm import load_arm
 pytestmark = pytest.mark.slow
 
 
-def test_repeated_rows_are_counted_and_their_times_made():
+def test_counts_and_omits_repeated_rows():
     generator = np.random.default_rng(3)
     whole = clean_motion()
     rows = np.arange(len(whole))
@@ -29,7 +29,7 @@ def test_repeated_rows_are_counted_and_their_times_made():
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("jitter", [0.15, 0.5])
-def test_jitter_is_measured_and_taken_out(name, jitter):
+def test_estimates_and_removes_jitter(name, jitter):
     intervals = np.random.default_rng(4).gamma(1 / jitter**2, jitter**2 / RATE, 4000)
     true = np.concatenate([[0.0], np.cumsum(intervals)])
     recording = clean_motion(name, at=true)
@@ -37,13 +37,13 @@ def test_jitter_is_measured_and_taken_out(name, jitter):
     kinds = found(recording, name)
     assert kinds["jitter"][0].size == pytest.approx(jitter, rel=0.15)
     assert "velocity disagrees" not in kinds
-    made = np.diff(true_time(recording.in_actuator_coordinates(arm)).t)
-    left = made / made.mean() - intervals / intervals.mean()
-    # 0.5 would be half of the jitter: what is left is the curvature of the way between two rows.
-    assert np.std(left) < 0.1 * jitter
+    reconstructed = np.diff(true_time(recording.in_actuator_coordinates(arm)).t)
+    error = reconstructed / reconstructed.mean() - intervals / intervals.mean()
+    # The remaining error is due to the acceleration between two rows.
+    assert np.std(error) < 0.1 * jitter
 
 
-def test_a_slower_effort_topic_is_named():
+def test_detects_a_slower_effort_topic():
     whole = clean_motion()
     every_other = np.arange(len(whole)) // 2 * 2
     kinds = found(replace(whole, tau=whole.tau[every_other]))
@@ -52,7 +52,7 @@ def test_a_slower_effort_topic_is_named():
     assert "repeated rows" not in kinds
 
 
-def test_gap_in_time():
+def test_detects_a_gap_in_the_times():
     whole = clean_motion()
     keep = np.ones(len(whole), bool)
     keep[1000:1100] = False
@@ -63,7 +63,7 @@ def test_gap_in_time():
     assert set(found(cut)) == {"gaps", "repetition"}
 
 
-def test_times_that_go_back_are_refused():
+def test_refuses_decreasing_times():
     whole = clean_motion()
     t = whole.t.copy()
     t[500] = t[498]
@@ -72,8 +72,8 @@ def test_times_that_go_back_are_refused():
     assert "row 501" in refusal.what
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "milliseconds"), (1e9, "nanoseconds"), (7 / 6, "rate right")])
-def test_times_in_another_unit_are_refused(factor, unit):
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "milliseconds"), (1e9, "nanoseconds"), (7 / 6, "wrong rate")])
+def test_refuses_times_in_another_unit(factor, unit):
     whole = clean_motion()
     refusal = found(replace(whole, t=whole.t * factor))["wrong time"][0]
     assert refusal.severity == "refusal"

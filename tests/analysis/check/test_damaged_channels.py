@@ -1,4 +1,4 @@
-"""`check` and `identify` find channels that are exchanged, inverted, scaled or shifted, and name them."""
+"""`check` and `identify` detect channels that are exchanged, inverted, scaled or shifted."""
 
 from dataclasses import replace
 from functools import cache
@@ -21,13 +21,13 @@ from dvrk_drake.recordings.recording import Recording, read_recording, write_rec
 
 pytestmark = pytest.mark.slow
 
-#: Of the columns in the order of a Recording.
+#: Prefixes of the columns, in the order of the fields of a Recording.
 PREFIXES = ("q", "tau", "qd")
 
 
 @cache
 def motion(name):
-    """Efforts of the SDF's links, each up to 10 % heavier or lighter, and of the arm's drives, each up to 20 % off."""
+    """Returns a simulated motion. Link masses deviate by up to 10 % from the SDF, drive effects by up to 20 %."""
     arm, generator = load_arm(name), np.random.default_rng(3)
     t = np.arange(0, 24, 1 / RATE)
     q, v, vd = trajectory(arm, t, period=12.0)
@@ -58,21 +58,21 @@ def test_undamaged_motion_has_no_finding(name, coordinates):
     assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
 
 
-def test_a_long_motion_is_fitted_in_parts():
+def test_long_motion_is_checked_in_segments():
     arm, short, count = load_arm("mtmr"), motion("mtmr"), 6
     t = np.arange(count * len(short)) / RATE
     long = Recording(*(np.tile(x, (count, 1)) for x in (short.q, short.tau, short.qd)), t, "actuator", source="long")
-    findings, of_short = check_channels(long, arm), check_channels(short, arm)
-    assert [str(finding) for finding in findings] == [str(finding) for finding in of_short]
+    findings, expected = check_channels(long, arm), check_channels(short, arm)
+    assert [str(finding) for finding in findings] == [str(finding) for finding in expected]
     (refusal,) = check_channels(exchanged(long, 1, 2, "tau"), arm)
     assert (refusal.kind, refusal.joints) == ("exchanged channels", (1, 2))
-    of_half = long.tau * np.where(t > t[-1] / 2, 2.0, 1.0)[:, None] ** (np.arange(7) == 1)
-    (scale,) = (f for f in check_channels(replace(long, tau=of_half), arm) if f.kind == "effort scale")
+    half_scaled = long.tau * np.where(t > t[-1] / 2, 2.0, 1.0)[:, None] ** (np.arange(7) == 1)
+    (scale,) = (f for f in check_channels(replace(long, tau=half_scaled), arm) if f.kind == "effort scale")
     assert scale.joints == (1,)
 
 
 @pytest.mark.parametrize(("name", "pair"), [("mtmr", (0, 1)), ("mtmr", (5, 6)), ("psm", (4, 5)), ("psm", (1, 2))])
-def test_exchanged_efforts_are_named(name, pair):
+def test_detects_exchanged_efforts(name, pair):
     damaged = exchanged(motion(name), *pair, "tau")
     found = check_channels(damaged, load_arm(name))
     assert [(f.severity, f.kind, f.joints) for f in found] == [("refusal", "exchanged channels", pair)]
@@ -80,14 +80,14 @@ def test_exchanged_efforts_are_named(name, pair):
 
 
 @pytest.mark.parametrize(("name", "pair"), [("mtmr", (3, 4)), ("psm", (4, 5)), ("psm", (0, 1))])
-def test_channels_exchanged_as_a_whole_are_named(name, pair):
+def test_detects_channels_with_all_signals_exchanged(name, pair):
     damaged = exchanged(motion(name), *pair, "q", "qd", "tau")
     found = check_channels(damaged, load_arm(name))
     assert [(f.kind, f.joints) for f in found] == [("exchanged channels", pair)]
     assert "all signals" in found[0].what
 
 
-def test_exchanged_efforts_in_joint_coordinates_are_named():
+def test_detects_exchanged_efforts_in_joint_coordinates():
     arm = load_arm("mtmr")
     damaged = exchanged(motion("mtmr").in_joint_coordinates(arm), 1, 3, "tau")
     assert [(f.kind, f.joints) for f in check_channels(damaged, arm)] == [("exchanged channels", (1, 3))]
@@ -95,17 +95,17 @@ def test_exchanged_efforts_in_joint_coordinates_are_named():
 
 @pytest.mark.parametrize("factor", [2.0, 0.5])
 @pytest.mark.parametrize(("name", "joint"), [("mtmr", 6), ("psm", 3)])
-def test_scaled_effort_is_warned_about(name, joint, factor):
+def test_detects_a_scaled_effort(name, joint, factor):
     recording = motion(name)
     scale = np.where(np.arange(7) == joint, factor, 1.0)
     found = check_channels(replace(recording, tau=recording.tau * scale), load_arm(name))
-    # Drives that share a joint with it may be named too.
+    # There may also be findings for drives that share a joint with this drive.
     sizes = {f.joints[0]: f.size for f in found if f.kind == "effort scale"}
     assert sizes[joint] == pytest.approx(factor, rel=0.3)
 
 
 @pytest.mark.parametrize("joint", [0, 5])
-def test_channel_inverted_as_a_whole_is_named(joint):
+def test_detects_a_channel_with_all_signals_inverted(joint):
     recording, signs = motion("mtmr"), np.where(np.arange(7) == joint, -1.0, 1.0)
     damaged = replace(recording, q=recording.q * signs, qd=recording.qd * signs, tau=recording.tau * signs)
     found = check_channels(damaged, load_arm("mtmr"))
@@ -113,7 +113,7 @@ def test_channel_inverted_as_a_whole_is_named(joint):
 
 
 @pytest.mark.parametrize(("joint", "offset"), [(1, 0.15), (1, -0.15), (2, -0.1), (3, 0.15), (3, -0.15)])
-def test_position_offset_is_warned_about(joint, offset):
+def test_detects_a_position_offset(joint, offset):
     recording = motion("mtmr")
     found = check_channels(replace(recording, q=recording.q + offset * np.eye(7)[joint]), load_arm("mtmr"))
     (finding,) = (f for f in found if f.kind == "position offset")
@@ -123,7 +123,7 @@ def test_position_offset_is_warned_about(joint, offset):
 
 @cache
 def static_poses(still=()):
-    """60 poses of an MTMR with noisy efforts; the joints `still` do not move."""
+    """Returns 60 poses of an MTMR with noisy efforts. The joints `still` do not move."""
     arm, generator = load_arm("mtmr"), np.random.default_rng(2)
     q = arm.sample_poses(60, generator, margin=0.1)
     q[:, list(still)] = q[0, list(still)]
@@ -134,7 +134,7 @@ def static_poses(still=()):
 @pytest.mark.parametrize(
     ("pair", "still"), [((0, 1), ()), ((1, 2), ()), ((3, 4), ()), ((0, 2), (0,)), ((3, 6), (0, 6))]
 )
-def test_exchanged_efforts_of_poses_are_named(pair, still):
+def test_detects_exchanged_efforts_of_poses(pair, still):
     arm, poses = load_arm("mtmr"), static_poses(still)
     assert check_channels(poses, arm) == []
     found = check_channels(exchanged(poses, *pair, "tau"), arm)
@@ -142,14 +142,14 @@ def test_exchanged_efforts_of_poses_are_named(pair, still):
 
 
 @pytest.mark.parametrize(("factor", "kind"), [(-1.0, "effort sign"), (2.0, "effort scale")])
-def test_wrong_sign_or_scale_of_poses_is_warned_about(factor, kind):
+def test_detects_a_wrong_sign_or_scale_of_poses(factor, kind):
     poses = static_poses()
     found = check_channels(replace(poses, tau=poses.tau * factor ** (np.arange(7) == 2)), load_arm("mtmr"))
     assert [(f.severity, f.kind, f.joints) for f in found] == [("warning", kind, (2,))]
 
 
-def test_a_scale_that_friction_may_hide_is_noted():
-    """On a day with 1.5 times the friction, half the effort dissipates 0.75 times the stated power."""
+def test_notes_a_scale_that_friction_cannot_exclude():
+    """With 1.5 times the friction of the arm file, half of the effort dissipates 0.75 times the expected power."""
     arm, recording = load_arm("mtmr"), motion("mtmr")
     h = arm.effect_coordinates["actuator.wrist_roll"]
     stated = [effect for effect in arm.effects.friction if effect.coordinate == "actuator.wrist_roll"]
@@ -163,7 +163,7 @@ def test_a_scale_that_friction_may_hide_is_noted():
 
 
 @pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40"])
-def test_real_poses_have_no_finding_and_show_exchanges(shared_data, name):
+def test_detects_exchanged_efforts_in_real_poses(shared_data, name):
     path = shared_data / "mtm_static" / f"{name}.csv"
     if not path.is_file():
         pytest.skip(f"needs {path}")
@@ -173,20 +173,20 @@ def test_real_poses_have_no_finding_and_show_exchanges(shared_data, name):
         assert [f.joints for f in check_channels(exchanged(poses, *pair, "tau"), arm)] == [pair]
 
 
-def test_joints_without_visible_zero_are_noted():
-    # Gravity cannot show the angle of a vertical axis.
+def test_notes_joints_with_undetectable_offset():
+    # Gravity is independent of the angle about a vertical axis.
     notes = [f for f in check_channels(motion("mtmr"), load_arm("mtmr")) if f.kind == "undetectable offset"]
     assert "outer_yaw" in notes[0].where
     assert "elbow_pitch" not in notes[0].where
 
 
-def test_exchange_replaces_the_finding_of_a_wrong_sign():
+def test_exchange_replaces_a_wrong_sign():
     arm = load_arm("mtmr")
     damaged = exchanged(motion("mtmr"), 4, 5, "tau")
     assert [f.kind for f in check_with_channels(damaged, arm).refusals] == ["exchanged channels"]
 
 
-def test_identify_refuses_and_names_the_channels(tmp_path, capfd):
+def test_identify_refuses_exchanged_channels(tmp_path, capfd):
     write_recording(exchanged(motion("mtmr"), 0, 1, "tau"), tmp_path / "motion.csv")
     model = tmp_path / "model.yaml"
     command = ["identify", str(tmp_path / "motion.csv"), "--arm", "mtmr", "--coordinates", "actuator"]
@@ -195,7 +195,7 @@ def test_identify_refuses_and_names_the_channels(tmp_path, capfd):
     assert not model.exists()
 
 
-def test_model_worse_than_zero_torque_is_refused():
+def test_rejects_a_model_worse_than_zero_torque():
     recording = motion("mtmr")
     noise = np.random.default_rng(1).normal(size=recording.q.shape) * np.sqrt(np.mean(recording.tau**2, axis=0))
     with pytest.raises(IdentificationError, match="cross-validated error exceeds the effort itself"):
@@ -215,14 +215,14 @@ def test_real_motions_have_no_finding(shared_data, name, coordinates):
         pytest.skip(f"needs {path}")
     arm = load_arm("mtmr" if name.startswith("mtm") else "psm")
     recording = read_recording(path, arm, "actuator")
-    if coordinates == "joint":  # as `convert` writes it
+    if coordinates == "joint":  # as in a file from `dvrk-drake convert`
         recording = wpi_in_joint_coordinates(read_wpi_csv(path), arm)
     assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
 
 
 @pytest.mark.parametrize("name", ["psm1_1", "psm1_2", "psm1_3", "psm2_1", "psm2_2"])
-def test_other_arms_of_which_three_joints_moved(shared_data, name):
-    """Two PSMs that no constant of the check was chosen with."""
+def test_detects_errors_of_other_arms(shared_data, name):
+    """Recordings of two PSMs that were not used to select the constants of the check. Only three joints move."""
     path = shared_data / "psm_three_joints" / f"{name}.csv"
     if not path.is_file():
         pytest.skip(f"needs {path}")

@@ -1,4 +1,4 @@
-"""`check` ends with 2 for what `identify` refuses, says what is needed, and lets pass what it takes."""
+"""`check` refuses exactly the recordings that `identify` refuses, with the same message."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -16,12 +16,12 @@ ARM = load_arm("mtmr")
 
 
 def with_sign(recording, joint):
-    """The same with one effort of the wrong sign."""
+    """Returns the recording with one effort of the wrong sign."""
     return replace(recording, tau=recording.measured_effort() * np.where(np.arange(7) == joint, -1, 1))
 
 
 def with_efforts(q, arm=ARM, **columns):
-    """Poses (m, 7) with the torque that the SDF says holds them."""
+    """Returns a recording of poses (m, 7) with holding torques of the SDF model."""
     return Recording(q=q, tau=holding_torques(arm, q) + 1e-4 * np.random.default_rng(1).normal(size=q.shape), **columns)
 
 
@@ -30,20 +30,20 @@ def poses(count):
 
 
 def motion(seconds, rate, speed=1.0):
-    """All joints swing; `speed` 0: they stand."""
+    """Returns a motion of all joints. They are at rest if `speed` is 0."""
     t = np.arange(round(seconds * rate)) / rate
     phase = speed * t[:, None] + np.arange(7)
     return with_efforts(0.1 + 0.1 * np.sin(phase), qd=0.1 * speed * np.cos(phase), t=t)
 
 
 REFUSED = {
-    "one row": (lambda: poses(1), "has 1 distinct pose, too few to identify from; at least 8"),
-    "few poses": (lambda: poses(7), "has 7 distinct poses, too few to identify from; at least 8"),
-    "still": (lambda: motion(6, 100, 0.0), "has 1 distinct pose, too few"),
-    "short": (lambda: motion(3, 100), "3.0 s at 100 Hz; a dynamic model needs a motion of at least 5 s at 50 Hz"),
-    "slow": (lambda: motion(10, 30), "10.0 s at 30 Hz; a dynamic model needs"),
-    "few rows": (lambda: motion(0.5, 100), "static identification needs poses at rest"),
-    "no times": (lambda: replace(motion(6, 100), t=None), "static identification needs poses at rest"),
+    "one row": (lambda: poses(1), "1 distinct pose found. Identification requires at least 8"),
+    "few poses": (lambda: poses(7), "7 distinct poses found. Identification requires at least 8"),
+    "still": (lambda: motion(6, 100, 0.0), "1 distinct pose found"),
+    "short": (lambda: motion(3, 100), "3.0 s at 100 Hz. A dynamic model requires at least 5 s at 50 Hz or more."),
+    "slow": (lambda: motion(10, 30), "10.0 s at 30 Hz. A dynamic model requires"),
+    "few rows": (lambda: motion(0.5, 100), "Static identification requires poses at rest"),
+    "no times": (lambda: replace(motion(6, 100), t=None), "Static identification requires poses at rest"),
 }
 
 
@@ -61,7 +61,7 @@ def test_check_refuses_what_identify_refuses(name, tmp_path, capsys):
     assert not model.exists()
 
 
-def test_what_identify_takes_passes(tmp_path, capsys):
+def test_check_accepts_what_identify_accepts(tmp_path, capsys):
     path = str(tmp_path / "r.csv")
     for recording in (poses(8), motion(6, 100)):
         write_recording(recording, path)
@@ -69,17 +69,17 @@ def test_what_identify_takes_passes(tmp_path, capsys):
         assert not check(read_recording(path, ARM), ARM).refusals
 
 
-def test_few_poses_may_still_validate_a_model():
+def test_few_poses_are_not_refused_for_validation():
     assert [finding.kind for finding in check_recording(poses(3), ARM).findings if finding.kind == "few poses"]
     assert not check_recording(poses(3), ARM).refusals
 
 
-def test_rests_of_a_motion_are_judged_as_poses():
-    """The static poses of a motion with pauses are identified: a wrong sign of a joint is detectable there."""
+def test_static_poses_of_a_motion_are_checked_as_poses():
+    """A wrong sign is detectable in the static poses of a motion with pauses."""
     pose = ARM.sample_poses(12, np.random.default_rng(2), 0.1)
-    pose = np.vstack([pose, pose[:1]])  # where it began, as gravity's work wants it
-    ways = [np.linspace(a, b, 100, endpoint=False) for a, b in pairwise(pose)]
-    q = np.vstack([np.vstack([np.repeat(a[:1], 60, 0), a]) for a in ways] + [np.repeat(pose[-1:], 60, 0)])
+    pose = np.vstack([pose, pose[:1]])  # a closed path, so that the work of gravity is 0
+    paths = [np.linspace(a, b, 100, endpoint=False) for a, b in pairwise(pose)]
+    q = np.vstack([np.vstack([np.repeat(a[:1], 60, 0), a]) for a in paths] + [np.repeat(pose[-1:], 60, 0)])
     recording = with_efforts(q, t=np.arange(len(q)) / 100)
     friction = 0.05 * ARM.effort_limits * np.tanh(np.gradient(q, 0.01, axis=0) / 0.05)
     recording = replace(recording, tau=recording.measured_effort() + friction)
@@ -90,8 +90,8 @@ def test_rests_of_a_motion_are_judged_as_poses():
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
 @pytest.mark.parametrize(("name", "joint"), [("mtmr", 1), ("mtmr", 2), ("psm", 0), ("psm", 1)])
-def test_one_wrong_sign_is_refused_and_its_joint_named(name, joint, coordinates):
-    """With Coulomb friction of either sign, which no pose is free of."""
+def test_refuses_one_wrong_sign_of_poses(name, joint, coordinates):
+    """The efforts contain Coulomb friction of random sign, as real poses do."""
     arm, generator = load_arm(name), np.random.default_rng(5)
     recording = with_efforts(arm.sample_poses(20, generator, 0.1), arm)
     friction = 0.03 * arm.effort_limits * generator.choice([-1, 1], recording.q.shape)
@@ -103,8 +103,8 @@ def test_one_wrong_sign_is_refused_and_its_joint_named(name, joint, coordinates)
     assert (refusal.kind, refusal.where, refusal.joints) == ("effort sign", arm.joint_names[joint], (joint,))
 
 
-def test_a_spring_or_a_small_gravity_is_no_wrong_sign():
-    """Efforts against gravity that something else explains: an offset, or what cables hold of a light wrist."""
+def test_accepts_opposite_efforts_of_offsets_or_cables():
+    """Efforts may be opposite to gravity because of an offset, or because of cables at a light wrist."""
     recording = poses(20)
     tau = recording.measured_effort().copy()
     tau[:, 1] -= 3 * np.mean(tau[:, 1])
@@ -113,14 +113,14 @@ def test_a_spring_or_a_small_gravity_is_no_wrong_sign():
 
 
 @pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40"])
-def test_a_wrong_sign_in_real_poses_is_refused(name, shared_data):
+def test_refuses_a_wrong_sign_in_real_poses(name, shared_data):
     recording = read_recording(shared_data / "mtm_static" / f"{name}.csv", ARM)
     for joint in (1, 2):
         (refusal,) = check(with_sign(recording, joint), ARM).refusals
         assert refusal.joints == (joint,)
 
 
-def test_real_recordings_pass(shared_data):
+def test_accepts_real_recordings(shared_data):
     checked = 0
     for path in [*(shared_data / "mtm_static").glob("mtm*.csv"), *(shared_data / "trajectories").glob("*_one*.csv")]:
         arm = load_arm("psm" if path.name.startswith("psm") else "mtmr")

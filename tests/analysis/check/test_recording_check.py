@@ -1,4 +1,4 @@
-"""`check`: a clean motion has no fault, what an arm did or did not do is said, and what is no motion."""
+"""Checks of simulated motions and poses, and the command `dvrk-drake check`."""
 
 import json
 from dataclasses import replace
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_a_clean_motion_gives_only_its_period(name):
+def test_clean_motion_has_only_the_period_as_finding(name):
     report = check_recording(clean_motion(name), load_arm(name))
     assert [finding.kind for finding in report.findings] == ["repetition"]
     assert report.period == pytest.approx(PERIOD, abs=1e-4)
@@ -39,21 +39,21 @@ def test_a_clean_motion_gives_only_its_period(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_floor_is_the_noise_that_was_put_into_the_efforts(name):
+def test_floor_equals_the_simulated_noise(name):
     arm = load_arm(name)
     report = check_recording(clean_motion(name), arm)
     white = np.random.default_rng(0).normal(size=(20000, 1)) * EFFORT_NOISE
     passed = float(np.std(low_pass(white, RATE, arm.identification.effort_cut_off)))
-    # In actuator coordinates noise of coupled joints adds; the first is driven by its own motor.
+    # The noise of coupled joints adds up in actuator coordinates. The first joint has its own motor.
     assert report.joints[0].floor == pytest.approx(passed, rel=0.15)
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_the_same_in_actuator_coordinates(name):
+def test_actuator_coordinates_have_the_same_findings(name):
     arm, recording = load_arm(name), clean_motion(name)
-    ours, theirs = (check_recording(r, arm) for r in (recording, recording.in_actuator_coordinates(arm)))
-    assert [f.kind for f in ours.findings] == [f.kind for f in theirs.findings]
-    for a, b in zip(ours.joints, theirs.joints, strict=True):
+    joint, actuator = (check_recording(r, arm) for r in (recording, recording.in_actuator_coordinates(arm)))
+    assert [f.kind for f in joint.findings] == [f.kind for f in actuator.findings]
+    for a, b in zip(joint.joints, actuator.joints, strict=True):
         assert a.floor == pytest.approx(b.floor, rel=1e-6)
         assert a.range == pytest.approx(b.range, rel=1e-9)
 
@@ -66,14 +66,14 @@ def test_a_motion_that_does_not_repeat_has_no_floor():
     assert {f.severity for fs in kinds.values() for f in fs} <= {"note", "warning"}
 
 
-def test_a_joint_that_never_moves():
+def test_detects_a_joint_that_does_not_move():
     still = changed(changed(clean_motion(), "q", 3, lambda x: 0 * x + 0.1), "qd", 3, lambda x: 0 * x)
     kinds = found(still)
     assert [f.joints for f in kinds["never moves"]] == [(3,)]
     assert {f.severity for fs in kinds.values() for f in fs} <= {"note", "warning"}
 
 
-def test_little_excitation():
+def test_detects_little_excitation():
     arm = load_arm("psm")
     middle = (arm.position_lower[0] + arm.position_upper[0]) / 2
     small = changed(clean_motion(), "q", 0, lambda x: middle + 0.1 * (x - middle))
@@ -85,14 +85,14 @@ def test_little_excitation():
     )
 
 
-def test_joints_that_move_together():
+def test_detects_joints_that_move_together():
     whole = clean_motion()
     q, qd = whole.q.copy(), whole.qd.copy()
     q[:, 1], qd[:, 1] = 0.5 * q[:, 0], 0.5 * qd[:, 0]
     assert [f.joints for f in found(replace(whole, q=q, qd=qd))["move together"]] == [(0, 1)]
 
 
-def test_outside_limits():
+def test_detects_positions_outside_limits():
     arm = load_arm("psm")
     beyond = arm.position_upper[4] + 0.05
     whole = clean_motion()
@@ -118,26 +118,26 @@ def test_poses_have_no_signals():
     assert report.joints[1].velocity_gain is None
 
 
-def test_poses_whose_efforts_are_reactions():
+def test_refuses_poses_with_inverted_efforts():
     arm = load_arm("mtml")
     recording = poses(arm)
     kinds = found(replace(recording, tau=-recording.tau), "mtml")
     assert {1, 2} <= {f.joints[0] for f in kinds["effort sign"]}
 
 
-def test_few_poses():
+def test_warns_of_few_poses():
     assert found(replace(poses(load_arm("mtml"), 5)), "mtml")["few poses"][0].size == 5
 
 
-def test_another_number_of_joints():
+def test_refuses_another_number_of_joints():
     assert found(Recording(np.zeros((5, 6)), np.zeros((5, 6))))["unusable"][0].severity == "refusal"
 
 
-def test_no_efforts():
+def test_refuses_a_recording_without_efforts():
     assert found(replace(clean_motion(), tau=None))["unusable"][0].severity == "refusal"
 
 
-def test_a_motion_without_velocities():
+def test_motion_without_velocities():
     kinds = found(replace(clean_motion(), qd=None))
     assert set(kinds) == {"no velocities", "repetition"}
 
@@ -149,7 +149,7 @@ def test_short_recordings_are_not_refused(rows):
     assert check_recording(short, load_arm("psm")).refusals == ()
 
 
-def test_nothing_moves_and_nothing_pulls():
+def test_arm_at_rest_without_efforts():
     whole = clean_motion()
     still = replace(whole, q=whole.q * 0 + whole.q[0], qd=0 * whole.qd, tau=0 * whole.tau)
     assert set(found(still)) == {"never moves", "no effort", "no repetition"}
@@ -188,11 +188,11 @@ def test_command_prints_findings_and_writes_json(tmp_path, capsys):
     assert {f["kind"] for f in report["findings"]} >= {"velocity disagrees", "repetition"}
 
 
-def test_command_says_that_poses_have_no_spectra(tmp_path, capsys):
+def test_command_plots_no_spectra_of_poses(tmp_path, capsys):
     write_recording(poses(load_arm("mtml")), tmp_path / "poses.csv")
     arguments = ["check", str(tmp_path / "poses.csv"), "--arm", "mtml", "--plots", str(tmp_path / "plots")]
     assert main(arguments) == 0
-    assert "no plots: spectra need a motion with efforts" in capsys.readouterr().err
+    assert "spectra require a motion with efforts" in capsys.readouterr().err
 
 
 def test_command_refuses_with_exit_code_2(tmp_path, capsys):
@@ -206,7 +206,7 @@ def test_command_refuses_with_exit_code_2(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("rows", [np.random.default_rng(0).permutation(1000), np.r_[0:500, 499:999]])
-def test_a_motion_whose_times_go_back_is_not_taken_for_poses(rows):
+def test_motion_with_decreasing_times_is_not_poses(rows):
     motion = clean_motion()
     shuffled = Recording(q=motion.q[rows], tau=motion.tau[rows], qd=motion.qd[rows], t=motion.t[rows])
     with pytest.raises(RecordingError, match="t does not increase"):

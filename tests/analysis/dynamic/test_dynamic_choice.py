@@ -15,7 +15,7 @@ from dvrk_drake.models.arm import load_arm
 FOLDS, ROWS = 12, 1200
 
 
-def arm_that_knows(**known):
+def arm_with_known_effects(**known):
     arm = load_arm("psm")
     known_effects = {f"actuator.{joint}": kinds for joint, kinds in known.items()}
     return replace(arm, identification=replace(arm.identification, known_effects=known_effects))
@@ -31,7 +31,7 @@ def of(effects, coordinate):
 
 
 def test_effects_of_the_arm_file_are_mandatory():
-    arm = arm_that_knows(pitch=["cable 1"], jaw=["asymmetric friction"])
+    arm = arm_with_known_effects(pitch=["cable 1"], jaw=["asymmetric friction"])
     always, candidates = drive_effects(arm, moving(arm)), optional_effects(arm, moving(arm))
     assert not set(always) & set(candidates)
     assert {("cable sine", 1.0), ("cable cosine", 1.0)} <= of(always, "actuator.pitch")
@@ -48,14 +48,14 @@ def test_effects_of_the_arm_file_are_mandatory():
     [
         (
             {"pitch": ["magnet"]},
-            'actuator.pitch: unknown "magnet"; known: spring, cable 1, cable 2, asymmetric friction',
+            'actuator.pitch: unknown effect "magnet". Allowed: spring, cable 1, cable 2, asymmetric friction',
         ),
-        ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow; known: actuator.yaw"),
-        ({"insertion": ["cable 1"]}, "cable sine is of an angle, and actuator.insertion slides"),
+        ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow. Allowed: actuator.yaw"),
+        ({"insertion": ["cable 1"]}, "cable sine requires a revolute coordinate, but actuator.insertion is prismatic"),
     ],
 )
 def test_invalid_known_effects_are_rejected(known, message):
-    arm = arm_that_knows(**known)
+    arm = arm_with_known_effects(**known)
     with pytest.raises(ArmError, match=message):
         drive_effects(arm, moving(arm))
 
@@ -105,4 +105,4 @@ def test_present_effects_are_selected_and_noise_is_not():
             independent=0.1,
         )
         for part in (selection, selection.without(4, 2)):
-            np.testing.assert_array_equal(part.choose(np.array([0]), np.arange(1, 22)), [0, 1])
+            np.testing.assert_array_equal(part.select(np.array([0]), np.arange(1, 22)), [0, 1])

@@ -56,10 +56,12 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
     slow, fast = (np.hstack([np.sin(f * w * T[:, None]), np.cos(f * w * T[:, None])]) for f in (1, 5))
     X, weights, prior = [slow, 0.3 * fast + 0.1 * slow], np.array([1.0, 0.3]), 1e-6 * np.eye(6)
     fold = (T % PERIOD / PERIOD * 12).astype(int)
-    problem = SimpleNamespace(chosen_columns=lambda i, _: (np.arange(6), X[i]), to_base=lambda _: np.eye(6), fold=fold)
+    problem = SimpleNamespace(
+        actuator_columns=lambda i, _: (np.arange(6), X[i]), to_base=lambda _: np.eye(6), fold=fold
+    )
     information = sum(weight * x.T @ x for weight, x in zip(weights, X, strict=True))
     fit = SimpleNamespace(
-        information=information, prior_precision=prior, weights=weights, chosen=np.arange(0), lower=np.full(6, -np.inf)
+        information=information, prior_precision=prior, weights=weights, effects=np.arange(0), lower=np.full(6, -np.inf)
     )
     estimates, predicted = [], []
     for _ in range(100):
@@ -85,12 +87,12 @@ def test_uninformed_parameters_keep_the_prior_variance():
         information=2.0 * X.T @ X,
         prior_precision=prior,
         weights=weights,
-        chosen=np.arange(0),
+        effects=np.arange(0),
         x=np.zeros(2),
         lower=np.full(2, -np.inf),
     )
     problem = SimpleNamespace(
-        chosen_columns=lambda i, _: (np.arange(2), X), to_base=lambda _: np.eye(2), fold=(T // 4).astype(int)
+        actuator_columns=lambda i, _: (np.arange(2), X), to_base=lambda _: np.eye(2), fold=(T // 4).astype(int)
     )
     covariance = parameter_covariance(problem, fit, tau, RATE, CUT_OFF, None)
     assert covariance[1, 1] == pytest.approx(1 / 4.0)

@@ -45,9 +45,9 @@ def case(request, shared_data, tmp_path_factory):
     motion, model = folder / "motion.csv", folder / "model.yaml"
     write_recording(recording, motion)
     plots = ["--plots", str(folder / "plots")]
-    with redirect_stdout(StringIO()) as said:
+    with redirect_stdout(StringIO()) as output:
         assert main(["identify", str(motion), "--arm", request.param, "--output", str(model), *plots]) == 0
-    assert "cross-validated" in said.getvalue()
+    assert "cross-validated" in output.getvalue()
     return request.param, arm, recording, IdentifiedModel.load(model), folder
 
 

@@ -13,9 +13,9 @@ from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
     effect_fault,
+    is_prismatic,
     joint_row,
     position_along,
-    slides,
 )
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
@@ -90,9 +90,9 @@ def test_loaded_model_is_equal_and_conflicts_are_rejected(case, tmp_path):
     loaded = IdentifiedModel.load(tmp_path / "model.yaml")
     np.testing.assert_allclose(loaded.holding_torque(q), model.holding_torque(q), atol=1e-12)
     assert all(e.coefficient != 0 and e.standard_error > 0 for e in model.holding_effects)
-    with pytest.raises(ModelError, match="has effects only there"):
+    with pytest.raises(ModelError, match="all effects in dynamics"):
         dataclasses.replace(model, effects=model.holding_effects[:1]).check()
-    with pytest.raises(ModelError, match="the gravity that stands there"):
+    with pytest.raises(ModelError, match=r"gravity equal to dynamics\.gravity"):
         dynamics = dataclasses.replace(model.dynamics, gravity=[float(-g) for g in model.arm.gravity])
         dataclasses.replace(model, dynamics=dynamics).check()
 
@@ -129,7 +129,7 @@ def test_identical_coordinates_are_listed_once(name):
     assert np.abs(unit @ unit.T - np.eye(len(kept))).max() < 1 - 1e-6
     for c, row in rows.items():
         assert np.abs(unit @ row / np.linalg.norm(row)).max() > 1 - 1e-9, f"{c} is lost"
-    assert [c for c in rows if slides(arm, c)] == [f"{kind}.insertion" for kind in ("actuator", "joint")] * (
+    assert [c for c in rows if is_prismatic(arm, c)] == [f"{kind}.insertion" for kind in ("actuator", "joint")] * (
         name == "psm"
     )
 

@@ -16,4 +16,4 @@ def test_nearly_equal_columns_are_named():
     (pair,) = uncertainty.strong_correlations()
     assert (pair.first, pair.second) == ("m4 c4x", "m5 c5x")
     assert pair.correlation == pytest.approx(-0.995, abs=2e-3)
-    assert "only their scaled sum is well known" in str(pair)
+    assert "only a scaled sum is identifiable" in str(pair)

@@ -1,4 +1,4 @@
-"""A payload from two recordings of one motion: identities, recovery on simulated arms and on a real one, refusals."""
+"""Estimation of a payload from two recordings of one motion, on simulated arms and on a real arm."""
 
 import dataclasses
 import json
@@ -10,7 +10,12 @@ from loaded_arm import two_days
 from pydrake.multibody.tree import MultibodyForces
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.payload.payload import PayloadIdentification, as_good, better_link_warnings, estimate_payload
+from dvrk_drake.analysis.payload.payload import (
+    PayloadIdentification,
+    better_link_warnings,
+    equally_good_links,
+    estimate_payload,
+)
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -34,7 +39,7 @@ CASES = {
 
 
 def inverse_dynamics(arm, plant, context, q, v, vd):
-    """(n,) efforts of the joints, by Drake, projected through the linkage."""
+    """Returns the joint efforts (n,) that Drake computes, mapped to the independent joints of the linkage."""
     order = [plant.GetJointByName(name).velocity_start() for name in arm.tree_joint_names]
     tree = np.zeros((3, plant.num_velocities()))
     tree[:, order] = arm.linkage.position(q), arm.linkage.velocity(v), arm.linkage.velocity(vd)
@@ -46,71 +51,69 @@ def inverse_dynamics(arm, plant, context, q, v, vd):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_point_mass_in_the_regressor_is_a_point_mass_in_drake(case):
-    name, link, mass, place = CASES[case]
+def test_point_mass_equals_a_drake_body(case):
+    name, link, mass, position = CASES[case]
     arm, plant = load_arm(name), make_arm_plant(load_arm(name))
     regressor, generator = DynamicRegressor(arm), np.random.default_rng(0)
     names = [own.link for own in regressor.links]
-    k, added = names.index(link), point_mass_parameters(mass, np.array(place))
+    k, added = names.index(link), point_mass_parameters(mass, np.array(position))
     context = plant.CreateDefaultContext()
     q = arm.sample_poses(5, generator)
     v, vd = generator.normal(size=(2, *q.shape))
     before = [inverse_dynamics(arm, plant, context, *sample) for sample in zip(q, v, vd, strict=True)]
-    both = LinkInertia(link, regressor.links[k].parameters + added).to_spatial_inertia()
-    plant.GetBodyByName(link).SetSpatialInertiaInBodyFrame(context, both)
+    loaded = LinkInertia(link, regressor.links[k].parameters + added).to_spatial_inertia()
+    plant.GetBodyByName(link).SetSpatialInertiaInBodyFrame(context, loaded)
     after = [inverse_dynamics(arm, plant, context, *sample) for sample in zip(q, v, vd, strict=True)]
-    ours = regressor.regressor(q, v, vd)[..., 10 * k : 10 * k + 10] @ added
-    np.testing.assert_allclose(ours, np.subtract(after, before), atol=1e-10)
+    change = regressor.regressor(q, v, vd)[..., 10 * k : 10 * k + 10] @ added
+    np.testing.assert_allclose(change, np.subtract(after, before), atol=1e-10)
 
 
-def test_a_point_mass_is_the_limit_of_bodies_that_can_exist():
+def test_point_mass_has_a_singular_pseudo_inertia():
     values = np.linalg.eigvalsh(pseudo_inertia(point_mass_parameters(0.2, np.array([0.1, -0.3, 0.2]))))
     assert values[:3] == pytest.approx(0, abs=1e-12) and values[3] > 0.1
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_truth_is_in_the_interval(case, seed):
-    """Four quantities, twelve arms: at the nominal rate two or three of the 45 intervals miss, by little.
+def test_intervals_contain_the_true_values(case, seed):
+    """At the nominal rate, 2 or 3 of the 45 intervals do not contain the true value.
 
-    So that no seed has to be picked, 1.5 times the interval is asked for; benchmarks/payload_coverage.py has the rate.
+    The test therefore uses 1.5 times the interval. benchmarks/payload_coverage.py measures the rate.
     """
-    name, link, mass, place = CASES[case]
-    model, reference, loaded = two_days(name, link, mass, place, seed)
+    name, link, mass, position = CASES[case]
+    model, reference, loaded = two_days(name, link, mass, position, seed)
     (payload,) = estimate_payload(reference, loaded, model, [link])
     reach = 1.5 * payload.quantile
     known = payload.body.determined
     assert abs(payload.body.mass - mass) < reach * payload.mass_error
-    assert np.all(np.abs(payload.body.place - place)[known] < reach * payload.place_error[known])
+    assert np.all(np.abs(payload.body.position - position)[known] < reach * payload.position_error[known])
     assert payload.found
     assert payload.mass_error < 0.2 * mass
-    # Along a bar that keeps its orientation nothing depends on the place; everything else shows.
+    # The position along a bar that keeps its orientation is not identifiable.
     np.testing.assert_array_equal(known, [True, case != "bar", True])
-    assert np.isnan(payload.place_error[1]) == (case == "bar")
+    assert np.isnan(payload.position_error[1]) == (case == "bar")
 
 
-def test_the_link_is_found_and_those_that_move_alike_are_told():
+def test_finds_the_link_and_equally_good_links():
     model, reference, loaded = two_days("psm", "end_link", 0.2, [0.0, 0.02, 0.39], 3)
-    best = [payload.link for payload in as_good(estimate_payload(reference, loaded, model))]
-    # The cranks and the end link turn about points of the yaw axis by the same angle.
+    best = [payload.link for payload in equally_good_links(estimate_payload(reference, loaded, model))]
+    # The cranks and the end link rotate by the same angle about points on the yaw axis.
     assert set(best) == {"end_link", "back_crank_link", "front_crank_link"}
 
 
-def test_an_arm_without_payload_has_none():
+def test_no_payload_is_found_without_payload():
     for seed in range(3):
         model, reference, loaded = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], seed)
         assert not any(p.found for p in estimate_payload(reference, loaded, model, ["end_link", "bottom_bar_link"]))
 
 
-def test_a_recording_against_itself_is_refused():
+def test_rejects_identical_recordings():
     model, reference, _ = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
-    with pytest.raises(
-        RecordingError, match=r"simulated: shows no difference from the reference: .* the same recording"
-    ):
+    with pytest.raises(RecordingError, match=r"simulated: the efforts equal the efforts of the reference"):
         estimate_payload(reference, reference, model, ["end_link"])
 
 
-def test_what_is_not_found_is_said_with_how_much_it_may_be(capsys):
+def test_largest_mass_is_printed_without_payload(capsys):
     link = "end_link"
     model, reference, other = two_days("psm", link, 0.0, [0.0, 0.0, 0.0], 0)
     (none,) = estimate_payload(reference, other, model, [link])
@@ -118,7 +121,7 @@ def test_what_is_not_found_is_said_with_how_much_it_may_be(capsys):
     printed = " ".join(capsys.readouterr().out.split())
     assert "No payload found on end_link" in printed and f"below {1e3 * none.largest_at_com:.3g} g (95 %)" in printed
     assert "mass [kg]" not in printed
-    # What weighs more is not below that.
+    # A larger mass has a larger upper limit.
     com = next(own for own in model.regressor.links if own.link == link).parameters
     mass = 1.5 * none.largest_at_com
     model, reference, loaded = two_days("psm", link, mass, com[1:4] / com[0], 0)
@@ -131,12 +134,12 @@ def result_of(payload, estimates):
 
 
 def assert_end_link_explains(estimates, capsys):
-    """A payload on the end link is not denied, and not attributed to another link without a warning."""
+    """Asserts that estimates on other links have a warning about a payload on the end link."""
     by_link = {payload.link: payload for payload in estimates}
     wrong = [by_link["insertion_link"], by_link["bottom_bar_link"]]
     for payload in wrong:
         (warning,) = map(str, better_link_warnings(payload, estimates))
-        assert f"{payload.link}: does not explain the change best" in warning and "on end_link" in warning
+        assert f"{payload.link}: a payload on" in warning and "on end_link" in warning
         assert "\n" not in warning and "--link end_link" in warning
         assert payload.as_dict(estimates)["better_links"][0] == "end_link"
         print_payload(make_console(), result_of(payload, estimates))
@@ -151,9 +154,9 @@ def assert_end_link_explains(estimates, capsys):
 LINKS = ["insertion_link", "bottom_bar_link", "end_link"]
 
 
-def test_a_payload_on_another_link_is_reported(capsys):
-    name, link, mass, place = CASES["end"]
-    model, reference, loaded = two_days(name, link, mass, place, 0)
+def test_reports_a_payload_on_another_link(capsys):
+    name, link, mass, position = CASES["end"]
+    model, reference, loaded = two_days(name, link, mass, position, 0)
     assert_end_link_explains(estimate_payload(reference, loaded, model, LINKS), capsys)
 
 
@@ -165,30 +168,30 @@ def test_without_payload_no_link_is_better():
         assert payload.as_dict(estimates)["largest_at_com"] > 0
 
 
-def test_a_reference_that_begins_later_is_aligned():
-    name, link, mass, place = CASES["end"]
-    model, reference, loaded = two_days(name, link, mass, place, 0)
+def test_aligns_a_reference_that_begins_later():
+    name, link, mass, position = CASES["end"]
+    model, reference, loaded = two_days(name, link, mass, position, 0)
     late = Recording(reference.q[260:], reference.tau[260:], reference.qd[260:], reference.t[260:])
     (payload,) = estimate_payload(late, loaded, model, [link])
-    # Both repeat after 6.5 s, and t is the same clock.
+    # Both motions have a period of 6.5 s, and t is the same clock.
     assert (payload.shift + 3.25) % 6.5 - 3.25 == pytest.approx(0, abs=2e-3)
     assert abs(payload.body.mass - mass) < 1.5 * payload.quantile * payload.mass_error
 
 
-def test_refusals():
+def test_rejects_invalid_inputs():
     model, reference, loaded = two_days("psm", "end_link", 0.2, [0.0, 0.0, 0.4], 0)
-    with pytest.raises(ModelError, match='unknown link "arm"; links of PSM that move: yaw_link, back_crank_link'):
+    with pytest.raises(ModelError, match=r'unknown link "arm"\. Moving links of PSM: yaw_link, back_crank_link'):
         estimate_payload(reference, loaded, model, ["arm"])
     backwards = Recording(loaded.q[::-1], loaded.tau[::-1], -loaded.qd[::-1], loaded.t, source="other.csv")
     with pytest.raises(
-        RecordingError, match=r"other.csv: is not the motion of the reference: .* at most 10% is allowed"
+        RecordingError, match=r"other.csv: the motion differs from the reference. .* at most 10 % is allowed"
     ):
         estimate_payload(reference, backwards, model, ["end_link"])
 
 
-def test_from_the_command_line(tmp_path, capsys):
-    name, link, mass, place = CASES["end"]
-    _, reference, loaded = two_days(name, link, mass, place, 0)
+def test_payload_command(tmp_path, capsys):
+    name, link, mass, position = CASES["end"]
+    _, reference, loaded = two_days(name, link, mass, position, 0)
     paths = [str(tmp_path / f"{which}.csv") for which in ("reference", "loaded")]
     for recording, path in zip((reference, loaded), paths, strict=True):
         write_recording(recording, path)
@@ -206,9 +209,9 @@ def test_from_the_command_line(tmp_path, capsys):
     assert len(errors) == 3 and 'unknown link "nose"' in errors[0] and "is an input" in errors[1]
 
 
-def test_a_named_link_is_compared_with_all_others(tmp_path, capsys):
-    name, link, mass, place = CASES["end"]
-    model, reference, loaded = two_days(name, link, mass, place, 0)
+def test_given_link_is_compared_with_all_links(tmp_path, capsys):
+    name, link, mass, position = CASES["end"]
+    model, reference, loaded = two_days(name, link, mass, position, 0)
     paths = [str(tmp_path / f"{which}.csv") for which in ("reference", "loaded")]
     for recording, path in zip((reference, loaded), paths, strict=True):
         write_recording(recording, path)
@@ -216,17 +219,18 @@ def test_a_named_link_is_compared_with_all_others(tmp_path, capsys):
     known.save(tmp_path / "model.yaml")
     command = ["payload", *paths, "--model", str(tmp_path / "model.yaml"), "--link"]
     assert main([*command, "insertion_link"]) == 0
-    said = capsys.readouterr()
-    (warning,) = messages(said.err)
-    assert warning.startswith("dvrk-drake: warning: insertion_link: does not explain the change best")
+    output = capsys.readouterr()
+    (warning,) = messages(output.err)
+    assert warning.startswith("dvrk-drake: warning: insertion_link: a payload on")
     assert "end_link" in warning
-    assert "explains the change" in " ".join(said.out.split()) and "below" not in said.out
+    assert "explains the change" in " ".join(output.out.split()) and "below" not in output.out
     assert main([*command, link]) == 0
-    said = capsys.readouterr()
-    assert not messages(said.err) and f"Payload on {link}" in said.out and "explains the change" not in said.out
+    output = capsys.readouterr()
+    assert not messages(output.err) and f"Payload on {link}" in output.out and "explains the change" not in output.out
 
 
-#: File, link, mass [kg], height above the remote centre [m]: its README, and docs/payload.md for how places are read.
+#: File, link, mass [kg] and height above the remote centre [m], from the README of the recordings. docs/payload.md
+#: describes how the positions were obtained.
 WEIGHTS = [
     ("psm_one_105g_parallel.csv", "bottom_bar_link", 0.105, 0.200),
     ("psm_one_205g_insertion.csv", "end_link", 0.205, 0.535),
@@ -235,7 +239,7 @@ WEIGHTS = [
 
 @pytest.fixture(scope="module")
 def unloaded(shared_data):
-    """A real PSM without weight: its recordings' folder, the recording and the model of it."""
+    """Returns the folder of the recordings of a real PSM, the recording without weight, and its model."""
     folder = shared_data / "trajectories"
     if not (folder / "psm_one_no_weight.csv").is_file():
         pytest.skip(f"needs {folder}")
@@ -250,12 +254,12 @@ def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
     loaded = read_recording(folder / file, model.arm, "actuator")
     (payload,) = estimate_payload(reference, loaded, model, [link])
     assert abs(payload.body.mass - mass) < payload.quantile * payload.mass_error
-    assert abs(payload.place_in_base[2] - height) < payload.quantile * payload.place_error[2]
+    assert abs(payload.position_in_base[2] - height) < payload.quantile * payload.position_error[2]
     assert abs(payload.body.mass / mass - 1) < 0.15
     assert payload.found
 
 
-def test_a_real_payload_on_another_link_is_reported(unloaded, capsys):
+def test_reports_a_real_payload_on_another_link(unloaded, capsys):
     folder, reference, model = unloaded
     loaded = read_recording(folder / "psm_one_205g_insertion.csv", model.arm, "actuator")
     assert_end_link_explains(estimate_payload(reference, loaded, model, LINKS), capsys)

@@ -1,4 +1,4 @@
-"""Whitening: an autoregressive error becomes white, and what is linear stays linear."""
+"""Whitening filter: an autoregressive error becomes white, and the filter is linear."""
 
 import numpy as np
 from scipy.signal import lfilter
@@ -9,28 +9,28 @@ RATE, CUT_OFF = 40.0, 5.0
 STEP = 4
 
 
-def red(coefficients, rows, generator):
-    """Every `STEP`-th row, from each of the first ones on, is an autoregression of its own."""
+def autoregression(coefficients, rows, generator):
+    """Returns a signal whose rows k, k + STEP, k + 2 STEP, ... are an autoregression, for each k < STEP."""
     x = np.empty(rows * STEP)
     for first in range(STEP):
         x[first::STEP] = lfilter([1.0], [1.0, *(-np.array(coefficients))], generator.normal(size=rows))
     return x
 
 
-def test_the_autoregression_is_found_and_what_is_left_is_white():
+def test_estimates_the_autoregression_and_whitens():
     generator = np.random.default_rng(0)
     true = np.array([[1.2, -0.5], [0.0, 0.0]])
-    x = np.column_stack([red(own, 5000, generator) for own in true])
+    x = np.column_stack([autoregression(coefficients, 5000, generator) for coefficients in true])
     whitening = Whitening.of(x, 2, RATE, CUT_OFF)
-    assert whitening.step == STEP and whitening.lost == 2 * STEP
+    assert whitening.step == STEP and whitening.num_removed == 2 * STEP
     np.testing.assert_allclose(whitening.coefficients, true, atol=0.03)
     for channel in range(2):
         white = whitening(x[:, channel], channel)
-        assert len(white) == len(x) - whitening.lost
+        assert len(white) == len(x) - whitening.num_removed
         assert abs(np.corrcoef(white[STEP:], white[:-STEP])[0, 1]) < 0.02
 
 
-def test_it_is_linear_and_none_changes_nothing():
+def test_whitening_is_linear():
     generator = np.random.default_rng(1)
     x, y = generator.normal(size=(2, 100, 3))
     whitening = Whitening(np.array([[0.5, -0.2]]), 3)

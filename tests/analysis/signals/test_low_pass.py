@@ -48,7 +48,7 @@ def test_low_pass_and_correlation_equal_scipy(order, cut_off):
 
 
 def test_too_few_rows_for_the_filter_are_rejected():
-    with pytest.raises(ValueError, match="needs more than 21 rows, got 21"):
+    with pytest.raises(ValueError, match="requires more than 21 rows, got 21"):
         low_pass(np.zeros(21), RATE, 10.0)
 
 

@@ -24,13 +24,13 @@ def arm():
     return load_arm("psm")
 
 
-def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
+def test_static_segments_identify_the_arm(arm):
     generator = np.random.default_rng(0)
     poses = arm.sample_poses(16, generator, margin=0.1)
     recording = motion_with_pauses(arm, poses, generator)
     parts, measured = low_speed_segments(recording, arm)
     assert np.all(measured.sum(axis=1) == 1)
-    # A joint that hardly moves between two poses is slow all the time. Both rests are then one pass.
+    # A joint that hardly moves between two poses is always slow. Both static segments are then one low-speed segment.
     assert np.all(measured.sum(axis=0) >= 0.7 * len(poses))
     truth = IdentifiedModel.from_arm(arm)
     fresh = arm.sample_poses(200, generator)
@@ -40,7 +40,7 @@ def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
     # Yaw, pitch and insertion carry weight. The small torques of the wrist are below its noise, as on a real arm.
     assert np.all(error[:3] < 0.05 * torque[:3])
     assert np.all(error <= torque + 2e-3 * arm.effort_limits)
-    with pytest.raises(IdentificationError, match=r"the arm moves \(joint \d at .* or the slow parts of a motion"):
+    with pytest.raises(IdentificationError, match=r"the arm moves \(joint \d at .* or the low-speed segments"):
         identify_static(recording, arm)
 
 
@@ -62,7 +62,7 @@ def test_segments_at_1_khz_equal_those_at_200_hz(arm):
     assert fast.measured.sum(axis=0).min() >= 0.6 * len(poses)
 
 
-def test_rest_ends_at_a_gap_in_the_times(arm):
+def test_static_segment_ends_at_a_gap_in_the_times(arm):
     """The motion is unknown where samples are missing."""
     a, b = arm.sample_poses(2, np.random.default_rng(1), margin=0.1)
     recording = motion_with_pauses(arm, [a, b], np.random.default_rng(2), rest=2.0)
@@ -77,23 +77,23 @@ def test_rest_ends_at_a_gap_in_the_times(arm):
 
 @pytest.mark.parametrize("rate", [100.0, 1000.0])
 @pytest.mark.parametrize("with_speeds", [True, False])
-def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
+def test_static_segments_are_poses_of_all_joints(arm, rate, with_speeds):
     generator = np.random.default_rng(3)
     poses = arm.sample_poses(12, generator, margin=0.1)
     recording = motion_with_pauses(arm, [*poses, poses[0]], generator, rest=1.0, rate=rate)
     noisy = recording.qd + arm.per_joint(0.01, 0.001) * generator.normal(size=recording.q.shape)
     rests = static_poses(replace(recording, qd=noisy if with_speeds else None), arm)
     assert len(rests) == len(poses), "the last pose is the first again"
-    # A rest begins when the arm is slow, not when it stops.
+    # A static segment begins when the speed is low, before the arm stops.
     np.testing.assert_allclose(rests.q, poses, atol=1e-4)
     truth = IdentifiedModel.from_arm(arm).holding_torque(poses)
     assert np.all(np.abs(rests.tau - truth) < 1e-3 * arm.effort_limits)
     found = find_poses(recording, arm)
     assert found.measured is None
-    assert found.note == f"12 poses at which the arm rests are taken; {len(recording)} rows"
+    assert found.note == f"Static poses found in the motion: 12, in {len(recording)} rows."
 
 
-def test_recording_without_rests_is_unchanged(arm):
+def test_recording_without_static_segments_is_unchanged(arm):
     generator = np.random.default_rng(4)
     poses = arm.sample_poses(12, generator, margin=0.1)
     moving = motion_with_pauses(arm, poses, generator, rest=0.0)
@@ -108,18 +108,18 @@ def test_recording_without_low_speed_segments_is_rejected(arm):
     q = np.zeros((50, 7))
     with pytest.raises(
         IdentificationError,
-        match=r"need a motion: qd1\.\.qd7, and t that increases by less than 0\.05 s, over 100 rows",
+        match=r"not a motion, .* qd1\.\.qd7, times t that increase by less than 0\.05 s, and at least 100 rows",
     ):
         low_speed_segments(Recording(q=q, tau=q), arm)
     t = np.arange(400) * 0.1
     q = np.zeros((400, 7))
-    with pytest.raises(IdentificationError, match=r"t that increases by less than 0\.05 s"):
+    with pytest.raises(IdentificationError, match=r"times t that increase by less than 0\.05 s"):
         low_speed_segments(Recording(q=q, qd=q, tau=q, t=t), arm)
     with pytest.raises(RecordingError, match="has no efforts"):
         low_speed_segments(Recording(q=q, qd=q, t=t), arm)
     t = np.arange(2000) / RATE
     qd = np.tile(np.cos(2 * np.pi * t)[:, None], (1, 7))
-    with pytest.raises(IdentificationError, match="no joint is slow"):
+    with pytest.raises(IdentificationError, match="has no low-speed segments"):
         low_speed_segments(Recording(q=np.sin(2 * np.pi * t)[:, None] + 0 * qd, qd=qd, tau=qd, t=t), arm)
 
 

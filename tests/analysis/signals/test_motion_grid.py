@@ -63,12 +63,12 @@ def test_predicted_efforts_have_the_effort_delay(grid):
     rows = late.efforts_at_rows(lines)[late.inner]
     np.testing.assert_allclose(rows, grid.row_times[grid.inner, None] - 5.0 - np.array(delays), atol=1e-9)
     # The low-pass filter does not change a straight line.
-    np.testing.assert_allclose(late.behind_filter(late.efforts_at_rows(lines)), rows, atol=1e-3)
+    np.testing.assert_allclose(late.filter_efforts(late.efforts_at_rows(lines)), rows, atol=1e-3)
 
 
 @pytest.mark.parametrize(("seconds", "rate"), [(4.9, 200.0), (12.0, 45.0)])
 def test_short_and_coarse_motions_are_rejected(seconds, rate):
-    with pytest.raises(RecordingError, match=rf"motion\.csv: {seconds} s at {rate:g} Hz; .* at least 5 s at 50 Hz"):
+    with pytest.raises(RecordingError, match=rf"motion\.csv: .* {seconds} s at {rate:g} Hz. .* at least 5 s"):
         motion_grid(recorded(seconds, rate), ARM, default_settings(ARM))
 
 
@@ -106,13 +106,13 @@ def test_parts_of_the_efforts_add_up_to_the_model(grid):
     effects = friction_everywhere(ARM, (t, *motion(t)))
     model = true_dynamics(ARM, np.random.default_rng(0), effects)
     efforts = drive_efforts(model, grid)
-    whole = grid.behind_filter(grid.efforts_at_rows(model.effort(grid.q, grid.v, grid.vd)))
+    whole = grid.filter_efforts(grid.efforts_at_rows(model.effort(grid.q, grid.v, grid.vd)))
     size = np.sqrt(np.mean(whole**2, axis=0))
     np.testing.assert_allclose(efforts.total() / size, whole / size, atol=1e-6)
     parts = efforts.friction_part("dry") + efforts.friction_part("viscous")
     np.testing.assert_allclose((efforts.other + parts) / size, whole / size, atol=1e-6)
     # Viscous friction is proportional to the actuators' speeds.
-    speed = grid.behind_filter(grid.efforts_at_rows(ARM.transmission.velocity(grid.v)))
+    speed = grid.filter_efforts(grid.efforts_at_rows(ARM.transmission.velocity(grid.v)))
     viscous = [effect.coefficient for effect in effects if effect.kind == "viscous"]
     np.testing.assert_allclose(efforts.friction_part("viscous") / size, speed * viscous / size, atol=1e-6)
     assert set(efforts.friction) == {(effect.coordinate, part) for effect in effects for part in ("dry", "viscous")}

@@ -100,7 +100,7 @@ def test_long_parameter_names_keep_all_digits(capsys):
     ("spoil", "message"),
     [
         (lambda r: Recording(q=r.q[:, :6], tau=r.tau[:, :6]), "missing column q7; "),
-        (lambda r: Recording(q=r.q * [1, 1, 1000, 1, 1, 1, 1], tau=r.tau), "are these millimetres or centimetres?"),
+        (lambda r: Recording(q=r.q * [1, 1, 1000, 1, 1, 1, 1], tau=r.tau), "Are the positions in millimetres"),
         (lambda r: Recording(q=r.q * [3, 1, 1, 1, 1, 1, 1], tau=r.tau), "yaw (q1) = "),
         (lambda r: Recording(q=r.q, tau=r.tau + 1000 * np.eye(7)[2]), "insertion (tau3) exceed its limit of 9.88"),
     ],
@@ -122,5 +122,7 @@ def test_unknown_instrument_is_rejected_in_one_line(tmp_path, capsys):
 def test_prismatic_joint_has_no_angular_spring(arm):
     model = IdentifiedModel.from_arm(arm)
     model.effects = [DriveEffect("joint.insertion", "cable sine", 1.0, 1.0)]
-    with pytest.raises(ModelError, match=r"effects\[0\]: kind cable sine is of an angle, and joint.insertion slides"):
+    with pytest.raises(
+        ModelError, match=r"effects\[0\]: kind cable sine requires a revolute .*\.insertion is prismatic"
+    ):
         model.check()

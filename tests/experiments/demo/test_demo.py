@@ -1,4 +1,4 @@
-"""The demo with fewer poses: it must identify the ground-truth arm and hold it."""
+"""Runs the demo with fewer poses: it must identify and hold the ground-truth arm."""
 
 import io
 
@@ -9,7 +9,7 @@ from rich.console import Console
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.experiments.demo import demo
-from dvrk_drake.experiments.ground_truth import perturbed_links, visiting_trajectory
+from dvrk_drake.experiments.ground_truth import perturbed_links, pose_visit_trajectory
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import read_recording
 from dvrk_drake.reports.demo import print_demo
@@ -24,16 +24,18 @@ def result(tmp_path_factory):
     shorter.setattr(demo, "FRESH_POSES", 6)
     stages, plot = [], demo_figures.plot_positions
     shorter.setattr(
-        demo_figures, "plot_positions", lambda path, *rest: (TITLES.update({path.name: rest[-1]}), plot(path, *rest))
+        demo_figures,
+        "plot_positions",
+        lambda path, *rest: (PLOT_TITLES.update({path.name: rest[-1]}), plot(path, *rest)),
     )
-    outcome = demo.run_demo(folder, progress=lambda what, share: stages.append((what, share)))
+    outcome = demo.run_demo(folder, progress=lambda step, share: stages.append((step, share)))
     demo_figures.plot_demo(folder, outcome)
     yield folder, outcome, stages
     shorter.undo()
 
 
-#: Properties of the position plots by file name.
-TITLES: dict[str, str] = {}
+#: Titles of the position plots by file name.
+PLOT_TITLES: dict[str, str] = {}
 
 
 def test_demo_writes_everything(result):
@@ -54,10 +56,10 @@ def test_demo_writes_everything(result):
     assert len(read_recording(folder / "poses.csv")) == 20
     assert IdentifiedModel.load(folder / "model.yaml").arm.name == "MTML"
     assert all(0.0 <= share <= 1.0 for _, share in stages)
-    assert len({what for what, _ in stages}) == 4
+    assert len({step for step, _ in stages}) == 4
 
 
-def test_demo_beats_zero_torque_and_paper_on_new_poses(result):
+def test_demo_error_is_below_zero_torque_and_paper(result):
     _, outcome, _ = result
     for ours, paper in zip(outcome.fresh.joints[1:], outcome.fresh_paper.joints[1:], strict=True):
         assert ours.rms_error < 0.2 * ours.rms_torque, ours
@@ -73,13 +75,13 @@ def test_demo_identifies_simulated_springs(result):
 
 def test_demo_drifts_less_than_nominal_and_stops(result):
     _, outcome, _ = result
-    assert outcome.drift["identified"].max() < 0.3 * outcome.drift["as drawn"].max()
+    assert outcome.drift["identified"].max() < 0.3 * outcome.drift["nominal"].max()
     assert outcome.step_error.max() < 1e-3
 
 
 def test_drift_output_states_absence_of_friction(result):
     folder, outcome, _ = result
-    assert "without dry friction" in TITLES["release.png"] and demo.NO_DRY_FRICTION in TITLES["release.png"]
+    assert "without dry friction" in PLOT_TITLES["release.png"] and demo.NO_DRY_FRICTION in PLOT_TITLES["release.png"]
     console = Console(record=True, width=120, file=io.StringIO())
     print_demo(console, outcome, folder)
     text = console.export_text()
@@ -91,17 +93,17 @@ def test_drift_output_states_absence_of_friction(result):
 def test_perturbed_links_are_consistent_and_differ():
     arm = load_arm("mtml")
     links = perturbed_links(arm, np.random.default_rng(3), shift=0.002)
-    for link, drawn in zip(links, link_inertias(arm), strict=True):
-        assert link.link == drawn.link
-        M, M_drawn = link.to_spatial_inertia(), drawn.to_spatial_inertia()
-        assert M.IsPhysicallyValid() and M.get_mass() != M_drawn.get_mass()
-        assert 0 < np.abs(M.get_com() - M_drawn.get_com()).max() <= 0.002
+    for link, nominal in zip(links, link_inertias(arm), strict=True):
+        assert link.link == nominal.link
+        M, M_nominal = link.to_spatial_inertia(), nominal.to_spatial_inertia()
+        assert M.IsPhysicallyValid() and M.get_mass() != M_nominal.get_mass()
+        assert 0 < np.abs(M.get_com() - M_nominal.get_com()).max() <= 0.002
 
 
 def test_trajectory_rests_at_poses_inside_limits():
     arm = load_arm("mtml")
     poses = arm.sample_poses(6, np.random.default_rng(0), margin=0.02)
-    trajectory, settled = visiting_trajectory(arm, poses)
+    trajectory, settled = pose_visit_trajectory(arm, poses)
     for t, pose in zip(settled, poses, strict=True):
         np.testing.assert_allclose(trajectory.value(t).ravel(), pose, atol=1e-12)
         np.testing.assert_allclose(trajectory.EvalDerivative(t).ravel(), 0, atol=1e-12)

@@ -17,7 +17,7 @@ T = np.arange(0, 20.001, 0.01)
 
 
 def state(q):
-    """Returns the true state; the recordings deviate from it by 10 mrad, which must not affect the measures."""
+    """Returns the true state. The recordings deviate from it by 10 mrad, which must not affect the measures."""
     return np.hstack([q, 0 * q])
 
 
@@ -105,22 +105,25 @@ def test_failed_run_has_worst_value(kind):
     scenario, simulation = stepped(0.4 * np.clip(T / 2, 0, 1))
     measure = Measure(kind)
     measure.check(scenario)
-    assert measure.is_answer == isinstance(measure(scenario, simulation), bool)
+    assert measure.is_boolean == isinstance(measure(scenario, simulation), bool)
     worst = measure.worst
-    assert worst is {"held": False, "ran_away": True}[kind] if measure.is_answer else worst == math.inf
+    assert worst is {"held": False, "ran_away": True}[kind] if measure.is_boolean else worst == math.inf
 
 
 @pytest.mark.parametrize(
     ("measure", "message"),
     [
         (Measure("settle"), 'kind is "settle"; allowed: settling_time, overshoot'),
-        (Measure("overshoot", band=0.1), "overshoot has no band"),
-        (Measure("ran_away", time=1.0), "ran_away has no time"),
+        (Measure("overshoot", band=0.1), "band is not a setting of overshoot"),
+        (Measure("ran_away", time=1.0), "time is not a setting of ran_away"),
         (Measure("held", band=-1.0), "band is -1; allowed: 1e-09..12.6 rad or m"),
         (Measure("held", time=math.nan), "time is nan; allowed: 1e-05..3600 s"),
         (Measure("held", time=18.5), r"time of held is 18.5 s; allowed: 0.02..18 s"),
         (Measure("drift", time=0.001), r"time of drift is 0.001 s; allowed: 0.02..18 s"),
-        (Measure("drift", joints=["elbow"]), "unknown elbow; MTML has outer_yaw, shoulder_pitch, elbow_pitch"),
+        (
+            Measure("drift", joints=["elbow"]),
+            "unknown joint elbow; joints of MTML: outer_yaw, shoulder_pitch, elbow_pitch",
+        ),
     ],
 )
 def test_rejects_invalid_measures(measure, message):
@@ -129,5 +132,5 @@ def test_rejects_invalid_measures(measure, message):
 
 
 def test_overshoot_requires_target():
-    with pytest.raises(StudyError, match="overshoot needs a scenario with targets"):
+    with pytest.raises(StudyError, match="overshoot requires a scenario with targets"):
         Measure("overshoot").check(released()[0])

@@ -56,7 +56,7 @@ def formula(monkeypatch):
     monkeypatch.setattr(study_module, "simulate", simulate)
 
 
-class Backwards(ThreadPoolExecutor):
+class ReverseOrderExecutor(ThreadPoolExecutor):
     """Executor that runs all cases in reverse order after the last one is submitted."""
 
     def __init__(self):
@@ -67,12 +67,12 @@ class Backwards(ThreadPoolExecutor):
         future = Future()
         self._calls.append((future, fn, arguments))
         if len(self._calls) == 24:
-            for its, function, these in reversed(self._calls):
-                its.set_result(function(*these))
+            for pending, function, values in reversed(self._calls):
+                pending.set_result(function(*values))
         return future
 
 
-class Dying(ThreadPoolExecutor):
+class WorkerLossExecutor(ThreadPoolExecutor):
     """Executor whose workers are killed after a given number of cases."""
 
     def __init__(self, cases):
@@ -118,7 +118,9 @@ def test_table_has_one_reproducible_row_per_case(reference):
     assert any(row["error"] for row in rows)
 
 
-@pytest.mark.parametrize("executor", [lambda: ThreadPoolExecutor(2), lambda: ThreadPoolExecutor(7), Backwards])
+@pytest.mark.parametrize(
+    "executor", [lambda: ThreadPoolExecutor(2), lambda: ThreadPoolExecutor(7), ReverseOrderExecutor]
+)
 def test_table_does_not_depend_on_workers_or_order(executor, reference, tmp_path):
     with executor() as workers:
         run_study(make_study(), workers, tmp_path / "other.csv")
@@ -128,12 +130,12 @@ def test_table_does_not_depend_on_workers_or_order(executor, reference, tmp_path
 @pytest.mark.parametrize("cases", [0, 1, 23])
 def test_lost_workers_do_not_lose_rows(cases, reference, tmp_path):
     path = tmp_path / "killed.csv"
-    message = rf"^{24 - cases} of 24 cases are missing: case"
-    with Dying(cases) as executor, pytest.raises(StudyError, match=message) as loss:
+    message = rf"^{24 - cases} of 24 cases are missing \(case"
+    with WorkerLossExecutor(cases) as executor, pytest.raises(StudyError, match=message) as loss:
         run_study(make_study(), executor, path)
     assert isinstance(loss.value.__cause__, BrokenProcessPool)
     counts = []
-    with Dying(24 - cases) as executor:  # exactly the number of missing cases
+    with WorkerLossExecutor(24 - cases) as executor:  # exactly the number of missing cases
         rows = run_study(make_study(), executor, path, lambda done, all_cases: counts.append((done, all_cases)))
     assert counts == [(done, 24) for done in range(cases, 25)]
     assert sorted(rows) == list(range(24))
@@ -152,7 +154,7 @@ def test_truncated_table_is_completed_identically(reference, tmp_path):
 def test_finished_study_runs_nothing(reference, tmp_path):
     path = tmp_path / "done.csv"
     path.write_bytes(reference)
-    with Dying(0) as executor:
+    with WorkerLossExecutor(0) as executor:
         run_study(make_study(), executor, path)
     assert path.read_bytes() == reference
 
@@ -171,23 +173,23 @@ def test_finished_study_runs_nothing(reference, tmp_path):
     ],
 )
 def test_rejects_table_of_another_study_unchanged(change, reference, tmp_path):
-    path = tmp_path / "begun.csv"
-    begun = reference[: len(reference) // 2]
-    path.write_bytes(begun)
-    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match="was begun with another study"):
+    path = tmp_path / "partial_table.csv"
+    partial_table = reference[: len(reference) // 2]
+    path.write_bytes(partial_table)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match="the results are from a different study"):
         run_study(make_study(**change), executor, path)
-    assert path.read_bytes() == begun
+    assert path.read_bytes() == partial_table
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: b"hello", "is no table of a study"),
-        (lambda text: b"t,q1,q2\n1,2,3\n", "is no table of a study"),
-        (lambda text: b"\xff\xfe\n", "is no table of a study"),
-        (lambda text: text + text.splitlines(keepends=True)[5], ":26: has case 4 again"),
-        (lambda text: text.replace(b',3,"wrong', b',300,"wrong'), ":5: was changed by hand"),
-        (lambda text: text.replace(b",false,", b",nearly,", 1), "was changed by hand: could not convert"),
+        (lambda text: b"hello", "does not contain results of a study"),
+        (lambda text: b"t,q1,q2\n1,2,3\n", "does not contain results of a study"),
+        (lambda text: b"\xff\xfe\n", "does not contain results of a study"),
+        (lambda text: text + text.splitlines(keepends=True)[5], ", line 26: case 4 occurs twice"),
+        (lambda text: text.replace(b',3,"wrong', b',300,"wrong'), ", line 5: the line is not a result of this study"),
+        (lambda text: text.replace(b",false,", b",nearly,", 1), ": could not convert"),
     ],
 )
 def test_rejects_other_files_and_leaves_them_unchanged(change, message, reference, tmp_path):
@@ -203,7 +205,7 @@ def test_two_studies_cannot_write_the_same_file(tmp_path):
     with (
         StudyTable(path, make_study()),
         ThreadPoolExecutor(1) as executor,
-        pytest.raises(StudyError, match="another study is writing it"),
+        pytest.raises(StudyError, match="another process is writing this file"),
     ):
         run_study(make_study(), executor, path)
 
@@ -226,12 +228,12 @@ def test_interrupted_study_keeps_rows_and_cancels_rest(reference, tmp_path):
 def test_parquet_matches_csv(reference, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")
     path = tmp_path / "results.parquet"
-    with Dying(9) as executor, pytest.raises(StudyError):
+    with WorkerLossExecutor(9) as executor, pytest.raises(StudyError):
         run_study(make_study(), executor, path)
     assert not path.exists()
     assert len((tmp_path / "results.parquet.rows.csv").read_bytes().splitlines()) == 10
-    for most in (15, 0):  # first the remaining cases, then none
-        with Dying(most) as executor:
+    for num_cases in (15, 0):  # first the missing cases, then none
+        with WorkerLossExecutor(num_cases) as executor:
             run_study(make_study(), executor, path)
         assert {p.name for p in tmp_path.iterdir()} == {"reference.csv", "results.parquet"}
     table = parquet.read_table(path)
@@ -239,7 +241,7 @@ def test_parquet_matches_csv(reference, tmp_path):
     for ours, theirs in zip(table.to_pylist(), csv.DictReader(reference.decode().splitlines()), strict=True):
         texts = {name: "" if value is None else str(value) for name, value in ours.items()}
         assert texts | {"held": texts["held"].lower()} == theirs
-    with Dying(0) as executor, pytest.raises(StudyError, match="was made by another study"):
+    with WorkerLossExecutor(0) as executor, pytest.raises(StudyError, match="the results are from a different study"):
         run_study(make_study(seeds=[5]), executor, path)
 
 
@@ -252,10 +254,10 @@ def test_wilson_interval_counts_failed_runs_as_worst(tmp_path):
     assert exact.failed == wrong.failed > 0  # the same seeds
     held = exact.measures["held"]
     assert isinstance(held, Share)
-    assert held.yes > wrong.measures["held"].yes > 0
+    assert held.count > wrong.measures["held"].count > 0
     # Wilson: the bounds are the shares p that are 1.96 standard errors away from the observed share.
     for p in (held.lower, held.upper):
-        assert abs(held.yes / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
+        assert abs(held.count / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
     drift = exact.measures["drift"]
     assert isinstance(drift, Quantiles)
     values = sorted(rows[c.index].values.get("drift", math.inf) for c in study.cases if c.variation == "exact")

@@ -39,14 +39,17 @@ def study_refusal(capsys, path, *options):
         (("scenario: psm", "seeds: [1]"), "scenario is missing"),
         (("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0]]"), "poses[0] has 6 numbers; PSM has 7 joints"),
         (("scenario: psm", "scenario: psm\nposes: [[9, 0, 0.1, 0, 0, 0, 0]]"), "poses[0]: yaw = 9 is outside"),
-        (("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0, 0]]"), "poses and random_poses: give one"),
+        (
+            ("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0, 0]]"),
+            "poses and random_poses exclude each other",
+        ),
         (
             ("scenario: psm", "scenarios: psm"),
             'key "scenarios" is unknown; did you mean "scenario"? allowed in a study: scenario, set, poses',
         ),
-        (("scenario: psm", "scenario: psm\nseeds: [1, 1]"), "seeds must be different whole numbers from 0; got [1, 1]"),
+        (("scenario: psm", "scenario: psm\nseeds: [1, 1]"), "seeds must not contain a number twice; got [1, 1]"),
         (("scenario: psm", "scenario: psm\nseeds: [-1]"), "seeds[0] is -1; allowed: 0..9223372036854775807"),
-        (("scenario: psm", "scenario: psm\nseeds: [a]"), 'seeds[0] is "a"; allowed: a whole number'),
+        (("scenario: psm", "scenario: psm\nseeds: [a]"), 'seeds[0] is "a"; allowed: an integer'),
         (("scenario: psm", "scenario: psm\nseeds: []"), "seeds, variations and measures must not be empty"),
         (
             ("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: a}]"),
@@ -63,7 +66,10 @@ def study_refusal(capsys, path, *options):
             'random_poses: key "sed" is unknown; did you mean "seed"? allowed in random_poses: count, seed',
         ),
         (("kind: drift", "kind: drif"), 'measures[0].kind is "drif"; allowed: settling_time'),
-        (("kind: drift", "kind: drift, joints: [elbow]"), "measures[0].joints of drift: unknown elbow; PSM has yaw"),
+        (
+            ("kind: drift", "kind: drift, joints: [elbow]"),
+            "measures[0].joints of drift: unknown joint elbow; joints of PSM: yaw",
+        ),
         (("kind: drift", "kind: drift, name: seed"), '"seed" cannot be a column'),
         (("kind: drift", 'kind: drift, name: "a,b"'), '"a,b" cannot be a column'),
         (("}]", "}, {kind: drift, time: 0.5}]"), "measures must have different names"),
@@ -80,11 +86,11 @@ def test_invalid_settings_give_one_line_error(change, message, study, capsys):
 
 def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
     assert "no such file" in study_refusal(capsys, tmp_path / "other.yaml")
-    assert "--set duration: must be key=value" in study_refusal(capsys, study, "--set", "duration")
-    assert "cannot be made a folder" in study_refusal(capsys, study, "--plots", str(study))
+    assert "--set duration: a setting must be key=value" in study_refusal(capsys, study, "--set", "duration")
+    assert "the folder cannot be created" in study_refusal(capsys, study, "--plots", str(study))
     (tmp_path / "folder.csv").mkdir()
     for output, message in (
-        (tmp_path / "none" / "r.csv", "cannot be written: "),
+        (tmp_path / "none" / "r.csv", "cannot be written"),
         (tmp_path / "folder.csv", "is not a regular file"),
         (tmp_path / "r.txt", "must end in .csv or .parquet"),
     ):
@@ -101,10 +107,12 @@ def test_rejects_invalid_number_of_workers(study, capsys):
 def test_rejects_invalid_schedulers(study, capsys, monkeypatch):
     monkeypatch.setattr("dvrk_drake.experiments.study.study.TIMEOUT", 0.3)
     pytest.importorskip("distributed", reason="needs the extra dask")
-    assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in study_refusal(
+    assert "is not the address of a scheduler; allowed: tcp://HOST:PORT" in study_refusal(
         capsys, study, "--scheduler", "here"
     )
-    assert "no Dask scheduler answers there" in study_refusal(capsys, study, "--scheduler", "tcp://127.0.0.1:1")
+    assert "no Dask scheduler answers at this address" in study_refusal(
+        capsys, study, "--scheduler", "tcp://127.0.0.1:1"
+    )
 
 
 def test_example_is_valid_study():

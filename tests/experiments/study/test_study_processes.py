@@ -1,4 +1,4 @@
-"""Studies on processes and on a Dask cluster: interruptions lose no rows and do not change the results."""
+"""Studies in processes and on a Dask cluster: interruptions lose no rows and do not change the results."""
 
 import json
 import os
@@ -27,7 +27,7 @@ random_poses: {count: 5, seed: 1, margin: 0.1}
 variations: [{name: nominal}, {name: wrong, set: [controller.parameter_error=0.2]}]
 measures: [{kind: held, time: 1}, {kind: drift, time: 0.5}, {kind: effort_share}]
 """
-#: Command line with a formula instead of the simulation, whose compilation takes seconds per worker.
+#: Program of `dvrk-drake` with a formula instead of the simulation, so that the workers compile nothing.
 FORMULA = Path(formula_study.__file__)
 
 
@@ -38,9 +38,9 @@ def study(tmp_path_factory):
     return path
 
 
-def undisturbed(study):
-    """Table computed by one thread of this process."""
-    path = study.parent / "undisturbed.csv"
+def reference_table(study):
+    """Returns the table computed by one thread of this process."""
+    path = study.parent / "reference_table.csv"
     path.unlink(missing_ok=True)
     with ThreadPoolExecutor(1) as executor:
         rows = run_study(load_study(study), executor, path)
@@ -67,17 +67,17 @@ def started():
 
 
 @pytest.fixture
-def sell(tmp_path, monkeypatch):
-    """Releases the given number of simulations; without this fixture the simulations do not wait."""
+def release_simulations(tmp_path, monkeypatch):
+    """Returns a function that lets a number of simulations run. Without this fixture, simulations do not wait."""
     folder = tmp_path / "tickets"
     folder.mkdir()
     monkeypatch.setenv(formula_study.TICKETS, str(folder))
 
-    def sell(count):
+    def release_simulations(count):
         for _ in range(count):
             tempfile.mkstemp(dir=folder)
 
-    return sell
+    return release_simulations
 
 
 def rows_in(path):
@@ -91,11 +91,11 @@ def children_of(process):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_study_survives_killed_process_and_worker(study, started, sell, tmp_path, monkeypatch):
+def test_study_survives_killed_process_and_worker(study, started, release_simulations, tmp_path, monkeypatch):
     monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
     path = tmp_path / "killed.csv"
     command = [FORMULA, "study", study, "--output", path, "--workers", 2]
-    sell(3)
+    release_simulations(3)
     first = started(*command)
     wait_until(lambda: rows_in(path) == 3, "three rows", first)
     workers = children_of(first)
@@ -104,16 +104,16 @@ def test_study_survives_killed_process_and_worker(study, started, sell, tmp_path
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), "end of the workers")
     assert rows_in(path) == 3
 
-    sell(1)
+    release_simulations(1)
     second = started(*command)
     wait_until(lambda: rows_in(path) == 4, "a fourth row", second)
     os.kill(children_of(second)[0], signal.SIGKILL)
-    sell(20)
+    release_simulations(20)
     output, error = second.communicate(timeout=TIMEOUT)
     assert (second.returncode, messages(error)) == (0, [])
     assert "nominal: 2 of 5 runs" in output
     monkeypatch.delenv(formula_study.TICKETS)
-    assert path.read_bytes() == undisturbed(study)
+    assert path.read_bytes() == reference_table(study)
 
 
 def test_dask_cluster_survives_lost_worker(study, started, tmp_path):
@@ -135,13 +135,13 @@ def test_dask_cluster_survives_lost_worker(study, started, tmp_path):
     with dask_executor(url) as executor:
         run_study(load_study(study), executor, path, kill_one)
     assert workers[0].wait(TIMEOUT) == -signal.SIGKILL
-    assert path.read_bytes() == undisturbed(study)
+    assert path.read_bytes() == reference_table(study)
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_ctrl_c_prints_one_line_and_ends_workers(study, started, sell, tmp_path):
+def test_ctrl_c_prints_one_line_and_ends_workers(study, started, release_simulations, tmp_path):
     path = tmp_path / "interrupted.csv"
-    sell(1)
+    release_simulations(1)
     run = started(FORMULA, "study", study, "--output", path, "--workers", 2)
     wait_until(lambda: rows_in(path) == 1, "a row", run)
     workers = children_of(run)

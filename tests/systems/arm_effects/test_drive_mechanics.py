@@ -16,7 +16,7 @@ def test_joints_of_drive_coordinates_follow_the_arm(name):
     run = Run(arm, arm.effects.only(["friction", "stops"]))
     plant = run.station.plant
     plant_context = plant.GetMyContextFromRoot(run.context)
-    added = run.station._parts.drive._added
+    added = run.station._plant_effects.drive._added
     assert len(added) == {"mtml": 2, "mtmr": 2, "psm": 4}[name]
     moved = run.q
     for _ in range(100):
@@ -130,7 +130,7 @@ def test_cable_stretches_by_its_load():
 
 @pytest.mark.parametrize(("name", "actuator"), [("mtml", "elbow_pitch"), ("psm", "insertion"), ("psm", "jaw")])
 def test_cable_without_rotor_inertia_is_refused(name, actuator):
-    with pytest.raises(StationError, match=f"stretch.{actuator}: allowed are actuators that turn one joint alone"):
+    with pytest.raises(StationError, match=f"stretch.{actuator}: the actuator must drive one revolute joint"):
         ArmStation(load_arm(name), effects=ArmEffects(stretch={actuator: Cable(100.0)}))
 
 

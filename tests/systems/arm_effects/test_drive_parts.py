@@ -6,8 +6,8 @@ from simulated_effects import Run, middle, weightless
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, EffortEffect
-from dvrk_drake.systems.arm_effects.drive_force import EffortSensor, Motors, in_steps
-from dvrk_drake.systems.arm_effects.drive_step import _follow, _measure_into
+from dvrk_drake.systems.arm_effects.drive_force import EffortSensor, Motors, round_to_step
+from dvrk_drake.systems.arm_effects.drive_step import _measure_into, _move_anchors
 
 ARM = load_arm("mtml")
 N = ARM.num_joints
@@ -17,8 +17,8 @@ INVERSE = ARM.transmission.inverse  # joints from actuators
 
 
 @pytest.mark.parametrize(("value", "step", "expected"), [(0.34, 0.1, 0.3), (-0.36, 0.1, -0.4), (0.34, 0.0, 0.34)])
-def test_in_steps_rounds_to_whole_steps(value, step, expected):
-    assert in_steps(value, step) == pytest.approx(expected, abs=1e-12)
+def test_round_to_step(value, step, expected):
+    assert round_to_step(value, step) == pytest.approx(expected, abs=1e-12)
 
 
 def test_motors_clamp_step_and_saturate_in_this_order():
@@ -111,27 +111,27 @@ def test_measurement_queue_keeps_order(delay):
 # Anchors of friction springs
 
 
-def hooks(positions, *, fall_speed=0.0, side=1.0, code=5, velocity=0.0):
+def anchors(positions, *, fall_speed=0.0, side=1.0, code=5, velocity=0.0):
     """Returns the anchor of one slider that slips at 0.1, after each position."""
     places, laws = np.array([[code, 0, 0]]), np.array([[0.1, fall_speed, side]])
-    hook, path = np.zeros(1), []
+    anchor, path = np.zeros(1), []
     for position in positions:
-        _follow(np.array([position, velocity]), places, laws, 1e-3, hook)
-        path.append(hook[0])
+        _move_anchors(np.array([position, velocity]), places, laws, 1e-3, anchor)
+        path.append(anchor[0])
     return path
 
 
 def test_anchor_follows_when_spring_slips():
-    assert hooks([0.05, 0.09, -0.09]) == [0.0, 0.0, 0.0]
-    np.testing.assert_allclose(hooks([0.3, 0.25, 0.15, 0.05, 0.2]), [0.2, 0.2, 0.2, 0.15, 0.15], atol=1e-12)
-    np.testing.assert_allclose(hooks([-0.3, -0.15]), [-0.2, -0.2], atol=1e-12)
+    assert anchors([0.05, 0.09, -0.09]) == [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(anchors([0.3, 0.25, 0.15, 0.05, 0.2]), [0.2, 0.2, 0.2, 0.15, 0.15], atol=1e-12)
+    np.testing.assert_allclose(anchors([-0.3, -0.15]), [-0.2, -0.2], atol=1e-12)
     # "presliding forward" holds in one direction only. It follows in the other one without deflection.
-    np.testing.assert_allclose(hooks([0.3, 0.1], code=6), [0.2, 0.1], atol=1e-12)
-    np.testing.assert_allclose(hooks([-0.3, -0.1], code=6, side=-1.0), [-0.2, -0.1], atol=1e-12)
+    np.testing.assert_allclose(anchors([0.3, 0.1], code=6), [0.2, 0.1], atol=1e-12)
+    np.testing.assert_allclose(anchors([-0.3, -0.1], code=6, side=-1.0), [-0.2, -0.1], atol=1e-12)
 
 
 def test_anchor_moves_closer_with_fall_speed():
-    (still,), (moving,) = hooks([0.3], fall_speed=1.0), hooks([0.3], fall_speed=1.0, velocity=1.0)
+    (still,), (moving,) = anchors([0.3], fall_speed=1.0), anchors([0.3], fall_speed=1.0, velocity=1.0)
     assert still == pytest.approx(0.2, abs=1e-12)
     # It holds 1/e of its travel, minus the motion of the arm in two steps.
     assert moving == pytest.approx(0.3 - (0.1 * np.exp(-1.0) - 2e-3), abs=1e-12)
@@ -143,7 +143,7 @@ def test_anchor_moves_closer_with_fall_speed():
 @pytest.mark.parametrize("stretch", [{}, {"outer_yaw": Cable(80.0, 0.05)}])
 def test_power_of_motors_equals_power_of_actuators(stretch):
     """The matrix from velocities to actuators is the transpose of the matrix from motor efforts."""
-    parts = Run(ARM, ArmEffects(stretch=stretch)).station._parts
+    parts = Run(ARM, ArmEffects(stretch=stretch)).station._plant_effects
     np.testing.assert_allclose(parts.to_actuators, parts.from_motors.T, atol=1e-12)
     assert np.linalg.matrix_rank(parts.to_actuators) == N
     assert parts.time_step == pytest.approx(1e-3)
@@ -152,7 +152,7 @@ def test_power_of_motors_equals_power_of_actuators(stretch):
 
 def test_drive_coordinates_are_plant_joints():
     run = Run(ARM, ARM.effects.only(["friction", "stops"]), middle(ARM))
-    drive, plant = run.station._parts.drive, run.station.plant
+    drive, plant = run.station._plant_effects.drive, run.station.plant
     joint, ratio = drive.joint(-2.0 * np.eye(N)[4])
     assert (joint.name(), ratio) == (ARM.joint_names[4], -2.0)
     q, q_plant = np.linspace(-0.2, 0.3, N), np.zeros(plant.num_positions())

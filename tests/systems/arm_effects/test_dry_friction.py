@@ -175,5 +175,5 @@ def test_stribeck_friction_decreases_while_sliding():
     run.fix("effort_disturbance", effort * np.eye(7)[6])
     run.advance(900)
     v = run.v[6]
-    # The steady slide: what pushes is what viscosity and sliding take, and the hook that comes two steps late.
+    # In steady sliding, viscous and sliding friction and the lag of the anchor by two steps balance the effort.
     assert v == pytest.approx((effort - sliding) / (viscous + 2 * STEP * at_rest / travel), rel=0.02)

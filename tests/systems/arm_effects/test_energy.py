@@ -76,10 +76,10 @@ class HeldArm:
 
     def in_hand(self):
         """Returns the energy of the hand's springs: quadratic up to their limits, linear beyond."""
-        turn = (self.wanted.rotation() @ self.X_BG.rotation().inverse()).ToAngleAxis().angle()
+        rotation = (self.wanted.rotation() @ self.X_BG.rotation().inverse()).ToAngleAxis().angle()
         way = np.linalg.norm(self.wanted.translation() - self.X_BG.translation())
         springs = (
-            (self.grip.rotational_stiffness, turn, self.grip.max_torque),
+            (self.grip.rotational_stiffness, rotation, self.grip.max_torque),
             (self.grip.stiffness, way, self.grip.max_force),
         )
         return sum(0.5 * k * x**2 if k * x <= most else most * x - 0.5 * most**2 / k for k, x, most in springs)
@@ -102,9 +102,9 @@ class HeldArm:
         for k, i in enumerate(plant.GetJointActuatorIndices(instance)):
             actuator = plant.get_joint_actuator(i)
             if actuator.name().startswith("friction"):
-                hooks = plant.get_desired_state_input_port(instance).Eval(context)
+                anchors = plant.get_desired_state_input_port(instance).Eval(context)
                 p = actuator.get_controller_gains().p
-                force = p * (hooks[k] - actuator.joint().GetOnePosition(context))
+                force = p * (anchors[k] - actuator.joint().GetOnePosition(context))
                 energy += 0.5 * min(abs(force), actuator.effort_limit()) ** 2 / p
         return energy
 

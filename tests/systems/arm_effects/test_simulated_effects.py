@@ -73,9 +73,13 @@ def test_unknown_part_is_an_error(tmp_path):
             "effects.saturation.outer_yaw is -1.861; allowed: 0.001..2000 N m or N",
         ),
         ("measurement: 1", "measurement: -1", "effects.delay.measurement is -1; allowed: 0..100 time steps"),
-        ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
-        ("scale: 0.015", "scale: 0.0", "has scale 0"),
-        ("coefficient: 0.0011", "coefficient: -0.0011", "has coefficient -0.0011"),
+        (
+            "presliding, scale: 0.015",
+            "stiction, scale: 0.015",
+            'effects.friction of actuator.wrist_roll: kind is "stiction"; allowed',
+        ),
+        ("scale: 0.015", "scale: 0.0", "scale of presliding is 0"),
+        ("coefficient: 0.0011", "coefficient: -0.0011", "coefficient of presliding is -0.0011"),
     ):
         assert old in text
         (tmp_path / "m.yaml").write_text(text.replace(old, new))
@@ -173,14 +177,14 @@ def test_scenario_cable_stretches():
     [
         ("stretch.elbow={stiffness: 100.0}", "simulated arm: stretch: unknown actuator elbow"),
         ("stretch.outer_yaw={stiffness: -1.0}", "stretch.outer_yaw.stiffness is -1; allowed: "),
-        ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path needs two poses or more"),
+        ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path must have 2 or more poses"),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0]}]", r"hand.path\[0\].pose has 3 numbers"),
         ("hand.grip=1", "allowed"),
         (
             "controller.compensated_effects=[friction]",
             'controller.compensated_effects is "friction"; allowed: cables, springs',
         ),
-        ("controller.friction_ratio=0.5", 'controller.friction_ratio needs mode "gravity"'),
+        ("controller.friction_ratio=0.5", 'controller.friction_ratio requires controller.mode "gravity"'),
     ],
 )
 def test_invalid_scenario_is_refused(setting, message):

@@ -23,7 +23,7 @@ def test_holds_the_first_pose_without_any_command():
 
 
 @pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
-def test_start_requires_250_ms_of_good_commands(mode):
+def test_start_requires_250_ms_of_valid_commands(mode):
     bench = Bench()
     for k in range(300):
         assert bench.send(mode) == Status.REFUSAL_NONE
@@ -117,7 +117,7 @@ def test_expiry_counts_from_the_answered_measurement():
     bench = Bench().started()
     answered = bench.utime
     bench.tick(39)
-    # Late, then repeated: this does not extend the expiry.
+    # A late or repeated command does not extend the expiry.
     for _ in range(11):
         assert bench.send(status_utime=answered) == Status.REFUSAL_NONE
         assert bench.tick().control_mode == Command.EFFORT
@@ -149,7 +149,7 @@ def test_single_message_cannot_switch_off(mode):
         assert bench.send(Command.OFF) == Status.REFUSAL_SUDDEN_OFF
         bench.tick()
     assert bench.guard.state == Status.STATE_HOLD
-    # Nor the first command of a new sender, even if another one commanded a hold before.
+    # The first command of a new sender is also refused, even if another sender commanded HOLD before.
     bench.run(Command.HOLD, 1)
     bench.tick(60)
     assert bench.send(Command.OFF, sender=6) == Status.REFUSAL_SUDDEN_OFF
@@ -172,7 +172,7 @@ def test_off_and_return_to_hold():
     bench = Bench(modes=WITH_OFF).started()
     bench.run(Command.HOLD, 1)
     assert bench.run(Command.OFF, 20).control_mode == Command.OFF
-    bench.q = Q - 0.05  # it fell
+    bench.q = Q - 0.05  # the arm fell
     assert bench.tick(200).control_mode == Command.OFF
     assert bench.send(Command.EFFORT) == Status.REFUSAL_BAD_MODE
     assert bench.guard.accepted_modes == modes(Command.OFF, Command.HOLD)
@@ -248,7 +248,7 @@ def test_foreign_messages_do_not_end_start():
         bench.run(Command.EFFORT, 1)
     assert bench.guard.state == Status.STATE_EFFORT
     assert (bench.guard.ignored_code, bench.guard.counts.ignored) == (Status.REFUSAL_WRONG_ARM, 320)
-    # Messages of the sender itself end it.
+    # Refused messages of the sender end the start.
     bench = Bench()
     bench.run(Command.EFFORT, 100)
     assert bench.send(effort=[np.nan] * N) == Status.REFUSAL_NOT_FINITE
@@ -266,7 +266,7 @@ def test_refused_command_keeps_command_in_force():
 def test_ended_start_keeps_held_pose(ending):
     bench = Bench()
     bench.run(Command.EFFORT, 100)
-    bench.q = Q - 0.01  # it has moved meanwhile
+    bench.q = Q - 0.01  # the arm has moved
     bench.tick()
     if ending == "refused":
         assert bench.send(effort=list(LIMIT)) == Status.REFUSAL_START_FAR
@@ -301,7 +301,7 @@ def test_wall_effort_increases_over_start_time():
         # The wall has twice the motor effort there.
         expected = -min(2 * share, 1.0) * LIMIT[0]
         assert bench.run(Command.EFFORT, 1).effort[0] == pytest.approx(expected, abs=0.01 * LIMIT[0])
-    # From then on, efforts do not depend on the start.
+    # Afterwards, efforts do not depend on the start.
     bench.run(Command.EFFORT, 250)
     bench.q = Q.copy()
     np.testing.assert_allclose(bench.run(Command.EFFORT, 1).effort, np.zeros(N), atol=1e-12)
@@ -311,7 +311,7 @@ def test_pose_beyond_limit_is_no_fault_in_position_mode():
     bench = Bench(modes=WITH_OFF)
     for mode in (Command.HOLD, Command.OFF):
         bench.run(mode, 1)
-    bench.q[5] = ARM.position_upper[5] + 0.04  # it is moved by hand
+    bench.q[5] = ARM.position_upper[5] + 0.04  # the arm is moved by hand
     bench.tick()
     bench.run(Command.HOLD, 1)
     bench.started(Command.POSITION)
@@ -324,7 +324,7 @@ def test_backward_arm_clock_discards_sender():
     bench.utime -= 10**6
     bench.step()
     assert bench.guard.fault_code == Status.FAULT_CLOCK
-    # On the old clock this would be a second sender and a command out of order.
+    # On the old clock, the command would be out of order and come from a second sender.
     bench.sequence = 0
     assert bench.send(Command.HOLD, sender=6) == Status.REFUSAL_NONE
     bench.tick()
@@ -365,10 +365,10 @@ def test_copy_is_independent(mode):
     assert other.guard.fault_code == Status.FAULT_NONE
     other.run(mode, 300)
     assert (other.output.control_mode, other.guard.fault_code) == (mode, Status.FAULT_NONE)
-    # Equal inputs from here on give equal outputs.
-    twin = copy.copy(other)
-    twin.guard = copy.deepcopy(other.guard)
-    for guarded in (other, twin):
+    # Equal inputs then give equal outputs.
+    duplicate = copy.copy(other)
+    duplicate.guard = copy.deepcopy(other.guard)
+    for guarded in (other, duplicate):
         guarded.run(mode, 20, position=list(Q + 0.01), effort=list(0.5 * LIMIT))
     for name in ("position", "velocity", "effort", "joint_flags"):
-        np.testing.assert_array_equal(getattr(other.output, name), getattr(twin.output, name))
+        np.testing.assert_array_equal(getattr(other.output, name), getattr(duplicate.output, name))

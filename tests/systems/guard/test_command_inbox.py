@@ -32,7 +32,7 @@ class Networked(Bench):
         return data if self.key is None else self.key.sign(data)
 
     def round(self, before=(), after=()):
-        """Runs one millisecond with a good command between other messages."""
+        """Runs one millisecond with a valid command between other messages."""
         self.sent.append(self.good())
         self.put(*before, self.sent[-1], *after)
         self.inbox.deliver(self.guard, self.utime)
@@ -46,7 +46,7 @@ class Networked(Bench):
 
 
 def stranger(bench, **fields):
-    """Returns a command of another origin without a change of the sender's own sequence."""
+    """Returns a command of another process. The sequence of the sender does not change."""
     command = bench.command(**{"effort": list(LIMIT), **fields})
     bench.sequence -= 1
     return command.encode()
@@ -78,7 +78,7 @@ def test_foreign_messages_are_counted_by_reason(fields, code):
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
 @pytest.mark.parametrize("key", [None, KEY])
-def test_good_commands_of_any_arm_are_delivered(name, key):
+def test_valid_commands_of_any_arm_are_delivered(name, key):
     bench = Networked(key, arm=load_arm(name)).acting()
     assert (bench.guard.counts.accepted, bench.guard.counts.ignored) == (260, 0)
     # An arm without a key accepts a signed command as well.
@@ -121,12 +121,12 @@ def test_flood_decodes_bounded_number():
 
 
 @pytest.mark.parametrize("key", [None, KEY])
-def test_200_spoofed_commands_that_continue_the_stream(key):
-    """Only a key distinguishes them from genuine ones. Without it they act within the guard's limits."""
+def test_spoofed_commands_may_continue_the_stream(key):
+    """Only a key distinguishes spoofed commands. Without a key, they act inside the limits of the guard."""
     bench = Networked(key).acting()
     moved = []
     for k in range(200):
-        # Derived from the sender's observed command: sequence and times plus a small increment.
+        # Sequence and times of the sender's last command, plus a small increment.
         spoofed = stranger(bench, sequence=bench.sequence + 1 + k, utime=bench.utime - 10**15 + 1 + k)
         output = bench.round([spoofed])
         moved.append(np.abs(output.effort - 0.05 * LIMIT).max())
@@ -152,7 +152,7 @@ def test_huge_sequence_or_time_blocks_no_sender(field, key):
 
 
 def test_replayed_authentic_commands_do_not_act():
-    """Immediately they are out of order. Later, when the sender is silent, they are stale."""
+    """Replayed commands are out of order, or stale if the sender is silent."""
     bench = Networked(KEY).acting()
     for _ in range(100):
         assert bench.round(bench.sent[-8:]).control_mode == Command.EFFORT
@@ -164,7 +164,7 @@ def test_replayed_authentic_commands_do_not_act():
         bench.tick()
     assert (bench.guard.state, bench.guard.counts.accepted) == (Status.STATE_HOLD, accepted)
     assert bench.guard.refusal_code == Status.REFUSAL_STALE
-    # Also not in another session of the arm.
+    # They do not act in another session of the arm either.
     other = Networked(KEY)
     other.guard.session_id = SESSION + 1
     other.inbox = CommandInbox(other.guard, KEY)

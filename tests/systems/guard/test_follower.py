@@ -48,7 +48,7 @@ def test_is_near_includes_the_exact_tolerance():
     follower = at(STILL)
     follower.begin_position()
     assert follower.is_near(LIMITS.start_position)
-    assert follower.astray(LIMITS.following_error) == ""
+    assert follower.following_fault(LIMITS.following_error) == ""
 
 
 # Positions
@@ -80,13 +80,13 @@ def test_large_following_error_is_detected(joint, side):
     follower = at()
     follower.begin_position()
     away = side * 0.15 * RANGE[joint] * E[joint]
-    assert follower.astray(Q + 0.999 * away) == ""
-    text = follower.astray(Q + 1.001 * away)
-    assert text.startswith(f"{ARM.joint_names[joint]} = ")
-    assert text.endswith(f"{0.15 * RANGE[joint]:.3g} away is allowed")
-    # The worst one is reported.
+    assert follower.following_fault(Q + 0.999 * away) == ""
+    text = follower.following_fault(Q + 1.001 * away)
+    assert text.startswith(f"{ARM.joint_names[joint]} is at ")
+    assert text.endswith(f"(allowed difference {0.15 * RANGE[joint]:.3g} rad)")
+    # The joint with the largest error is reported.
     other = (joint + 1) % N
-    assert follower.astray(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
+    assert follower.following_fault(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -100,15 +100,15 @@ def test_lag_up_to_following_time_is_allowed(side):
         late += dt / 0.1 * (target - late)
     assert side * (target - late) > 0.5 * error
 
-    def astray(position):
-        return follower.astray(Q + (position - Q[joint]) * E[joint])
+    def fault_at(position):
+        return follower.following_fault(Q + (position - Q[joint]) * E[joint])
 
-    assert astray(late - side * 0.999 * error) == astray(target + side * 0.999 * error) == astray(late) == ""
-    assert astray(late - side * 1.001 * error) and astray(target + side * 1.001 * error)
-    # A step longer than the following time brings the late one to the target, not beyond.
+    assert fault_at(late - side * 0.999 * error) == fault_at(target + side * 0.999 * error) == fault_at(late) == ""
+    assert fault_at(late - side * 1.001 * error) and fault_at(target + side * 1.001 * error)
+    # After a step longer than the following time, the filtered target equals the target.
     target = follower.follow_position(Q + side * 9.0 * E[joint], STILL, 0.2).position[joint]
-    assert astray(target - side * 0.999 * error) == ""
-    assert astray(target - side * 1.001 * error) and astray(target + side * 1.001 * error)
+    assert fault_at(target - side * 0.999 * error) == ""
+    assert fault_at(target - side * 1.001 * error) and fault_at(target + side * 1.001 * error)
 
 
 def test_position_start_resets_the_lag():
@@ -117,9 +117,9 @@ def test_position_start_resets_the_lag():
     for _ in range(100):
         follower.follow_position(Q + 9.0 * E[4], STILL, 1e-3)
     target = follower.target
-    assert follower.astray(target - 1.2 * 0.15 * RANGE[4] * E[4]) == ""
+    assert follower.following_fault(target - 1.2 * 0.15 * RANGE[4] * E[4]) == ""
     follower.begin_position()
-    assert follower.astray(target - 1.01 * 0.15 * RANGE[4] * E[4])
+    assert follower.following_fault(target - 1.01 * 0.15 * RANGE[4] * E[4])
     np.testing.assert_array_equal(follower.target, target)
 
 
@@ -136,14 +136,14 @@ def test_braking_distance_is_allowed_after_latch(joint, side, share):
     q[:] = 9.0
     np.testing.assert_array_equal(follower.target, Q)
 
-    def astray(away):
-        return bool(follower.astray(Q + away * E[joint]))
+    def fault_at(away):
+        return bool(follower.following_fault(Q + away * E[joint]))
 
-    assert not astray(way + 0.999 * side * error) and astray(way + 1.001 * side * error)
-    assert not astray(-0.999 * side * error) and astray(-1.001 * side * error)
+    assert not fault_at(way + 0.999 * side * error) and fault_at(way + 1.001 * side * error)
+    assert not fault_at(-0.999 * side * error) and fault_at(-1.001 * side * error)
     for _ in range(20):
         np.testing.assert_array_equal(follower.hold(0.05).position, Q)
-    assert not astray(0.999 * side * error) and astray(1.001 * side * error)
+    assert not fault_at(0.999 * side * error) and fault_at(1.001 * side * error)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -155,7 +155,7 @@ def test_fault_holds_valid_joints_with_bounded_effort(side):
             output = at().hold_valid_joints(Q - side * away, STILL, valid, side * gravity)
             np.testing.assert_allclose(output.effort, expected, atol=1e-12)
     assert output.control_mode == Command.EFFORT
-    # Below the bounds they are those of the arm's own gains.
+    # Below the bounds, the efforts follow from the gains of the arm.
     gravity, v = 0.02 * side * LIMIT, side * 0.01 * LIMITS.fault_effort / LIMITS.kd
     q = Q - 0.02 * side * LIMITS.fault_effort / LIMITS.kp
     output = at().hold_valid_joints(q, v, valid, gravity)
@@ -209,14 +209,14 @@ def test_start_inside_wall_increases_wall_gradually(side):
         output = follower.follow_effort(push, q, STILL, 1e-3, share)
         np.testing.assert_allclose(output.effort, np.clip(push + share * wall, -LIMIT, LIMIT), atol=1e-12)
         assert output.joint_flags[0] == Status.FLAG_POSITION_LIMIT
-    # The subtracted effort does not push an arm outward after it has left the wall.
+    # The subtracted effort does not push the arm outward after it has left the wall.
     inside = follower.follow_effort(side * LIMIT * E[0], Q, STILL, 1.0, 0.0)
     np.testing.assert_allclose(inside.effort, side * LIMIT * E[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_start_inside_wall_never_pulls_outward(side):
-    """Nothing is subtracted beyond the present effort of the wall, also outside it or while braking."""
+    """The subtracted effort is at most the present effort of the wall, also outside the wall or while braking."""
     q = Q.copy()
     q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
     follower = at(q)

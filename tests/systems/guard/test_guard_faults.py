@@ -32,7 +32,7 @@ def test_reset_requires_a_change_of_the_flag():
     bench = Bench(modes=WITH_OFF)
     bench.guard.report_fault("the amplifier is hot")
     assert (bench.guard.fault_code, bench.guard.fault_text) == (Status.FAULT_DRIVER, "the amplifier is hot")
-    bench.run(Command.HOLD, 5, reset_fault=True)  # always true is no change to true
+    bench.run(Command.HOLD, 5, reset_fault=True)  # a constant flag is no change to true
     assert bench.guard.state == Status.STATE_FAULT
     bench.run(Command.HOLD, 5)
     assert bench.guard.state == Status.STATE_FAULT
@@ -53,7 +53,7 @@ def test_pose_beyond_limit_faults_in_effort_mode():
     bench.q[5] = ARM.position_upper[5] + 0.03
     output = bench.tick()
     assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_POSITION_LIMIT)
-    assert bench.guard.fault_text.startswith("wrist_yaw = 0.8154 is beyond")
+    assert bench.guard.fault_text.startswith("wrist_yaw is at 0.8154 rad, outside its limits")
     np.testing.assert_array_equal(output.position, bench.q)
     bench.run(Command.HOLD, 1)
     bench.run(Command.HOLD, 1, reset_fault=True)
@@ -65,7 +65,7 @@ def test_pose_beyond_coupled_limit_faults():
     bench.q = Q.copy()
     bench.q[1:3] = 0.2, -0.2 - 0.36  # each joint inside its own range
     bench.tick()
-    assert bench.guard.fault_text == "parallelogram = -0.36 is beyond -0.33..0.68"
+    assert bench.guard.fault_text == "parallelogram is at -0.36 rad, outside its limits -0.33..0.68 rad"
 
 
 BAD = GuardSettings().plausibility.bad_samples
@@ -73,7 +73,7 @@ BAD = GuardSettings().plausibility.bad_samples
 
 @pytest.mark.parametrize("which", ["q", "v", "effort"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
-def test_bad_measurements_lead_to_hold_then_fault(which, value):
+def test_invalid_measurements_lead_to_hold_then_fault(which, value):
     bench = Bench(model=Heavy()).at_rest().started()
     good = getattr(bench, which)
     setattr(bench, which, np.where(np.arange(N) == 3, value, good))
@@ -85,12 +85,12 @@ def test_bad_measurements_lead_to_hold_then_fault(which, value):
     assert (output.control_mode, bench.guard.fault_code) == (Command.EFFORT, Status.FAULT_MEASUREMENT)
     np.testing.assert_allclose(output.effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
     assert np.all(output.joint_flags & Status.FLAG_IMPLAUSIBLE)
-    # A reset while it is still bad faults again.
+    # A reset while the measurement is still invalid leads to a fault again.
     healthy = {"position": list(Q), "effort": [0.0] * N}
     for reset in (False, True):
         bench.send(Command.HOLD, reset_fault=reset, **healthy)
         assert bench.tick().control_mode == Command.EFFORT
-    # Good again, at another pose: unchanged until a reset, then held where it is.
+    # Valid measurements at another pose change nothing until a reset. Then this pose is held.
     setattr(bench, which, good)
     bench.q = Q - 0.03
     output = bench.tick(100)
@@ -102,7 +102,7 @@ def test_bad_measurements_lead_to_hold_then_fault(which, value):
     np.testing.assert_array_equal(output.position, Q - 0.03)
 
 
-def test_few_bad_measurements_in_hold_are_tolerated():
+def test_few_invalid_measurements_in_hold_are_tolerated():
     bench = Bench()
     for _ in range(3):
         bench.q = Q * np.nan
@@ -116,7 +116,7 @@ def test_few_bad_measurements_in_hold_are_tolerated():
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
 def test_wrong_velocity_at_start_has_no_lasting_effect(joint, side):
-    """The speed limit brakes on that one sample, and the start does not subtract this effort later."""
+    """The speed limit brakes at this sample only. The start does not subtract this effort later."""
     bench = Bench().at_rest()
     commanded = bench.effort.copy()
     while bench.guard.state != Status.STATE_EFFORT:
@@ -132,7 +132,7 @@ def test_wrong_velocity_at_start_has_no_lasting_effect(joint, side):
 def test_reset_does_not_hold_an_unmeasured_pose():
     bench = Bench(modes=WITH_OFF, checks=True, model=Heavy()).at_rest()
     good = bench.q
-    # In OFF, neither a hold nor a reset of a fault switches the power on.
+    # In OFF, neither HOLD nor the reset of a fault switches the power on.
     bench.run(Command.HOLD, 5)
     bench.run(Command.OFF, 5)
     bench.q = good * np.nan
@@ -153,7 +153,7 @@ def test_reset_does_not_hold_an_unmeasured_pose():
         output = bench.tick()
     assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
     np.testing.assert_array_equal(output.position, good - 0.1)
-    # With power: where the measurements return, not where they were lost.
+    # With power, the arm is held at the first valid pose after the loss, not at the pose before it.
     bench.q = good * np.nan
     bench.tick(BAD + 5)
     bench.run(Command.HOLD, 1, **healthy)
@@ -167,7 +167,7 @@ def test_reset_does_not_hold_an_unmeasured_pose():
 
 
 def test_reset_after_invalid_position_holds_measured_pose():
-    """This also holds for a pose near the target. Until the reset, the others are held and damped."""
+    """Tests also a pose near the target. Until the reset, the other joints are held and damped."""
     bench = Bench(checks=True, model=Heavy()).at_rest()
     bench.tick(100)
     bench.q = Q + 0.015 * np.eye(N)[0]
@@ -196,7 +196,7 @@ def test_reset_without_fault_has_no_effect():
     assert (bench.guard.state, bench.guard.fault_text) == (Status.STATE_HOLD, "")
 
 
-def test_no_power_before_first_good_measurement():
+def test_no_power_before_first_valid_measurement():
     guard = CommandGuard(ARM, SESSION, Weightless())
     output = guard.step(0, 0, Q * np.nan, 0 * Q, 0 * Q)
     assert (output.control_mode, guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
@@ -219,8 +219,10 @@ def test_implausible_first_pose_is_a_fault():
     bench = Bench(q=degrees, modes=WITH_OFF)
     guard = bench.guard
     assert (guard.state, guard.fault_code) == (Status.STATE_FAULT, Status.FAULT_MEASUREMENT)
-    assert guard.fault_text == "outer_yaw = 40 is far beyond -0.6981..1.134; degrees or wrong zero?"
-    assert bench.output.control_mode == Command.OFF  # it never held a pose
+    assert guard.fault_text == (
+        "outer_yaw is at 40 rad, far outside its limits -0.6981..1.134 rad; check its unit (degrees?) and its zero"
+    )
+    assert bench.output.control_mode == Command.OFF  # no pose was held
     bench.q = Q
     assert bench.tick().control_mode == Command.OFF
     assert guard.state == Status.STATE_FAULT
@@ -278,7 +280,7 @@ def test_pose_far_beyond_limits_is_never_held(begin):
             assert np.abs(bench.output.position).max() < np.abs(Q).max() + 0.1
         bench.send(Command.HOLD, position=list(Q), reset_fault=k % 2 == 1)
     assert bench.tick().control_mode != Command.HOLD
-    assert begin is lost_power or "outer_yaw = 5.73 is far beyond" in bench.guard.fault_text
+    assert begin is lost_power or "outer_yaw is at 5.73 rad, far outside" in bench.guard.fault_text
     bench.q = Q
     bench.tick()
     bench.run(Command.HOLD, 1)
@@ -302,7 +304,7 @@ def test_backward_measurement_time_is_a_fault():
         bench.age = 2 * MS * (k % 2)
         bench.utime += MS
         bench.step()
-    assert bench.guard.hold_reason == "the measurement is 0.001000 s older than the one before"
+    assert bench.guard.hold_reason == "the measurement is 0.001000 s older than the previous one"
 
 
 def test_efforts_require_finite_model_gravity():
@@ -317,7 +319,7 @@ def test_caller_cannot_change_commanded_effort():
         bench.effort = 0.0 * LIMIT
         bench.run(Command.EFFORT, 1, effort=list(0.6 * LIMIT)) if bench.guard.fault_code == 0 else None
         bench.output.effort[:] = 0.0
-    assert "does not show the commanded one" in bench.guard.fault_text
+    assert "does not follow the commanded effort" in bench.guard.fault_text
 
 
 def test_prismatic_joint_in_millimetres_is_reported():
@@ -326,7 +328,9 @@ def test_prismatic_joint_in_millimetres_is_reported():
     q = np.zeros(7)
     q[2] = 120.0
     guard.step(0, 0, q, 0 * q, 0 * q)
-    assert guard.fault_text == "insertion = 120 is far beyond 0..0.24; mm or wrong zero?"
+    assert (
+        guard.fault_text == "insertion is at 120 m, far outside its limits 0..0.24 m; check its unit (mm?) and its zero"
+    )
 
 
 def test_off_in_fault_requires_reset():
@@ -340,7 +344,7 @@ def test_off_in_fault_requires_reset():
 
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
-def test_old_measurement_is_bad(mode):
+def test_old_measurement_is_invalid(mode):
     bench = Bench()
     bench.run(mode, 260)
     for _ in range(20):  # the same measurement, until it is 20 ms old
@@ -356,7 +360,7 @@ def test_old_measurement_is_bad(mode):
     assert bench.guard.fault_text == old
 
 
-def test_future_measurement_is_bad():
+def test_future_measurement_is_invalid():
     bench = Bench().started()
     bench.age = -1
     assert bench.tick().control_mode == Command.HOLD
@@ -377,7 +381,7 @@ def test_joint_that_does_not_follow_is_a_fault(joint, side):
     bench.q = Q + 1.01 * away
     output = bench.tick()
     assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_FOLLOWING)
-    assert bench.guard.fault_text.startswith(f"{ARM.joint_names[joint]} = ")
+    assert bench.guard.fault_text.startswith(f"{ARM.joint_names[joint]} is at ")
     np.testing.assert_array_equal(output.position, bench.q)
 
 

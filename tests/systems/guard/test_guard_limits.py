@@ -29,9 +29,9 @@ def test_soft_wall_reverses_outward_effort(row, side):
     command = np.where(a != 0, side * np.sign(a) * LIMIT, 0.0)
 
     def settled(depth, rate=0.0):
-        """Effort and flags at `depth` of its width into the wall."""
+        """Returns effort and flags at `depth`, as a share of the width of the wall."""
         q = Q.copy()
-        # The sum of joints 2 and 3 stays in the middle of its range, unless it is the limit in question.
+        # The sum of joints 2 and 3 stays in the middle of its range, unless its limit is tested.
         q[1:3] = {
             (1, 1): (0.0, -0.6),
             (1, -1): (0.0, 0.3),
@@ -52,11 +52,11 @@ def test_soft_wall_reverses_outward_effort(row, side):
     assert np.all(effort[joints] * np.sign(command[joints]) <= 1e-12)  # no outward effort remains
     effort, _ = settled(1.0)
     np.testing.assert_allclose(effort, -command, atol=1e-12)
-    # One width before the wall, but it reaches the wall within Kd/Kp at this speed.
+    # The joint is one width before the wall, but reaches it within Kd/Kp at this speed.
     seconds = max(np.divide(ARM.gains.kd, ARM.gains.kp)[joints])
     effort, _ = settled(-1.0, 2 * limits.wall_width[row] / (seconds * (a @ a)))
     np.testing.assert_allclose(effort, -command, atol=1e-12)
-    # It never pulls: it exerts no effort on the way out.
+    # The wall exerts no effort on a joint that moves out of it.
     effort, _ = settled(0.5, -0.6 * limits.wall_width[row] / (seconds * (a @ a)))
     np.testing.assert_allclose(effort, command, atol=1e-12)
 
@@ -92,11 +92,11 @@ def test_feedforward_velocity_passes_with_unlimited_position():
 
 def test_hold_after_position_keeps_near_target():
     bench = Bench().started(Command.POSITION)
-    bench.q = Q - 0.01  # it sags
+    bench.q = Q - 0.01  # the arm sags
     bench.tick()
     np.testing.assert_array_equal(bench.run(Command.HOLD, 1).position, Q)
     bench = Bench().started(Command.POSITION)
-    bench.q = Q - 0.2  # it is pushed away
+    bench.q = Q - 0.2  # the arm is pushed away
     bench.tick()
     np.testing.assert_array_equal(bench.run(Command.HOLD, 1).position, Q - 0.2)
 

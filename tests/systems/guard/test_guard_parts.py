@@ -18,10 +18,10 @@ MS, NOW = 1000, 10**9
 
 
 def measurement():
-    """Returns a good measurement of three joints, 25 ms old."""
+    """Returns a valid measurement of three joints that is 25 ms old."""
     measured = Measurement(3, 20_000)
     measured.advance(NOW - 25 * MS)
-    assert measured.take(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
+    assert measured.store(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
     assert measured.dt == np.inf
     measured.advance(NOW)
     return measured
@@ -42,16 +42,16 @@ def test_stopped_clock_is_reported():
     measured = Measurement(3, 20_000)
     for k in range(25):
         assert (measured.advance(1000)[1] == "the arm's clock stands still") == (k >= 10)
-    for k in range(12):  # after a step the count begins anew
+    for k in range(12):  # after an advance of the clock, the count restarts
         assert (measured.advance(2000)[1] != "") == (k > 10)
 
 
 @pytest.mark.parametrize(("age", "good"), [(-1, False), (0, True), (20_000, True), (20_001, False)])
 def test_measurement_age_is_checked(age, good):
     measured = measurement()
-    problem = measured.take(NOW - age, GOOD + 1, GOOD + 2, GOOD + 3)
+    problem = measured.store(NOW - age, GOOD + 1, GOOD + 2, GOOD + 3)
     assert (problem == "") == good
-    assert measured.bad == (not good)
+    assert measured.num_invalid == (not good)
     for kept, added in ((measured.q, 1), (measured.v, 2), (measured.effort, 3)):
         np.testing.assert_array_equal(kept, GOOD + added if good else GOOD)
     assert good or "allowed is 0 to 0.02 s" in problem
@@ -65,43 +65,43 @@ def test_measurement_size_and_numbers_are_checked(which, bad):
     vectors[which] = bad
     for count in (1, 2):
         text = "the measured positions, velocities or efforts are not 3 finite numbers each"
-        assert measured.take(NOW, *vectors) == text
-        assert measured.bad == count
+        assert measured.store(NOW, *vectors) == text
+        assert measured.num_invalid == count
     np.testing.assert_array_equal(measured.q, GOOD)
-    assert measured.take(NOW, GOOD, GOOD, GOOD) == ""
-    assert measured.bad == 0
+    assert measured.store(NOW, GOOD, GOOD, GOOD) == ""
+    assert measured.num_invalid == 0
 
 
-def test_interval_is_between_good_measurements():
+def test_interval_is_between_valid_measurements():
     measured = measurement()
     measured.advance(NOW + 7 * MS)
-    measured.take(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
-    measured.take(NOW + 5 * MS, GOOD, GOOD, GOOD)
+    measured.store(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
+    measured.store(NOW + 5 * MS, GOOD, GOOD, GOOD)
     assert measured.dt == pytest.approx(30e-3, abs=1e-12)
 
 
 def test_repeated_and_older_measurements():
     measured = measurement()
-    assert measured.take(NOW, GOOD + 1, GOOD, GOOD) == ""
-    assert measured.take(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
-    problem = measured.take(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
-    assert problem == "the measurement is 0.002000 s older than the one before" and measured.bad == 1
+    assert measured.store(NOW, GOOD + 1, GOOD, GOOD) == ""
+    assert measured.store(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
+    problem = measured.store(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
+    assert problem == "the measurement is 0.002000 s older than the previous one" and measured.num_invalid == 1
     np.testing.assert_array_equal(measured.q, GOOD + 1)
-    # After the arm's clock went back, times begin anew.
+    # After the arm's clock went back, earlier times are not compared.
     measured.advance(NOW - 1000 * MS)
-    assert measured.take(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
+    assert measured.store(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
 
 
 def test_first_pose_can_be_implausible():
     measured = measurement()
-    assert measured.take(NOW, GOOD + 100, GOOD, GOOD, lambda q: f"{q[0]:g} is far away") == "100 is far away"
+    assert measured.store(NOW, GOOD + 100, GOOD, GOOD, lambda q: f"{q[0]:g} is far away") == "100 is far away"
     np.testing.assert_array_equal(measured.q, GOOD)
-    assert measured.bad == 1
+    assert measured.num_invalid == 1
 
 
 def test_measurement_is_copied():
     measured, q = measurement(), GOOD.copy()
-    measured.take(NOW, q, q, q)
+    measured.store(NOW, q, q, q)
     q[:] = 9.0
     np.testing.assert_array_equal(measured.q, GOOD)
 
@@ -160,7 +160,7 @@ def test_sequence_order_and_jumps(step, code):
     stream.send(0)
     assert stream.send(MS, step=step) == code
     if code:
-        assert stream.send(2 * MS, step=1 - step) is False  # the refused one moved nothing
+        assert stream.send(2 * MS, step=1 - step) is False  # the refused command changed nothing
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_sender_clock_must_advance_with_arm_clock(ahead, jumps):
     stream = Stream()
     stream.send(0)
     assert stream.send(40 * MS, ahead=ahead) == (Status.REFUSAL_CLOCK_JUMP if jumps else 0)
-    if jumps:  # the refused one moved nothing
+    if jumps:  # the refused command changed nothing
         assert stream.send(41 * MS) is False
 
 
@@ -181,12 +181,12 @@ def test_sender_restarts_after_jump_and_expiry(jump):
     stream.send(0)
     first = stream.send(MS, **jump)
     assert first in (Status.REFUSAL_CLOCK_JUMP, Status.REFUSAL_SEQUENCE_JUMP, Status.REFUSAL_OUT_OF_ORDER)
-    goes_on = {"ahead": size} if name == "ahead" else {}
+    changes = {"ahead": size} if name == "ahead" else {}
     for k in range(2, 51):
-        assert stream.send(k * MS, **goes_on) == first
-    assert stream.send(50 * MS + 1, **goes_on) is False
+        assert stream.send(k * MS, **changes) == first
+    assert stream.send(50 * MS + 1, **changes) is False
     assert stream.stream.lost == 0
-    assert stream.send(51 * MS + 1, **goes_on) is False
+    assert stream.send(51 * MS + 1, **changes) is False
 
 
 def test_stopped_sender_clock_is_a_jump():
@@ -221,8 +221,10 @@ def test_off_requires_hold_of_the_same_sender():
 
 def test_reset_is_a_change_from_false_to_true():
     stream = Stream()
-    asked = [stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])]
-    assert asked == [False, False, False, True, False, False, True]
+    requested = [
+        stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])
+    ]
+    assert requested == [False, False, False, True, False, False, True]
     # The flag of another sender does not count.
     stream.send(8 * MS)
     assert stream.send(60 * MS, sender=6, reset=True) is False
@@ -241,13 +243,13 @@ def test_forget_discards_the_sender():
 
 def test_command_in_force_is_copied():
     command = Bench().command(effort=np.ones(N))
-    force = CommandInForce()
-    force.take(command)
+    in_force = CommandInForce()
+    in_force.replace(command)
     command.effort[:] = 9.0
-    np.testing.assert_array_equal(force.effort, np.ones(N))
-    np.testing.assert_array_equal(force.position, command.position)
-    np.testing.assert_array_equal(force.velocity, np.zeros(N))
-    assert force.status_utime == command.status_utime and force.command is command
+    np.testing.assert_array_equal(in_force.effort, np.ones(N))
+    np.testing.assert_array_equal(in_force.position, command.position)
+    np.testing.assert_array_equal(in_force.velocity, np.zeros(N))
+    assert in_force.status_utime == command.status_utime and in_force.command is command
 
 
 @pytest.mark.parametrize("mode", [Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT])

@@ -59,7 +59,7 @@ GUARD_SETTINGS, PLAUSIBILITY_SETTINGS = settings_of(GuardSettings), settings_of(
 
 @st.composite
 def configurations(draw):
-    """A guard with an arm, a model and settings."""
+    """Guard with an arm, a model and settings."""
     arm = draw(st.sampled_from(ARMS))
     model = draw(st.sampled_from([*[Weightless()] * 6, *(Broken(x) for x in (np.nan, np.inf, 1e300, 10.0))]))
     plausibility = PlausibilitySettings(**draw(PLAUSIBILITY_SETTINGS))
@@ -68,7 +68,7 @@ def configurations(draw):
 
 
 class Script:
-    """Generates measurements and commands near each other and the arm's range, with extreme ones among them."""
+    """Generates measurements and commands near each other and inside the arm's range, and some extreme ones."""
 
     def __init__(self, draw, arm, guard):
         self.arm, self.guard, self.n = arm, guard, arm.num_joints
@@ -103,7 +103,7 @@ class Script:
         return command
 
     def step(self):
-        """One period: output of the guard."""
+        """Returns the output of the guard for one period."""
         self.utime += int(self.random.choice([1000, 1000, 1000, 0, 3000, 60_000, -1000], p=_PERIODS))
         self.guard.receive(self.command() if self.random.random() < 0.97 else None, self.utime)
         size = self.random.choice([1e-5, 1e-3, 1e-2, 1.0], p=[0.9, 0.08, 0.01, 0.01])
@@ -128,7 +128,7 @@ def check(data, modes):
     guard.step(script.utime, script.utime, script.q, np.zeros(script.n), np.zeros(script.n))
     if script.mode != Command.HOLD:
         # Commands act immediately, without the periods of the start check.
-        guard._force.take(script.command())
+        guard._in_force.replace(script.command())
         guard._stream.accept(guard.last_command, script.utime)
         guard._act(script.mode)
     for _ in range(10):
@@ -138,7 +138,7 @@ def check(data, modes):
             assert numbers.shape == (script.n,) and np.all(np.isfinite(numbers))
         assert np.all(np.abs(output.effort) <= arm.effort_limits * (1 + 1e-12))
         assert np.all(np.abs(output.velocity) <= guard.limits.speed * (1 + 1e-12))
-        # Inside the limits, or where the arm was measured once.
+        # The target is inside the limits, or at a measured pose.
         low, high = np.minimum(arm.position_lower, script.low), np.maximum(arm.position_upper, script.high)
         assert np.all((output.position >= low - 1e-9) & (output.position <= high + 1e-9))
 
@@ -147,7 +147,7 @@ def check_many(count):
     modes = Counter()
     decorate = settings(max_examples=count, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     decorate(given(st.data())(lambda data: check(data, modes)))()
-    # The test would mean nothing if no command acted or no fault was found.
+    # Commands must act and faults must occur, otherwise the test is not meaningful.
     print(f"{count} configurations: {dict(modes)}")
     for mode, state in (
         (Command.EFFORT, Status.STATE_EFFORT),

@@ -25,7 +25,7 @@ from dvrk_drake.systems.guard.settings import GuardSettings
         ({"reset_fault": True}, Status.REFUSAL_BAD_RESET),
     ],
 )
-def test_bad_commands_are_refused_and_lead_to_hold(fields, code):
+def test_invalid_commands_are_refused_and_lead_to_hold(fields, code):
     bench = Bench(modes=WITH_OFF).started()
     for _ in range(52):
         assert bench.send(**fields) == code

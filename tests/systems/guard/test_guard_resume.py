@@ -22,7 +22,7 @@ def expire(bench):
 
 
 def jump(bench, mode=None):
-    """Lets the sender's clock jump: its commands are refused until the last good one expires."""
+    """Simulates a jump of the sender's clock. Its commands are refused until the last accepted one expires."""
     for _ in range(50):
         code = bench.send(mode or bench.output.control_mode, utime=bench.utime)
         assert code == Status.REFUSAL_CLOCK_JUMP
@@ -42,7 +42,7 @@ def waits(bench, reason):
     assert (guard.state, guard.fault_code, guard.hold_reason) == (Status.STATE_HOLD, Status.FAULT_NONE, reason)
     for sender in (5, 6):
         bench.tick(60)
-        # The first one may come after a jump of its clock.
+        # The first command may follow a jump of the sender's clock.
         bench.send(Command.HOLD, sender=sender)
         for mode in 150 * [Command.EFFORT, Command.POSITION]:
             bench.tick()
@@ -130,7 +130,7 @@ def test_refusal_during_mode_change_requires_resume(bad):
     assert bench.guard.state == Status.STATE_STARTING
     assert bench.send(**{**fields, **bad}) != Status.REFUSAL_NONE
     assert bench.tick().control_mode == Command.HOLD
-    assert bench.guard.hold_reason.startswith("a command was refused while its mode began: ")
+    assert bench.guard.hold_reason.startswith("a command was refused during the start check: ")
     bench.tick(1000)
     assert bench.send(Command.EFFORT) == Status.REFUSAL_RESUME
 
@@ -217,31 +217,31 @@ class WallBench(Bench):
 
     def __init__(self, **arguments):
         self.stalled = 0
-        self.utime = 0  # before the guard is made
+        self.utime = 0  # before the guard is created
         super().__init__(wall_clock=lambda: self.utime + self.stalled - 10**14, **arguments)
 
     def stall(self, milliseconds):
-        """Stops the guard's process and the arm's clock: nothing is received, no step is made."""
+        """Stops the guard's process and the arm's clock. No command is received and no step is executed."""
         self.stalled += round(milliseconds * MS)
 
 
 @MODES
 @pytest.mark.parametrize("first", ["receive", "step"])
 @pytest.mark.parametrize(
-    ("milliseconds", "goes_on"), [(20, True), (48, True), (48.001, False), (50, False), (200, False), (1000, False)]
+    ("milliseconds", "continues"), [(20, True), (48, True), (48.001, False), (50, False), (200, False), (1000, False)]
 )
-def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, goes_on):
-    """The first event after it is a command or a step. The command was 1 ms old on arrival."""
+def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, continues):
+    """The first event after the stall is a command or a step. The command was 1 ms old on arrival."""
     bench = WallBench().started(mode)
     assert bench.send(mode, status_utime=bench.utime - MS) == Status.REFUSAL_NONE
     bench.stall(milliseconds)
     bench.utime += MS
     if first == "receive":
-        assert bench.send(mode) == (Status.REFUSAL_NONE if goes_on else Status.REFUSAL_RESUME)
+        assert bench.send(mode) == (Status.REFUSAL_NONE if continues else Status.REFUSAL_RESUME)
     bench.q = Q + 1e-3
     bench.output = output = bench.step()
     guard = bench.guard
-    if goes_on:
+    if continues:
         assert (output.control_mode, guard.counts.expired, guard.hold_reason) == (mode, 0, "")
         assert first == "receive" or bench.send(mode) == Status.REFUSAL_NONE
         bench.tick()
@@ -255,16 +255,16 @@ def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, g
 
 @MODES
 @pytest.mark.parametrize(
-    ("milliseconds", "goes_on"), [(20, True), (50, True), (51, False), (200, False), (1000, False)]
+    ("milliseconds", "continues"), [(20, True), (50, True), (51, False), (200, False), (1000, False)]
 )
-def test_sender_stall_expires_command_by_arm_clock(mode, milliseconds, goes_on):
+def test_sender_stall_expires_command_by_arm_clock(mode, milliseconds, continues):
     bench = WallBench().started(mode)
     bench.run(mode, 1)  # received one tick before the time that the bench has now
     bench.tick(milliseconds - 1)
     code = bench.send(mode)
-    assert code == (Status.REFUSAL_NONE if goes_on else Status.REFUSAL_RESUME)
-    assert bench.tick().control_mode == (mode if goes_on else Command.HOLD)
-    assert goes_on == (bench.guard.hold_reason == "")
+    assert code == (Status.REFUSAL_NONE if continues else Status.REFUSAL_RESUME)
+    assert bench.tick().control_mode == (mode if continues else Command.HOLD)
+    assert continues == (bench.guard.hold_reason == "")
 
 
 def test_answer_to_old_measurement_has_its_wall_clock_age():
@@ -279,7 +279,7 @@ def test_answer_to_old_measurement_has_its_wall_clock_age():
 
 
 def test_delayed_command_has_age_of_its_measurement():
-    """Such a command waits in the socket of a stopped process. By the arm's clock it is new."""
+    """A command that waits in the socket of a stopped process is recent by the arm's clock."""
     bench = WallBench().started()
     answered = bench.utime
     bench.stall(30)
@@ -297,7 +297,7 @@ def test_measurements_have_wall_clock_times():
     clock = WallClock(lambda: now[0])
     clock.note(5000, 200)
     now[0] += 3000
-    clock.note(5000, 200)  # the same one again
+    clock.note(5000, 200)  # a repeated measurement
     clock.note(8000, 0)
     assert clock.time_of(5000, 1) == 10**6 - 200
     assert clock.time_of(8000, 1) == clock.now() == 10**6 + 3000

@@ -64,11 +64,11 @@ def test_joint_without_gains_is_refused(kp):
 
 @pytest.mark.parametrize("row", range(N + 1))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_beyond_starts_at_half_of_the_margin(row, side):
+def test_position_limit_fault_starts_at_half_of_the_margin(row, side):
     joint = int(np.flatnonzero(A[row])[0])
     bound = (LOWER if side < 0 else UPPER)[row]
     q = Q.copy()
-    # The sum of shoulder and elbow has limits of its own, and stays inside of them unless they are in question.
+    # The sum of shoulder and elbow has its own limits and stays inside unless they are tested.
     elsewhere = {(1, 1): -0.6, (1, -1): 0.3, (2, 1): -0.1, (2, -1): 1.0, (N, -1): -0.6, (N, 1): 0.2}
     if (row, side) in elsewhere:
         q[1 if row == 2 else 2] = elsewhere[row, side]
@@ -76,19 +76,19 @@ def test_beyond_starts_at_half_of_the_margin(row, side):
     def at(share):
         pose = q.copy()
         pose[joint] += bound + side * share * LIMITS.margin[row] - A[row] @ q
-        return LIMITS.beyond(pose)
+        return LIMITS.position_limit_fault(pose)
 
     assert at(-0.5) == at(0.0) == at(0.499) == ""
-    assert at(0.501).startswith(f"{LIMITS.names[row]} = ")
-    assert at(0.501).endswith(f" is beyond {LOWER[row]:.4g}..{UPPER[row]:.4g}")
+    assert at(0.501).startswith(f"{LIMITS.names[row]} is at ")
+    assert at(0.501).endswith(f", outside its limits {LOWER[row]:.4g}..{UPPER[row]:.4g} rad")
 
 
-def test_beyond_describes_the_worst_limit():
+def test_position_limit_fault_names_the_worst_limit():
     q = Q.copy()
     q[4], q[6] = UPPER[4] + 0.6 * LIMITS.margin[4], LOWER[6] - 0.7 * LIMITS.margin[6]
-    assert LIMITS.beyond(q).startswith("wrist_roll = ")
+    assert LIMITS.position_limit_fault(q).startswith("wrist_roll is at ")
     q[4] += 0.2 * LIMITS.margin[4]
-    assert LIMITS.beyond(q).startswith("wrist_pitch = ")
+    assert LIMITS.position_limit_fault(q).startswith("wrist_pitch is at ")
 
 
 @pytest.mark.parametrize("row", range(N + 1))
@@ -105,8 +105,8 @@ def test_implausible_pose_starts_at_half_of_the_range(row, side):
         return LIMITS.implausible_pose(pose)
 
     assert at(-0.5) == at(0.0) == at(0.499) == ""
-    assert at(0.501).startswith(f"{LIMITS.names[row]} = ")
-    assert at(0.501).endswith("; degrees or wrong zero?")
+    assert at(0.501).startswith(f"{LIMITS.names[row]} is at ")
+    assert at(0.501).endswith("; check its unit (degrees?) and its zero")
 
 
 # The start
@@ -127,7 +127,7 @@ def test_efforts_must_start_near_measured_ones(joint, side):
     far = side * 0.1 * LIMIT[joint] * E[joint]
     assert start(Command.EFFORT, effort=HALF + 0.99 * far) == Status.REFUSAL_NONE
     assert start(Command.EFFORT, effort=HALF + 1.01 * far) == Status.REFUSAL_START_FAR
-    # Nor where the present effort is more than commands may be and than they may start beside.
+    # The start is also refused if the present effort exceeds the limit of commands plus the start tolerance.
     most = side * LIMIT * E[joint]
     assert start(Command.EFFORT, measured=1.09 * most, effort=1.05 * most) == Status.REFUSAL_NONE
     assert start(Command.EFFORT, measured=1.11 * most, effort=1.05 * most) == Status.REFUSAL_START_FAR
@@ -139,17 +139,17 @@ def test_efforts_must_start_near_measured_ones(joint, side):
 @pytest.mark.parametrize("side", [-1, 1])
 def test_positions_must_start_near_measured_ones(joint, side):
     far = side * LIMITS.margin[joint] * E[joint]
-    lead = KP[joint] / KD[joint] * far  # a velocity that leads as far
+    lead = KP[joint] / KD[joint] * far  # velocity with the same lead
     assert start(Command.POSITION, position=Q + 0.99 * far) == Status.REFUSAL_NONE
     assert start(Command.POSITION, position=Q + 1.01 * far) == Status.REFUSAL_START_FAR
     assert start(Command.POSITION, velocity=0.99 * lead) == Status.REFUSAL_NONE
     assert start(Command.POSITION, velocity=1.01 * lead) == Status.REFUSAL_START_FAR
-    # Together they count where they lead the same way, and neither makes up for the other.
+    # Distance and velocity add up in the same direction, but do not compensate each other.
     assert start(Command.POSITION, position=Q + 0.6 * far, velocity=0.3 * lead) == Status.REFUSAL_NONE
     assert start(Command.POSITION, position=Q + 0.6 * far, velocity=0.6 * lead) == Status.REFUSAL_START_FAR
     assert start(Command.POSITION, position=Q + 0.6 * far, velocity=-0.6 * lead) == Status.REFUSAL_NONE
     assert start(Command.POSITION, position=Q + 1.1 * far, velocity=-0.6 * lead) == Status.REFUSAL_START_FAR
-    # Positions may start outside the limits, to come back, and whatever the effort is.
+    # Positions may start outside the limits, to return, and with any effort.
     outside = Q + 9.0 * E[joint]
     assert start(Command.POSITION, q=outside, position=outside, measured=2 * LIMIT) == Status.REFUSAL_NONE
 
@@ -187,7 +187,7 @@ def test_fast_joint_is_braked(joint, side):
         effort, flags = limits.restrain_effort(push, Q, share * speed)
         np.testing.assert_allclose(effort, left * push, atol=1e-12)
         assert flagged(flags) == (([joint], {Status.FLAG_SPEED_LIMIT}) if share > 1 else ([], set()))
-    # It brakes a fast joint with up to the full motor effort.
+    # A fast joint is braked with up to the full motor effort.
     np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 1.1 * speed)[0], -0.4 * push, atol=1e-12)
     np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 9.0 * speed)[0], -push, atol=1e-12)
 
@@ -252,10 +252,10 @@ def test_joints_stop_together_on_coupled_limit(side):
     last[1:3] = bound / 2 - side * 0.001
     wanted = last + side * np.array([0.001, 0.003, 0.001, 0.0, 0.0, 0.0, 0.001])
     target, flags = LIMITS.limit_position(wanted, last, 0.01)
-    # A half of their way leads them to the limit; the other joints go all of theirs.
+    # These joints reach the limit after half of the distance. The other joints move the whole distance.
     np.testing.assert_allclose(target - last, side * np.array([0.001, 0.0015, 0.0005, 0, 0, 0, 0.001]), atol=1e-12)
     np.testing.assert_array_equal(flags, np.where(A[N] != 0, Status.FLAG_COUPLED_LIMIT, 0))
-    # Along the limit, and away from it, they are free.
+    # Motions along the limit and away from it are not limited.
     for change in ([0.0, 0.002, -0.002], [0.0, -side * 0.002, 0.0]):
         on = target + np.array([*change, 0, 0, 0, 0])
         moved, flags = LIMITS.limit_position(on, target, 0.01)
@@ -318,7 +318,7 @@ def test_conflicting_coupled_limits_stop_target():
     np.testing.assert_array_equal(target, Q)
     assert target is not last
     assert np.all(flags[[0, 1]] == Status.FLAG_COUPLED_LIMIT)
-    # Each of them alone lets the target go on.
+    # With only one of these limits, the target moves.
     for alone in (first, second):
         limits = GuardLimits(coupled(alone), GuardSettings())
         assert limits.limit_position(wanted, Q, 0.01)[0][3] == pytest.approx(Q[3] + 0.001)

@@ -17,8 +17,8 @@ def test_slow_median_period_is_found_after_50_periods(period, slow):
     monitor = PeriodMonitor(SETTINGS)
     faults = [monitor.add(period) for _ in range(200)]
     assert [bool(fault) for fault in faults] == [slow and k >= 50 for k in range(200)]
-    assert not slow or faults[-1] == "the guard's period has a median above the allowed 5 ms"
-    # Good periods end it.
+    assert not slow or faults[-1] == "the median period of the guard is above the allowed 5 ms"
+    # Normal periods end the fault.
     faults = [monitor.add(0.001) for _ in range(100)]
     assert [bool(fault) for fault in faults] == [slow and k < 49 for k in range(100)]
 
@@ -27,7 +27,7 @@ def test_slow_median_period_is_found_after_50_periods(period, slow):
 def test_long_period_is_found_immediately(period, long):
     monitor = PeriodMonitor(SETTINGS)
     assert monitor.add(0.001) == ""
-    text = f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are 40"
+    text = f"the guard was not stepped for {1e3 * period:.0f} ms; 40 ms are allowed"
     assert monitor.add(period) == (text if long else "")
     assert monitor.add(0.001) == ""
 
@@ -42,14 +42,14 @@ def test_slow_guard_holds_until_operator_resumes():
         bench.send(Command.EFFORT)
         bench.step()
         assert (bench.guard.state == Status.STATE_EFFORT) == (k < 50)
-    assert bench.guard.hold_reason == "the guard's period has a median above the allowed 5 ms"
-    # No command acts while it is slow, even with an operator's reset.
+    assert bench.guard.hold_reason == "the median period of the guard is above the allowed 5 ms"
+    # No command acts while the period is too long, even after a reset by an operator.
     for reset in (False, True):
         bench.utime += 20 * MS
         assert bench.send(Command.HOLD, reset_fault=reset) == Status.REFUSAL_NONE
         bench.step()
     assert bench.guard.hold_reason == ""
-    assert bench.guard.waits_for == "the guard's period has a median above the allowed 5 ms"
+    assert bench.guard.blocked_reason == "the median period of the guard is above the allowed 5 ms"
     assert bench.guard.accepted_modes == modes(Command.HOLD)
     bench.tick()
     bench.utime += MS
@@ -64,7 +64,7 @@ def test_guard_holds_after_49_ms_without_step():
     bench.utime += 49 * MS
     output = bench.step()
     assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
-    assert bench.guard.hold_reason == "the guard was not stepped for 49 ms; allowed are 40"
+    assert bench.guard.hold_reason == "the guard was not stepped for 49 ms; 40 ms are allowed"
 
 
 def test_period_is_measured_by_wall_clock():
@@ -81,7 +81,7 @@ def test_period_is_measured_by_wall_clock():
         assert bench.guard.state == state
         wall[0] += MS
         assert bench.send(Command.EFFORT) in (Status.REFUSAL_NONE, Status.REFUSAL_RESUME)
-    assert bench.guard.hold_reason == "the guard was not stepped for 50 ms; allowed are 40"
+    assert bench.guard.hold_reason == "the guard was not stepped for 50 ms; 40 ms are allowed"
 
 
 def reversals(monitor, wave, seconds=6.0):
@@ -100,7 +100,7 @@ def test_oscillating_efforts_are_found(joint, frequency):
     wave = lambda t: unit * np.sign(np.sin(2 * np.pi * frequency * (t + 1e-4)))  # noqa: E731
     time, found = reversals(OscillationMonitor(SETTINGS, ARM), wave)
     assert found == joint
-    # Each half period is a reversal, and four of them are allowed, which fade. The mean takes a while to settle.
+    # Each half period is a reversal. Four reversals are allowed, with exponential decay. The mean settles slowly.
     assert time <= 8 / (2 * frequency) + 0.11
 
 

@@ -78,7 +78,7 @@ def test_position_jump_beyond_tolerance_is_found(joint, side):
 
 @pytest.mark.parametrize("ticks", [5, 100, 107, 125, 133])
 def test_last_valid_pose_precedes_the_fault(ticks):
-    """Its age is one to two detection times before the fault is found, or it is the first pose."""
+    """The last valid pose is one to two detection times older than the fault, or it is the first pose."""
     sensors, v = Sensors(), unit(0, 0.5)
     first = sensors.q.copy()
     sensors.v = v
@@ -122,7 +122,7 @@ def test_inconsistent_velocity_is_found(joint, speed, measured, relative):
     q = (lambda q: q0) if measured == "stuck" else None
     factor = {"stuck": 1.0, "inverted": -1.0, "zero": 0.0, "double": 2.0}[measured]
     fault, ticks = sensors.move(v, ticks=1000, measured_q=q, measured_v=lambda v: factor * v)
-    # The difference grows at `relative` times the speed, and fades with the time constant T.
+    # The difference grows with `relative` times the speed and decays with the time constant T.
     seen = abs(factor * speed)
     T = SETTINGS.velocity_memory
     allowed = TOLERANCE[joint] + T * SETTINGS.velocity_counts * COUNTS[joint] + SETTINGS.velocity_delay * seen
@@ -167,7 +167,7 @@ def test_constant_position_under_changing_effort_is_frozen(joint, side):
     time = SETTINGS.frozen_time + COUNTS[joint] / SETTINGS.frozen_speed
     for factor, found in ((0.99, False), (1.01, True)):
         sensors = Sensors()
-        sensors.move(np.zeros(N), ticks=1000)  # it may have been at rest before
+        sensors.move(np.zeros(N), ticks=1000)  # the joint was at rest before
         sensors.effort = unit(joint, side * factor * SETTINGS.frozen_effort * LIMIT[joint])
         fault, ticks = sensors.move(np.zeros(N), ticks=500)
         assert ("does not change although" in fault) == found
@@ -206,7 +206,7 @@ def test_gravity_of_moving_joints_freezes_no_other_joint():
 @pytest.mark.parametrize("joint", JOINTS)
 def test_motion_inconsistent_with_effort_is_found(joint):
     """With unit inertia, the full effort accelerates the joint in the wrong direction (inverted encoder)."""
-    strong = SETTINGS.hand_effort < 0.1 * LIMIT[joint]  # on the others, the allowed hand effort hides it
+    strong = SETTINGS.hand_effort < 0.1 * LIMIT[joint]  # on weaker joints, the error is within the allowed hand effort
     for sign, found in ((1, False), (-1, strong)):
         sensors = Sensors(model=Unity())
         sensors.effort = unit(joint, LIMIT[joint])
@@ -229,7 +229,7 @@ def test_mass_matrix_is_updated_every_50_ms():
 
 def test_slowly_growing_model_error_is_accepted():
     sensors = Sensors()
-    v = COUNTS / MS  # a count at each tick, so that nothing looks frozen
+    v = COUNTS / MS  # one count per tick, so that the position is not frozen
     for k in range(2000):
         sensors.effort = 3 * LIMIT * min(k / 1000, 1.0)
         assert sensors.move(v, ticks=1)[0] == ""
@@ -243,9 +243,9 @@ def test_missing_measured_effort_is_found(joint, measured):
         sensors.commanded = unit(joint, commanded * LIMIT[joint])
         sensors.effort = measured * sensors.commanded
         fault, ticks = sensors.move(np.zeros(N), ticks=100)
-        text = f"{ARM.joint_names[joint]}: the measured effort does not show the commanded one"
+        text = f"{ARM.joint_names[joint]}: the measured effort does not follow the commanded effort"
         assert (fault == text) == found
-        assert not sensors.checks.invalid.any()  # its position is valid
+        assert not sensors.checks.invalid.any()  # the position is valid
         if found:
             assert MS * ticks == pytest.approx(SETTINGS.silent_time, abs=1.5 * MS)
 
@@ -314,7 +314,7 @@ def test_invalid_joint_gets_gravity_effort_others_are_held(mode, joint):
     np.testing.assert_array_equal(output.joint_flags & Status.FLAG_IMPLAUSIBLE != 0, unit(joint).astype(bool))
     gravity = Heavy().gravity_effort(Q)
     np.testing.assert_allclose(output.effort, gravity, rtol=0, atol=1e-12)
-    # The others are held by springs and dampers, within 0.3 of their limits; this one has no feedback.
+    # All other joints are regulated within 0.3 of their effort limits. The faulty joint has no feedback.
     kp, others = np.array(ARM.gains.kp), np.arange(N) != joint
     for away in (1e-3, -1e-3, 9e-3):
         bench.q = Q + unit(joint, 0.3) + away
@@ -337,7 +337,7 @@ def test_no_false_alarms_on_recordings_of_real_arms(shared_data, name, file):
     recording = read_recording(shared_data / "trajectories" / file, arm).in_joint_coordinates(arm)
     model = ControlModel(IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs))
     speed, true = GuardLimits(arm, GuardSettings()).speed, true_time(recording)
-    # As recorded, and without the rows that are written twice and at the times at which the others were measured.
+    # The rows as recorded, then without repeated rows and with the true times of the other rows.
     for rows, t in ((np.arange(len(recording)), recording.t), (true.rows, true.t)):
         checks = Plausibility(arm, model, SETTINGS, speed)
         for row, dt in zip(rows, np.diff(t, prepend=t[0]), strict=True):
@@ -364,7 +364,7 @@ def test_reset_marks_position_as_valid():
     assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_NONE)
     np.testing.assert_array_equal(output.position, bench.q)
     assert not np.any(bench.tick(100).joint_flags)
-    # Another joint fails later: the first one is among those that are held.
+    # Another joint fails later. The first joint is then held again.
     bench.q = bench.q + unit(0, 0.3)
     np.testing.assert_array_equal(bench.tick().joint_flags & Status.FLAG_IMPLAUSIBLE != 0, unit(0).astype(bool))
 
@@ -375,7 +375,7 @@ def test_second_invalid_joint_gets_no_feedback():
         bench.q = bench.q + unit(joint, 0.3)
         output = bench.tick()
         assert np.flatnonzero(output.joint_flags & Status.FLAG_IMPLAUSIBLE).tolist() == flags
-        # With the last valid positions of both.
+        # The gravity effort uses the last valid positions of both joints.
         np.testing.assert_allclose(output.effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
         bench.tick(50)
 
@@ -385,7 +385,7 @@ def test_arm_without_power_is_not_checked():
     bench.run(Command.HOLD, 1)
     bench.run(Command.OFF, 1)
     for _ in range(10):
-        bench.q = bench.q - unit(4, 0.1)  # it falls and is held
+        bench.q = bench.q - unit(4, 0.1)  # the arm falls and is held
         assert bench.tick().control_mode == Command.OFF
     assert bench.guard.fault_code == Status.FAULT_NONE
     bench.run(Command.HOLD, 100)
@@ -399,7 +399,7 @@ def test_saturated_coupled_actuators_are_plausible():
     assert sensors.commanded[1] > SETTINGS.silent_effort * LIMIT[1]
     sensors.effort = np.array([0.0, 1.464 - 1.753, -1.753, 0.0, 0.0, 0.0, 0.0])
     assert sensors.move(COUNTS / MS, ticks=200)[0] == ""
-    # An effort that reads zero although the actuators apply it is still found.
+    # A measured effort of zero is still detected if the actuators can apply the effort.
     sensors.commanded = 0.4 * LIMIT * unit(1)
     sensors.effort = np.zeros(N)
-    assert "does not show" in sensors.move(COUNTS / MS, ticks=200)[0]
+    assert "does not follow the commanded effort" in sensors.move(COUNTS / MS, ticks=200)[0]

@@ -101,10 +101,10 @@ class Scene:
             self.key,
             self.modes,
         )
-        self.hear()
+        self.receive()
         return self
 
-    def hear(self):
+    def receive(self):
         while self.network.published:
             channel, data = self.network.published.pop(0)
             assert channel == "DVRK_STATUS_MTML"
@@ -112,7 +112,7 @@ class Scene:
             self.statuses.append(Status.decode(data))
 
     def next_period(self):
-        self.hear()
+        self.receive()
         self.k += 1
         self.utime += 1000
         if self.k < self.periods:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lcm_arm import ARM, POSES, START, Controller, Sending, SimulatedArm, run
+from lcm_arm import ARM, POSES, START, CommandSender, Controller, SimulatedArm, run
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
@@ -50,7 +50,7 @@ def test_controller_starts_acts_and_hold_follows(name):
     assert (status.guard_state, status.refusal_code) == (Status.STATE_HOLD, Status.REFUSAL_RESUME)
     assert status.fault_code == Status.FAULT_NONE and status.fault_text.startswith("the last command expired: ")
     run(lcm, 60, arm)
-    operator = Sending(lcm, arm.arm)
+    operator = CommandSender(lcm, arm.arm)
     run(lcm, 5, arm, operator)
     operator.fix("reset_fault", [1.0])
     run(lcm, 5, arm, operator)
@@ -80,7 +80,7 @@ def test_the_status_echoes_the_last_accepted_command():
     assert command.session_id == status.session_id != 0
 
 
-def test_of_two_controllers_the_first_stays_in_command():
+def test_first_of_two_controllers_stays_in_control():
     lcm = DrakeLcm("memq://")
     arm, first, second = SimulatedArm(lcm), Controller(lcm), Controller(lcm)
     run(lcm, 300, arm, first)
@@ -105,7 +105,7 @@ def test_second_gravity_compensation_is_refused_at_start():
 def test_own_gravity_compensation_with_zero_command():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
-    sender = Sending(lcm, effort=np.zeros(7))
+    sender = CommandSender(lcm, effort=np.zeros(7))
     run(lcm, 1000, arm, sender)
     assert arm.statuses[-1].guard_state == Status.STATE_EFFORT
     assert arm.drift() < 1e-3
@@ -115,7 +115,7 @@ def test_own_gravity_compensation_with_zero_command():
 def test_position_commands_move_the_arm():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
-    sender = Sending(lcm, desired_state=np.concatenate([POSES["mtml"], np.zeros(7)]))
+    sender = CommandSender(lcm, desired_state=np.concatenate([POSES["mtml"], np.zeros(7)]))
     run(lcm, 300, arm, sender)
     assert arm.statuses[-1].guard_state == Status.STATE_POSITION
     goal = np.array(POSES["mtml"]) + 0.1
@@ -128,7 +128,7 @@ def test_position_commands_move_the_arm():
 def test_a_fault_is_reset_through_the_sender():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
-    first = Sending(lcm)
+    first = CommandSender(lcm)
     run(lcm, 3, arm, first)
     arm.guard.report_fault("the amplifier is hot")
     run(lcm, 100, arm, first)
@@ -141,7 +141,7 @@ def test_a_fault_is_reset_through_the_sender():
 def test_arm_falls_in_off_if_driver_accepts_it():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(control_modes=["off"]))
-    sender = Sending(lcm, control_mode=[float(Command.HOLD)])
+    sender = CommandSender(lcm, control_mode=[float(Command.HOLD)])
     run(lcm, 10, arm, sender)
     sender.fix("control_mode", [float(Command.OFF)])
     run(lcm, 200, arm, sender)
@@ -154,7 +154,7 @@ def test_efforts_after_off_are_refused_while_braking():
     lcm = DrakeLcm("memq://")
     driver = DvrkDriver(control_modes=["effort", "off"], guard=GuardSettings(start_time=0.05))
     arm = SimulatedArm(lcm, driver=driver)
-    sender = Sending(lcm)
+    sender = CommandSender(lcm)
     for mode, milliseconds in ((Command.HOLD, 50), (Command.OFF, 50), (Command.HOLD, 5)):
         sender.fix("control_mode", [float(mode)])
         run(lcm, milliseconds, arm, sender)
@@ -192,7 +192,7 @@ def test_sender_commands_hold_without_finite_numbers():
         ({"effort": effort, "reset_fault": [1.0]}, Command.HOLD),
     ]
     for inputs, mode in cases:
-        command = Sending(lcm, **inputs).command()
+        command = CommandSender(lcm, **inputs).command()
         assert command.control_mode == mode
         np.testing.assert_array_equal(command.effort, effort if mode == Command.EFFORT else np.zeros(7))
         expected = q_v if mode == Command.POSITION else np.zeros(14)
@@ -213,7 +213,7 @@ def test_status_receiver_outputs_nan_without_valid_status():
     lcm = DrakeLcm("memq://")
     builder = DiagramBuilder()
     statuses = StatusFilter("MTML", 7)
-    serializer = TolerantSerializer(Status, read=lambda data: statuses.take(data, 0.0))
+    serializer = TolerantSerializer(Status, read=lambda data: statuses.accept(data, 0.0))
     subscriber = builder.AddSystem(LcmSubscriberSystem("DVRK_STATUS_MTML", serializer, lcm))
     receiver = builder.AddSystem(DvrkStatusReceiver(ARM))
     builder.Connect(subscriber.get_output_port(), receiver.get_input_port())

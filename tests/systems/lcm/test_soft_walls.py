@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lcm_arm import ARM, POSES, SOON, Sending, SimulatedArm, run, without_stops
+from lcm_arm import ARM, POSES, SOON, CommandSender, SimulatedArm, run, without_stops
 from pydrake.lcm import DrakeLcm
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -19,7 +19,7 @@ def test_feedforward_velocity_keeps_joints_inside_limits(name):
     A, lower, upper = arm.arm.limit_matrix()
     outward = np.where(np.arange(7) == 2, -1.0, 1.0)  # shoulder and elbow in opposite directions, for the coupled limit
     goal = np.where(outward > 0, arm.arm.position_upper - 1e-3, arm.arm.position_lower + 1e-3)
-    sender = Sending(lcm, arm.arm, desired_state=np.concatenate([POSES[name], np.zeros(7)]))
+    sender = CommandSender(lcm, arm.arm, desired_state=np.concatenate([POSES[name], np.zeros(7)]))
     run(lcm, 60, arm, sender)
     sender.fix("desired_state", np.concatenate([goal, np.zeros(7)]))
     run(lcm, 1500, arm, sender)
@@ -35,7 +35,7 @@ def test_feedforward_velocity_keeps_joints_inside_limits(name):
 def test_effort_plus_gravity_compensation_stays_limited():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
-    sender = Sending(lcm, effort=np.zeros(7))
+    sender = CommandSender(lcm, effort=np.zeros(7))
     run(lcm, 300, arm, sender)
     for sign in (1, -1):
         sender.fix("effort", sign * ARM.effort_limits)
@@ -51,7 +51,7 @@ def pushed(name, push, seconds):
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     A, lower, upper = arm.arm.limit_matrix()
     held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
-    sender = Sending(lcm, arm.arm, effort=held)
+    sender = CommandSender(lcm, arm.arm, effort=held)
     run(lcm, 60, arm, sender)
     worst = -np.inf
     for k in range(round(1e3 * seconds)):
@@ -80,7 +80,7 @@ def test_wrist_on_soft_wall_comes_to_rest(name, joint):
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
     push = 0.6 * arm.arm.effort_limits * np.eye(7)[joint]
-    sender = Sending(lcm, arm.arm, effort=held)
+    sender = CommandSender(lcm, arm.arm, effort=held)
     run(lcm, 60, arm, sender)
     for k in range(1000):
         sender.fix("effort", held + push * min(1.0, k / 200))

@@ -1,4 +1,4 @@
-"""Rests of synthetic motions and the poses that are extracted from them."""
+"""Static segments of synthetic motions and the poses that are extracted from them."""
 
 from dataclasses import replace
 
@@ -45,16 +45,16 @@ def test_velocities_are_smoothed_without_delay():
         np.testing.assert_allclose(v[200:-200], (2 * np.pi * np.cos(2 * np.pi * t))[200:-200], atol=0.01)
 
 
-def test_rests_are_at_the_commanded_poses():
+def test_static_segments_are_at_the_commanded_poses():
     poses, recording = moving()
     rests = static_poses(recording, ARM)
     np.testing.assert_allclose(rests.q, poses, atol=1e-3)
     assert rests.t is None and rests.qd is None
-    # A stop of 0.25 s is too short for a rest.
+    # A stop of 0.25 s is too short for a static segment.
     assert len(static_poses(moving(rest=0.15)[1], ARM)) == 0
 
 
-def test_poses_and_short_recordings_have_no_rests():
+def test_poses_and_short_recordings_have_no_segments():
     _, recording = moving()
     t = recording.t
     assert recording.is_motion and recording.has_increasing_times
@@ -65,11 +65,11 @@ def test_poses_and_short_recordings_have_no_rests():
     assert not Recording(q=recording.q[:99], t=t[:99]).is_motion
 
 
-def test_poses_come_from_rests_or_are_unchanged():
+def test_poses_are_extracted_or_unchanged():
     poses, recording = moving(count=12)
     found = find_poses(recording, ARM)
     np.testing.assert_allclose(found.recording.q, poses, atol=1e-3)
-    assert "12 poses at which the arm rests" in found.note and not found.moves
+    assert "found in the motion: 12" in found.note and not found.moves
     few = find_poses(moving(count=3)[1], ARM)
     assert few.moves and few.measured is None and len(few.recording) > 100
     slow = find_poses(moving(count=3)[1], ARM, with_low_speed_segments=True)
