@@ -49,8 +49,13 @@ class NamedArrays(NamedTuple):
 
 def looks_like_arrays(path: Path, content: bytes) -> bool:
     """Returns whether a file with this content is a MATLAB file or a NumPy archive, from its first bytes or its name."""
-    is_matlab = content[126:128] in (b"IM", b"MI") or content[:8] == _HDF5_MAGIC
+    is_matlab = content[126:128] in (b"IM", b"MI") or _is_hdf5(content)
     return is_matlab or path.suffix.lower() == ".mat" or (content[:4] == _ZIP_MAGIC and path.suffix.lower() == ".npz")
+
+
+def _is_hdf5(content: bytes) -> bool:
+    # MATLAB writes a header of 512 bytes before the HDF5 signature.
+    return any(content[start : start + 8] == _HDF5_MAGIC for start in (0, 512))
 
 
 def read_arrays(path: Path, content: bytes) -> dict[str, NDArray]:
@@ -59,7 +64,7 @@ def read_arrays(path: Path, content: bytes) -> dict[str, NDArray]:
     Raises:
         RecordingError: The file cannot be read.
     """
-    read = _read_hdf5 if content[:8] == _HDF5_MAGIC else _read_npz if content[:4] == _ZIP_MAGIC else _read_mat
+    read = _read_hdf5 if _is_hdf5(content) else _read_npz if content[:4] == _ZIP_MAGIC else _read_mat
     try:
         with warnings.catch_warnings():
             # "returned data may be corrupt"
@@ -69,9 +74,7 @@ def read_arrays(path: Path, content: bytes) -> dict[str, NDArray]:
         # For a damaged file the libraries raise errors of many types: ValueError, OSError, zlib.error, KeyError, ...
         text = " ".join(str(error).split())
         raise RecordingError(f"{path}: the file is damaged or not a MATLAB or NumPy file ({text})") from error
-    return {
-        name: value for name, value in found.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
-    }
+    return {name: value for name, value in found.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"}
 
 
 def select_arrays(
