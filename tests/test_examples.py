@@ -68,7 +68,7 @@ def test_page_is_served_until_enter_on_a_terminal(tmp_path):
     )
     os.close(terminal)
     printed = b""
-    while b"press Enter" not in printed:
+    while b"Press Enter" not in printed:
         printed += os.read(controller, 1000)
     address = re.search(rb"http://\S+", printed).group().decode()
     with urllib.request.urlopen(address) as page:
