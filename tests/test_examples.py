@@ -94,5 +94,5 @@ def test_model_is_written_to_the_given_path(tmp_path):
     before = (tmp_path / "own.yaml").read_bytes()
     assert IdentifiedModel.load(tmp_path / "own.yaml").arm.name == arm.name
     again = run(tmp_path, "real_recording.py", "poses.csv", "own.yaml")
-    assert again.returncode == 1 and "exists already" in again.stderr
+    assert again.returncode == 1 and "already exists" in again.stderr
     assert (tmp_path / "own.yaml").read_bytes() == before
