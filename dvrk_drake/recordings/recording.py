@@ -23,6 +23,7 @@ from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
+from dvrk_drake.recordings.ros_bag import is_ros_bag, read_joint_states
 
 Coordinates = Literal["joint", "actuator"]
 
@@ -250,10 +251,11 @@ def read_recording(
     arm: Arm | None = None,
     coordinates: Coordinates = "joint",
     *,
+    topic: str | None = None,
     skip_invalid: bool = False,
     progress: Progress | None = None,
 ) -> Recording:
-    """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file content selects the format.
+    """Reads a CSV, a ROS bag, or an LCM log with the DVRK_STATUS messages of an arm; the content selects the format.
 
     A CSV has a header with q1..qn and optionally t, qd1..qdn and tau1..taun, in any order. Other columns are ignored.
     For the content of a log, see `read_status_log`.
@@ -262,7 +264,8 @@ def read_recording(
         path: Path of the CSV or log.
         arm: Arm that defines the number and the names of the joints, and whose statuses are read from a log. Without
             an arm, a CSV must have 7 joints, and a log must have statuses of only one arm.
-        coordinates: Coordinates of q, qd and tau in a CSV. A log contains joint coordinates.
+        coordinates: Coordinates of q, qd and tau in a CSV. Logs and bags contain joint coordinates.
+        topic: JointState topic of a bag or its namespace, see `read_joint_states`.
         skip_invalid: Whether to omit and note rows of a CSV with an empty cell, a NaN or an infinity, instead of
             refusing the file.
         progress: Callback that receives the step, "reading", and the completed share 0..1 of a CSV.
@@ -287,9 +290,26 @@ def read_recording(
     if is_lcm_log(path):
         if coordinates != "joint":
             raise RecordingError(f"{path}: an LCM log is in joint coordinates, not in {coordinates} coordinates")
+        _refuse_topic(path, topic)
         log = read_status_log(path, arm)
         return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes, "event")
-    return _read_csv(path, arm, coordinates, step_progress(progress, "reading"), skip_invalid)
+    share = step_progress(progress, "reading")
+    if is_ros_bag(path):
+        if coordinates != "joint":
+            raise RecordingError(f"{path}: a ROS bag is in joint coordinates, not in {coordinates} coordinates")
+        if arm is None:
+            raise RecordingError(f"{path}: a ROS bag needs the arm whose joint states are read (arm= in Python)")
+        bag = read_joint_states(path, arm, topic, skip_invalid=skip_invalid, progress=share)
+        return Recording(
+            bag.q, bag.tau, bag.qd, bag.t, "joint", str(path), bag.messages, bag.sha256, bag.notes, "message"
+        )
+    _refuse_topic(path, topic)
+    return _read_csv(path, arm, coordinates, share, skip_invalid)
+
+
+def _refuse_topic(path: Path, topic: str | None) -> None:
+    if topic is not None:
+        raise RecordingError(f"{path}: --topic does not apply, because this file is not a ROS bag")
 
 
 def _read_csv(

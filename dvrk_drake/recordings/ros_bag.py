@@ -14,17 +14,17 @@ import re
 from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _MAGIC = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0")
@@ -81,8 +81,8 @@ def read_joint_states(
     """Reads the measured joint states of an arm from a bag.
 
     Messages with a header stamp of 0, and messages that are not later than the previous one, are omitted and noted.
-    The joints may be in any order. If the messages lack the last joint, the jaw, it is read from the topic of the jaw and
-    interpolated linearly at the times of the arm.
+    The joints may be in any order. If the messages lack the last joint, the jaw, it is read from the topic of the jaw
+    and interpolated linearly at the times of the arm.
 
     Args:
         path: Path of a `.bag`, `.db3` or `.mcap` file, or of the folder of a ROS 2 bag.
@@ -139,6 +139,10 @@ class _Bag:
     """Bag that is open for reading. Errors of the rosbags library become one line."""
 
     def __init__(self, path: Path) -> None:
+        # The import takes 0.2 s, and most commands read no bag.
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
         self.path = path
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
