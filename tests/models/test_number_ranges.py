@@ -380,7 +380,7 @@ def test_invalid_numbers_of_an_arm_made_in_python_are_refused():
         ({"effects": ArmEffects(stretch={"outer_yaw": Cable()})}, r"effects\.stretch\.outer_yaw\.stiffness is 0; all"),
         ({"effects": ArmEffects(friction=[FrictionEffect(coefficient=math.nan)])}, r"coefficient is nan; allowed: "),
         ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing: all coefficients are 0"),
-        ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be a vector of three numbers with a length up to 30"),
+        ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be a vector of three numbers with a norm up to 30"),
     ):
         with pytest.raises(ArmError, match=message):
             dataclasses.replace(arm, **changes)
