@@ -4,7 +4,9 @@ from __future__ import annotations
 
 
 class DvrkDrakeError(Exception):
-    """Base class of all errors that this package raises deliberately; the command line exits with code 2.
+    """Base class of all errors that this package raises deliberately.
+
+    For these errors, the command line exits with code 2.
 
     Attributes:
         findings: Findings of `check` for the recording that caused the error. `str(finding)` is a text of one line.

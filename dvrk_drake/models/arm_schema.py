@@ -26,7 +26,7 @@ _POSITIONS = within(-1e4, 1e4, "rad or m")
 #: of a TX40.
 COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
 #: Largest accepted absolute value of positions, velocities and efforts in inputs and recordings [rad, m, rad/s, m/s, N
-#: m, N]. No arm reaches this value in any unit. Products of smaller numbers with gains remain finite.
+#: m, N]. No arm reaches this value in any of these units. Products of smaller numbers with gains remain finite.
 IMPLAUSIBLE = 1e6
 #: Accepted components of the gravity vector. `Arm` additionally checks the norm of the vector.
 GRAVITIES = within(-30.0, 30.0, "m/s^2")
@@ -53,7 +53,7 @@ class LoopClosure:
 
 @dataclass
 class Gains:
-    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N and m for a prismatic joint.
+    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)], with N and m for a prismatic joint.
 
     The ranges in this class apply to all arms. `Arm.gains_fault` checks the narrower ranges of one arm.
     """

@@ -50,7 +50,7 @@ class FrictionEffect(DriveEffect):
 
     Attributes:
         fall_speed: Stribeck velocity of the kind "presliding" [rad/s, m/s]. At this speed, the friction is 1/e of its
-            static value. If it is 0, friction does not depend on the speed.
+            static value. If `fall_speed` is 0, friction does not depend on the speed.
     """
 
     fall_speed: float = field(default=0.0, metadata=within(1e-6, 100.0, "rad/s or m/s", also=(0.0,)))
@@ -60,7 +60,7 @@ class FrictionEffect(DriveEffect):
 class Cable:
     """Elastic cable between the motor and the joint of an actuator that drives only this joint.
 
-    The stiffness is in N m/rad, the damping in N m s/rad.
+    The units are N m/rad and N m s/rad, or N/m and N s/m for a prismatic actuator.
     """
 
     stiffness: float = field(default=0.0, metadata=within(1e-3, 1e6, "N m/rad or N/m"))

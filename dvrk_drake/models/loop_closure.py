@@ -20,7 +20,7 @@ Closure = Literal["mimic", "ball"]
 
 
 def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure) -> None:
-    """Pins frame_a of the closing bar to frame_b, and adds a distance constraint for the bar's length.
+    """Pins frame_a of the closing bar to frame_b, and adds a distance constraint with the length of the bar.
 
     SAP assigns each constraint the compliance 5e-10 s^2 / m at a time step of 1 ms, where m is the effective mass of
     the unconstrained tree at the pin. The three equations of the pin share one effective mass. A light bar that rotates

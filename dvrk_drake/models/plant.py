@@ -81,8 +81,8 @@ def check_plant(arm: Arm) -> None:
     """Checks that a plant of the arm can be created with each method of loop closure.
 
     Raises:
-        ArmError: Drake cannot load the SDF, a link has no joint, or a frame of a loop or one of the frames dh_0, dh_1,
-            ... is missing.
+        ArmError: Drake cannot load the SDF, or a link has no joint. A frame of a loop closure, or one of the frames
+            dh_0, dh_1, ..., is missing.
     """
     for closure in get_args(Closure):
         try:

@@ -45,7 +45,7 @@ class Range:
 
     Attributes:
         low, high: Smallest and largest accepted number.
-        unit: Unit of both; "rad or m" if it depends on the joint type.
+        unit: Unit of both numbers; "rad or m" if it depends on the joint type.
         also: Additional accepted numbers, e.g. 0 or infinity.
         either_sign: Whether low and high apply to the absolute value.
     """
@@ -156,7 +156,7 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
     Args:
         schema: Dataclass whose fields are dataclasses, lists, mappings with text keys, bool, int, float, str, or
             optional values of these types. Numbers must be finite and within the range of their field, see `within`.
-        content: Content as returned by yaml_load.
+        content: Parsed content of the file.
         what: Kind of file that is expected, e.g. "a gains file".
     """
     if not isinstance(content, dict):

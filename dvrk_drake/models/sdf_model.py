@@ -22,8 +22,9 @@ _MAX_DEPTH = 50
 _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
 _LENGTHS = Range(1e-6, 10.0, "m")
-#: Mapping from an element or attribute to the range of its numbers. The links of a dVRK weigh 1 g to 10 kg, those of a
-#: UR10e up to 13 kg. All these links are shorter than 1 m. -1 and 0 denote unspecified limits of velocity or effort.
+#: Mapping from an element or attribute to the range of its numbers. The links of a dVRK have masses of 1 g to 10 kg,
+#: those of a UR10e up to 13 kg. All these links are shorter than 1 m. -1 and 0 denote unspecified limits of velocity or
+#: effort.
 _RANGES = {
     "mass": Range(1e-6, 200.0, "kg"),
     **{f"i{axis}": _MOMENTS for axis in ("xx", "yy", "zz")},

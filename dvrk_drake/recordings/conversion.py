@@ -113,8 +113,8 @@ def convert(
     if recording.coordinates == "actuator":
         first, *others = recording.notes
         note = (
-            "in actuator coordinates, which the CSV does not state: pass --coordinates actuator to every command that "
-            "reads the CSV, or convert with --arm"
+            "in actuator coordinates, but the CSV does not state this: pass --coordinates actuator to every command "
+            "that reads the CSV, or convert with --arm"
         )
         if chosen == "wpi-csv":
             note += " (required for a PSM, whose roll is recorded at the joint)"

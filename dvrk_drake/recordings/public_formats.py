@@ -181,7 +181,7 @@ def looks_like_matlab(path: Path, content: bytes) -> bool:
 
 
 def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid: bool = False) -> Recording:
-    """Reads static poses from a MATLAB array of 8 x 2 x N: joint, position (first) or effort (second), pose.
+    """Reads static poses from a MATLAB array of 8 x 2 x N. The indices are joint, quantity (position, effort) and pose.
 
     The first seven rows are the joints in the dVRK's order [rad, N m], in joint coordinates. The eighth row is the
     gripper, which has no actuator. It is omitted. An array of 8 x 2 is one pose, because MATLAB drops trailing
@@ -195,7 +195,7 @@ def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid
     Args:
         path: Path of the `.mat` file.
         variable: Name of the array; None if only one array of the file matches.
-        skip_invalid: Whether to omit invalid poses instead of refusing the file.
+        skip_invalid: Whether to omit invalid poses. If False, a file with invalid poses is refused.
 
     Raises:
         RecordingError: The file does not have this layout, no variable or several variables match, or a pose is

@@ -55,8 +55,8 @@ class Recording:
         t: Times (m,), or None for static poses.
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
-        lines: Line number (m,) of each row in the source, or None. For an LCM log it is the number of the event, for a
-            MATLAB array the number of the pose.
+        lines: Line number (m,) of each row in the source, or None. For an LCM log, `lines` contains event numbers; for
+            a MATLAB array, it contains pose numbers.
         sha256: SHA-256 of the source, or "".
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
         line_label: Name of the numbers in `lines`, for messages: "line", "event" or "pose".
@@ -110,7 +110,7 @@ class Recording:
 
     @property
     def is_motion(self) -> bool:
-        """Returns whether the rows are samples of a motion: at least `MIN_ROWS`, at intervals below `MAX_PERIOD`.
+        """Returns whether the rows are samples of a motion: at least `MIN_ROWS` rows at intervals below `MAX_PERIOD`.
 
         Times may decrease, see `has_increasing_times`. `motion` determines whether the arm moves.
         """
@@ -206,8 +206,8 @@ class Recording:
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
         revolute = np.max(shares[~arm.prismatic])
-        # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3; in degrees by up to
-        # 57.
+        # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3. Positions in degrees
+        # exceed them by a factor of up to 57.
         if outside > 0.3 and revolute > 4 and np.radians(revolute) <= 1.2:
             message += " Are the positions in degrees instead of rad, or of another arm?"
         elif arm.prismatic[joint] and shares[joint] > 4:
