@@ -1,4 +1,4 @@
-"""Tests bounding boxes of link masses and their use as bounds."""
+"""Tests the bounding boxes of links and their use as bounds of the mass distribution."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ def point_mass(mass, p):
 
 
 def test_margin_of_a_point_depends_on_distance_from_centre():
-    """Checks that the margin is 1 - (d / w)^2 along each axis. It is positive for bodies inside the box."""
+    """Checks that the margin is 1 - (d / w)^2 on each axis, with the distance d from the centre and the half width w.
+
+    The margin of a body inside the box is positive.
+    """
     box = BoundingBox(np.array([-0.1, 0.0, 0.2]), np.array([0.3, 0.2, 0.3]))
     p = np.array([0.2, 0.1, 0.32])
     expected = 1 - ((p - box.center) / box.half_width) ** 2

@@ -1,4 +1,4 @@
-"""Tests that the committed Python of the LCM types equals the output of lcm-gen, and encodes and decodes correctly."""
+"""Tests that the committed code of the LCM types equals the output of lcm-gen, and encodes and decodes correctly."""
 
 import subprocess
 import sys
