@@ -1,4 +1,4 @@
-"""Connections between an arm's station, its controller and the source of its desired state."""
+"""Functions that connect the station of an arm to a controller and to a source of desired states."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def connect_controller(
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:
-    """Adds a controller to a Diagram that contains the station, and connects both.
+    """Adds a controller to a Diagram that contains the station, and connects the controller to the station.
 
     The arguments are those of `add_closed_loop`.
     """
