@@ -213,6 +213,6 @@ def _velocity_limits(arm: Arm) -> NDArray[np.float64]:
     limits = np.array([plant.GetJointByName(name).velocity_upper_limits()[0] for name in arm.joint_names])
     if not np.all(np.isfinite(limits)):
         raise ControllerError(
-            f"{arm.name}: a joint has no velocity limit (<velocity> in the SDF). A follower needs one"
+            f"{arm.name}: a joint has no velocity limit (<velocity> in the SDF). A follower requires one for each joint"
         )
     return limits
