@@ -7,8 +7,8 @@ in parallel planes, symmetric about x = 0, so that they do not collide. Their ra
     0 bars 13 | 15 front crank 20 | 22 back crank 30 | 32 counterweight 43 | 45 yaw fork 57 | motors
               | 15 end link 25    | 27 carriage 34
 
-The bars move between the flanges of the end link, a channel that is open at the back. Behind the back crank the fork is
-empty up to 200 mm from the pivot A, which is the reach of the crank and the counterweight.
+The end link is a channel that is open at the back, and the bars move between its flanges. Behind the back crank, the
+fork is empty up to 200 mm from the pivot of the crank. The back crank and the counterweight reach that far.
 """
 
 from collections.abc import Callable
