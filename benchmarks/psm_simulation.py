@@ -187,7 +187,7 @@ def steps_per_second(row: StationRow | CenicRow, start: np.ndarray, seconds: flo
 
 
 def closure_errors(row: StationRow | CenicRow, seconds: float) -> tuple[float, float]:
-    """Returns the largest distances between the frames of a loop closure and of the remote centre from the origin [m]."""
+    """Returns the largest distances between loop closure frames, and of the remote centre from the origin [m]."""
     plant, root = row.plant, row.simulator.get_context()
     pins, centre = 0.0, 0.0
     for time in np.linspace(0.0, seconds, 51)[1:]:
