@@ -60,7 +60,7 @@ class ControllerScenario:
 
 @dataclass
 class Target:
-    """Pose in which the arm shall be at rest at a given time.
+    """Desired pose at a given time. The desired velocity at this time is zero.
 
     Attributes:
         time: Time [s].
@@ -114,7 +114,8 @@ class Scenario(ArmConfig):
         sample_period: Sample period of the recording [s].
         controller: Controller of the arm.
         start: Start pose (n,) [rad, m], at rest. Default: zero, or the nearest pose inside the limits.
-        targets: Desired poses at which the arm is at rest, with their times. Only in mode "hold".
+        targets: Desired poses with their times. The desired velocities are zero at these times. Targets are allowed
+            only in mode "hold".
         hand: Hand that moves the arm.
         effort_noise: Standard deviation of the noise of recorded efforts, as a share of the effort limits.
 
@@ -213,7 +214,7 @@ class Scenario(ArmConfig):
         ArmFrame(self.mounted_arm, self.hand.frame)
         if len(self.hand.path) < 2:
             raise ScenarioError(
-                "hand.path must have 2 or more poses. The hand grasps the arm at the first and releases it at the last."
+                "hand.path requires 2 or more poses. The hand grasps the arm at the first pose and releases it at the last."
             )
 
 

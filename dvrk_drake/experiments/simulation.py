@@ -83,10 +83,10 @@ def simulate(
             of the effects to simulate. Default: True.
         duration: Duration of the simulation [s]. Default: 5.
         start: Start pose (n,), at rest [rad, m]. Default: zero, or the nearest pose inside the limits.
-        targets: Pairs of a time [s] and the pose (n,) [rad, m] in which the arm shall be at rest at this time.
+        targets: Pairs of a time [s] and the desired pose (n,) [rad, m] at this time, with zero desired velocity.
         sample_period: Sample period of the recording [s]. Default: 0.01.
         seed: Seed of the effects' noise. Default: 0.
-        meshcat: Meshcat that shows the arm in real time, and the recorded animation at the end.
+        meshcat: Meshcat that shows the arm in real time, and the recorded animation at the end. None: no animation.
         progress: Function called with the name of the step ("simulating") and its finished share, 0..1.
 
     Returns:

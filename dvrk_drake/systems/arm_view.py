@@ -169,8 +169,8 @@ class ArmView:
     def follow_sliders(self) -> NDArray[np.float64]:
         """Draws the pose of the sliders if a slider was moved. Returns the drawn pose (n,) [rad, m].
 
-        Sliders of joints with a coupled limit stop at this limit. While they do, a button without a function shows the
-        name of the limit.
+        Sliders of joints with a coupled limit stop at this limit. While a slider is stopped, a button without a
+        function shows the name of the limit.
         """
         requested = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
         if np.array_equal(requested, self._q):

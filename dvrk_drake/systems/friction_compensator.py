@@ -43,9 +43,9 @@ class FrictionCompensator(LeafSystem):
     remains larger. The remaining friction prevents any cycle from gaining energy. The remaining friction also holds the
     arm against errors of the gravity compensation; see `safe_ratios`.
 
-    **Time.** The state consists of the deflections of the elements and the last position. It is updated every `period`
-    seconds, at initialization and by a forced update. The initial deflections are zero. While `state_estimated` is not
-    finite, `friction_effort` is zero. Afterwards, the deflections start from zero again.
+    **Time.** The state consists of the deflections of the elements and the last positions of their coordinates. It is
+    updated every `period` seconds, at initialization and by a forced update. The initial deflections are zero. While
+    `state_estimated` is not finite, `friction_effort` is zero. Afterwards, the deflections start from zero again.
     """
 
     def __init__(

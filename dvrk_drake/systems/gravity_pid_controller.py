@@ -60,8 +60,8 @@ class GravityPidController(LeafSystem):
     **Saturation.** `effort` is clamped to the effort limits. Conditional integration prevents integrator windup (Astrom
     and Hagglund, Advanced PID Control, 2006, chapter 3). The integrator of a joint stops while the command exceeds the
     limit and the integration would increase the excess. The integrator also stops while the magnitude of Kp e alone
-    exceeds the limit. The integral is stored as an effort, so a change of Ki causes no step. Ki = 0 resets the
-    integral.
+    exceeds the limit. The integral is stored as an effort, so a change of Ki causes no step of the effort. Ki = 0
+    resets the integral.
 
     **Fault.** An invalid input does not raise an exception, so the Diagram continues to run. While an input is not
     finite, the command is the gravity effort of the last finite pose, without PID. The arm then neither falls nor moves

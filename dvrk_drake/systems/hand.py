@@ -165,7 +165,7 @@ class PoseTrajectorySource(LeafSystem):
         output_ports:
         - pose
 
-    - `pose` (RigidTransform): pose of the trajectory. Drake's TrajectorySource outputs only vectors.
+    - `pose` (RigidTransform): pose of the trajectory. Drake's TrajectorySource cannot output poses, only vectors.
     """
 
     def __init__(self, trajectory: PiecewisePose) -> None:

@@ -72,9 +72,9 @@ class Teleoperation(LeafSystem):
       not checked, because it may press on an object.
     - The instrument is inside the cannula, i.e. less than `MIN_DEPTH` beyond the remote centre.
 
-    Afterwards, X_MG and X_FT are stored again, as when the clutch closes. If the follower was moved externally while
-    the clutch was open, the command is set to the measured position. Before the first finite follower_position,
-    `desired_state` is NaN, which the controller rejects.
+    After each of these cases, X_MG and X_FT are stored again, as when the clutch closes. If the follower was moved
+    externally while the clutch was open, the command is set to the measured position. Before the first finite
+    follower_position, `desired_state` is NaN, which the controller rejects.
 
     The input ports do not contain the age of a value. A program that receives the inputs as messages must therefore
     open the clutch if messages are delayed. Inputs are sampled and outputs change every `period` seconds and at

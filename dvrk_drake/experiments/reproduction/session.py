@@ -32,7 +32,7 @@ from dvrk_drake.recordings.recording import Recording, write_recording
 
 @dataclass(frozen=True)
 class SampleSizes:
-    """Sample sizes of the experiments. Tests use smaller ones.
+    """Sample sizes of the experiments. Tests use smaller sizes.
 
     Attributes:
         collected: Number of poses for the identification of an arm.

@@ -79,7 +79,7 @@ class Measure:
         if kind.time is not None and not 2 * scenario.sample_period <= self._time <= rest + 1e-9:
             raise StudyError(
                 f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s. The "
-                "minimum is two sample periods. The maximum is the time left after the last target and the release "
+                "minimum is two sample periods. The maximum is the duration after the last target and the release "
                 "by the hand."
             )
         if self.kind == "overshoot" and not scenario.targets:

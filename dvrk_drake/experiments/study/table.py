@@ -49,7 +49,8 @@ class StudyTable:
         """Opens the table at `path`. The file is new or contains rows of the same study.
 
         Raises:
-            StudyError: The file is of another study, is not the table of a study, or is locked by another process.
+            StudyError: The file contains rows of another study, is not the table of a study, or is locked by another
+                process.
             RecordingError: The file cannot be read or written.
         """
         self._path, self._study = Path(path), study

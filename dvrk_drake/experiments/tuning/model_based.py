@@ -19,8 +19,8 @@ from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_pos
 DAMPING_RATIO = 0.8
 #: Minimum phase margin [rad] and minimum gain margin, at the smallest and the largest inertia of the joint.
 PHASE_MARGIN, GAIN_MARGIN = np.pi / 6, 2.0
-#: Maximum effort due to one encoder count, as a share of the maximum effort. The dry friction is allowed if it is
-#: larger.
+#: Maximum effort due to one encoder count, as a share of the maximum effort. An effort up to the dry friction is always
+#: allowed.
 MAX_COUNT_EFFORT = 0.05
 #: Maximum time until the integral term moves a joint that sticks at the edge of its settling band [s].
 BREAK_AWAY_TIME = 0.25

@@ -72,7 +72,8 @@ def turning_points(x: NDArray[np.float64], threshold: float) -> NDArray[np.int_]
     return np.array(found)
 
 
-#: Maximum duration of a release, in s and in periods of the last release; durations of the tests for Kv and Ki [s].
+#: Maximum duration of a release, in s and in oscillation periods of the previous release; durations of the tests for Kv
+#: and Ki [s].
 RELEASE_DURATION, RELEASE_PERIODS, DAMPING_DURATION, OFFSET_DURATION = 1.5, 7.0, 1.0, 2.0
 #: Factor by which Kp is raised until the joint oscillates; number of logarithmic bisections after that.
 KP_FACTOR, NUM_BISECTIONS = 2.0, 5

@@ -133,7 +133,7 @@ Method = Literal["paper", "model"]
 OWN, PUBLISHED = "the arm's own", "published"
 #: Function called with the finished share, 0..1.
 Progress = Callable[[float], object]
-#: Share of the paper's procedure in the progress of a run.
+#: Share of the paper's procedure in the total progress of a run.
 PROCEDURE_SHARE = 0.5
 
 
