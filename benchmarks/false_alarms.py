@@ -2,9 +2,9 @@
 
     python benchmarks/false_alarms.py [--minutes 30] [--processes 2]
 
-The output has one line per use. If the guard held the arm or reported a fault, the line contains the reason.
-Collections use the Collector of `dvrk-drake collect`. In teleoperation a simulated hand moves an MTML, and a PSM
-follows.
+A use is a combination of arm, control mode and motion. The output has one line per use. If the guard held the arm or
+reported a fault, the line contains the reason. Collections use the Collector of `dvrk-drake collect`. In teleoperation
+a simulated hand moves an MTML, and a PSM follows.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ encodes a command. Each controller is measured under three conditions: on an oth
 view --live` and a client of its page, or with a busy process on every core. Each condition is measured without and with
 real-time scheduling (`--realtime`). With real-time scheduling, arm and controller have one core each.
 
-A period without a fresh command is one in which no answer to the last status arrived. The rows of the echo show how
-often the computer itself causes such periods.
+The column "no fresh command" is the number of periods in which no command for the last status arrived. The rows of the
+echo show how often the computer itself causes such periods.
 
 The benchmark requires a multicast route:
 

@@ -36,7 +36,7 @@ TRIALS = ((2.6, 0), (3.2, 1), (3.8, 0))
 
 
 class Trial:
-    """Simulated arm at the time before a fault."""
+    """Simulated arm at the start of a fault."""
 
     def __init__(self, name, use, begin, seed):
         self.begin, self.arm = begin, FaultyArm(name, use, seed=seed)
