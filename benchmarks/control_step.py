@@ -140,7 +140,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", metavar="FILE", help="write the results to this file")
     parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
-    parser.add_argument("--seconds", type=float, default=0.5, help="simulated time of one repetition")
+    parser.add_argument("--seconds", type=float, default=0.5, help="simulated time of one repetition [s]")
     arguments = parser.parse_args()
     arm = load_arm("mtml")
     rows = {row: start(row, arm) for row in ("python", "cpp", "cpp_serial", "none")}

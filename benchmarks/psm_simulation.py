@@ -207,7 +207,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", help="write the results to this file")
     parser.add_argument("--repetitions", type=int, default=11, help="number of repetitions; default: %(default)s")
-    parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of one repetition")
+    parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of one repetition [s]")
     arguments = parser.parse_args()
     trajectory = motion(arguments.seconds)
     start, end = (trajectory.value(time)[:, 0] for time in (0.0, arguments.seconds))

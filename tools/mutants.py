@@ -111,10 +111,10 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
 
 class _Tests:
-    """Runs tests in a forked process that imports a mutant instead of the module. It is also a pytest plugin.
+    """Runs tests in a forked process that imports a mutant instead of the module.
 
-    `shared` contains the sort key of each test. The value of its key "" is the CPU time of the process and the names of
-    the imported modules.
+    The object is also a pytest plugin. `shared` contains the sort key of each test. The value of its key "" is the CPU
+    time of the process and the names of the imported modules.
     """
 
     def __init__(self, tests: list[str], shared: Any, limit: float, mutant: Mutant | None = None) -> None:

@@ -100,7 +100,7 @@ def bolts(
 
 
 def both(make: Callable[[float], Sequence[cad.Shape] | cad.Shape]) -> list[cad.Shape]:
-    """Returns the result of `make` for either side, +1 and -1, of the plane x = 0."""
+    """Returns the results of `make` for both sides of the plane x = 0, +1 and -1."""
     made = [make(side) for side in (1.0, -1.0)]
     return [part for one in made for part in (one if isinstance(one, list) else [one])]
 

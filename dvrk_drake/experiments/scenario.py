@@ -214,8 +214,8 @@ class Scenario(ArmConfig):
         ArmFrame(self.mounted_arm, self.hand.frame)
         if len(self.hand.path) < 2:
             raise ScenarioError(
-                "hand.path must have 2 or more poses. The hand grasps the arm at the first pose and releases the arm at "
-                "the last pose."
+                "hand.path must have 2 or more poses. The hand grasps the arm at the first pose and releases the arm "
+                "at the last pose."
             )
 
 
