@@ -30,7 +30,7 @@ def handle_frame(arm: Arm) -> str:
 class ArmFrame:
     """Kinematics of a frame F of an arm with base frame B.
 
-    Joint positions q are (n,) [rad; m for a prismatic joint]. An object must not be shared between threads.
+    Joint positions q have shape (n,) [rad; m for a prismatic joint]. Threads must not share an `ArmFrame`.
     """
 
     def __init__(self, arm: Arm, frame_name: str) -> None:
@@ -91,8 +91,8 @@ class PsmInverseKinematics:
     The wrist link has the length L and connects the wrist pitch axis to the wrist yaw axis. It lies in a plane with the
     shaft and is perpendicular to the yaw axis. Therefore the direction d of the wrist link is the direction of the tip
     position without its component along the yaw axis. The wrist centre p_tip - L d lies on the shaft, which passes
-    through the RCM. It determines yaw, pitch and insertion. The remaining rotation consists of roll, wrist pitch and
-    wrist yaw about z, x and y.
+    through the RCM. The position of the wrist centre determines yaw, pitch and insertion. The remaining rotation
+    consists of roll, wrist pitch and wrist yaw about z, x and y.
 
     Lengths and the pose of the frame on its link are read from the arm's SDF.
     """
@@ -136,7 +136,7 @@ class PsmInverseKinematics:
         """Returns the joint positions (6,) [rad, m], or None if there is no solution.
 
         There is no solution if the wrist centre is closer to the RCM than `min_depth`, or if the wrist pitch is 90
-        degrees or more. |yaw| > 135 degrees, which corresponds to a tip above the RCM, is not a solution either. Joint
+        degrees or more. Solutions with |yaw| > 135 degrees, for which the tip is above the RCM, are rejected. Joint
         limits are not checked.
 
         Args:
