@@ -1,4 +1,4 @@
-"""Models of friction, cable and spring torques in the drive, each linear in one coefficient.
+"""Models of friction, cable and spring torques in the drive. Each model is linear in one coefficient.
 
 An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`). The coordinate is the position of an
 actuator, the position of a joint, or a combination of joint positions that the arm's files name. The effect adds
@@ -33,7 +33,8 @@ class EffectKind:
         unit: Unit of the coefficient for a revolute coordinate. For a prismatic coordinate, N replaces N m and m
             replaces rad.
         scale: Meaning of `ActuatorEffect.scale` for this kind, or "" if the kind has no scale.
-        dissipative: True if the effect dissipates energy in all motions. Its coefficient must then not be negative.
+        dissipative: True if the effect dissipates energy in all motions. The coefficient of such an effect must not be
+            negative.
         revolute: True if the kind is allowed for revolute coordinates only.
         loaded: True if the shape is multiplied by the load of the coordinate [N m, N].
         code: Code of the kind in `effect_step`. It is 0 for kinds that depend on position only.
@@ -71,7 +72,7 @@ EFFECT_KINDS: dict[str, EffectKind] = {
         position_shape=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
     ),
     # A spring or cable that is attached off the axis causes one period per revolution. An eccentric pulley or the
-    # strands of a cable cause more.
+    # strands of a cable cause more periods.
     "cable sine": EffectKind(
         "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.sin(s * x)
     ),

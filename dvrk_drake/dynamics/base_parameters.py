@@ -52,7 +52,7 @@ class BaseParameters:
     The regressor for beta consists of the columns `columns` of the regressor for phi.
 
     Attributes:
-        columns: Indices (b,) of the standard parameters whose regressor columns are the columns for beta.
+        columns: Indices (b,) of the standard parameters whose regressor columns form the regressor for beta.
         combination: Matrix (b, p) that maps phi to beta.
         names: Names (b,), such as "L2 (m2+...+m7) + m2 c2x".
         units: Units (b,) of the base parameters.
@@ -124,7 +124,7 @@ def reduce_to_base(
 
 
 def _snap_to_known(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDArray[np.float64]:
-    """Sets coefficients that differ from 0, +-1 or a named length only by rounding errors to the exact values."""
+    """Corrects coefficients that differ from 0, +-1 or a named length only by rounding errors."""
     known = np.array([0.0, 1.0, -1.0, *lengths.values(), *(-v for v in lengths.values())])
     nearest = known[np.argmin(np.abs(combination[..., None] - known), axis=-1)]
     return np.where(np.abs(combination - nearest) < 1e-9, nearest, combination)

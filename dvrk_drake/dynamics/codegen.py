@@ -1,4 +1,4 @@
-"""Generates Python source and functions compiled with numba from symbolic expressions."""
+"""Generates Python source code and compiled functions (numba) from symbolic expressions."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def effect_shapes(
 ) -> Iterator[NDArray[np.float64]]:
     """Yields the shape (m,) of each effect along its coordinate, starting from state 0.
 
-    The coordinate is x = h a for actuator positions a. The load of the coordinate is |h tau| / (h h). tau are the
+    The coordinate is x = h a for actuator positions a. The load of the coordinate is |h tau| / (h h). Here, tau are the
     actuator efforts that compensate gravity according to the SDF.
 
     Args:
@@ -98,8 +98,9 @@ class DynamicModel:
         """Indices of the effects that have the same torque at rest and in motion.
 
         These are the position-dependent effects, except the offset of an actuator that compensates gravity. Such an
-        offset can be caused by an error of the gravity model or by direction-dependent friction, so it may be wrong at
-        rest. If the coordinate also has a cable cosine, the offset is part of the cable torque and is included.
+        offset can be caused by an error of the gravity model or by direction-dependent friction, so the offset may be
+        wrong at rest. If the coordinate also has a cable cosine, the offset is part of the cable torque and is
+        included.
         """
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
         poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))

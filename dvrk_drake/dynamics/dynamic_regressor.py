@@ -32,7 +32,7 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Number of samples per regressor in `torque`.
+#: Number of samples in a chunk, for which `torque` computes one regressor.
 _CHUNK = 256
 
 

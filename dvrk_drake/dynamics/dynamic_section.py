@@ -27,7 +27,7 @@ class LinkEstimate:
         standard_errors: Standard errors (10,) of the individual parameters. The standard errors of base parameters are
             smaller.
         mass_identifiability: Relative reduction of the prior variance of the mass by the motion, 0 to 1. Near 0, the
-            estimate equals the mass in the SDF.
+            estimate is close to the mass in the SDF.
         bounds: Descriptions of the bounds of `consistent_parameters` that the link has reached.
     """
 
@@ -75,9 +75,10 @@ class RotorEstimate:
 class ActuatorStatistics:
     """RMS effort and RMS errors of one actuator after low-pass filtering [N m; N if prismatic].
 
-    `rms_cross_validation` is the prediction error on held-out phases of the motion, or on held-out segments if the
+    `rms_cross_validation` is the RMS prediction error on held-out phases of the motion, or on held-out segments if the
     motion is not periodic. Effects and gravity direction are estimated again without the held-out part.
-    `rms_repeatability` is the RMS difference of the effort between periods, or 0 if the motion does not repeat.
+    `rms_repeatability` is the RMS difference of the effort between periods, divided by sqrt(2). This value is 0 if the
+    motion does not repeat.
     """
 
     name: str = ""

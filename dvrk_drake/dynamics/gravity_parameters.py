@@ -29,7 +29,7 @@ class GravityParameters:
         standard_parameters: Mass and first moments of every link, in the link frames of the SDF.
         to_standard: Matrix (p, 10 l) that maps the ten parameters of each of the l links, in the order of
             `link_inertias`, to the standard parameters. A rotor without a frame dh_<name> is balanced about its axis.
-            It is treated as a part of the link that carries the motor.
+            Such a rotor is treated as a part of the link that carries the motor.
         lengths: Name -> distance between link frames [m]. The names of the base parameters contain these names.
         base: Base parameters beta = base.combination standard_values, in the units base.units.
     """

@@ -61,7 +61,7 @@ class BaseParameterEstimate:
 
 
 def _earlier(name: str) -> dict[str, object]:
-    """Returns the metadata of an RMS effort without excluded measurements, whose key ended in `_undoubted`."""
+    """Returns the metadata of an RMS effort whose earlier key ended in `_undoubted`."""
     return RMS_EFFORTS | formerly(f"{name}_undoubted")
 
 
@@ -82,9 +82,9 @@ class JointStatistics:
         num_excluded: Number of excluded measurements.
         feedforward_scale: Factor of the joint's torque, 0 to 1. It is less than 1 if the recording does not fully
             support a feedforward.
-        position_lower: Lower end of the range covered by the poses.
-        position_upper: Upper end of the range covered by the poses.
-        coverage: Ratio of the covered range to the range of the joint limits.
+        position_lower: Lower end of the position range that the recording covers.
+        position_upper: Upper end of the position range that the recording covers.
+        coverage: Ratio of this position range to the range of the joint limits.
     """
 
     name: str = ""
@@ -180,9 +180,9 @@ class IdentifiedModel(_Identified):
     Attributes:
         arm: Arm with the gravity vector for which the base parameters were identified.
         base_parameters: Base parameters in the order of `gravity_parameters(arm).base`. For a model identified from a
-            motion, they are computed from the links in `dynamics`.
-        effects: Position-dependent effects of a model identified from poses. Empty if the model has `dynamics`, which
-            contains all effects.
+            motion, the base parameters are computed from the links in `dynamics`.
+        effects: Position-dependent effects of a model identified from poses. The list is empty if the model has
+            `dynamics`, because `dynamics` contains all effects.
         joints: Statistics of the fit of each joint.
         provenance: Origin of the model.
         dynamics: Full dynamics of a model identified from a motion, or None if the model contains only holding torques.
@@ -390,7 +390,7 @@ class ControlModel:
         return effort * self._scale
 
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], rotors included."""
+        """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], including the rotors."""
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
 
 

@@ -108,7 +108,7 @@ def parameters_from_pseudo_inertia(J: ArrayLike) -> NDArray[np.float64]:
 
 
 def change_of_frame(X_LF: RigidTransform) -> NDArray[np.float64]:
-    """Returns the matrix (10, 10) from a body's parameters about Fo in frame F to its parameters about Lo in frame L.
+    """Returns the matrix (10, 10) that maps a body's parameters about Fo in frame F to those about Lo in frame L.
 
     A point of the body is (p_L, 1) = X_LF (p_F, 1), so the pseudo-inertia is J_L = X_LF J_F X_LF'.
     """

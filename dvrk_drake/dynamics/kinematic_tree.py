@@ -29,8 +29,8 @@ class KinematicTree:
         pose_terms: Matrices T0 to T3 (l, 4, 3, 4), each with a rotation part and a translation part [m].
         hinges: Hinge vectors H (l, 6). They contain the angular velocity of C and the velocity of its origin Co,
             relative to P, per unit of dx/dt, expressed in C.
-        G: Matrix (l, n) that maps the independent joint positions q to the joint coordinates. Rows of fixed joints are
-            0.
+        G: Matrix (l, n) that maps the independent joint positions q to the joint coordinates. The rows of fixed joints
+            are zero.
         c: Offsets (l,) of the joint coordinates [rad, m].
         affects: Mask (l, n), True where an independent joint moves a link.
     """
@@ -95,7 +95,7 @@ def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ..
 
 
 def _axis(joint: Joint) -> NDArray[np.float64]:
-    """Returns the unit axis (3,) of a joint, which is equal in its frames F and M. It is zero for a fixed joint."""
+    """Returns the unit axis (3,) of a joint in the joint frames F and M, or zero for a fixed joint."""
     match joint.type_name():
         case "revolute":
             return joint.revolute_axis()

@@ -88,11 +88,11 @@ class PsmInverseKinematics:
     The solution is unique, except for full revolutions of the roll, if two conditions hold. The wrist centre is beyond
     the remote centre of motion (RCM), and |wrist_pitch| < 90 degrees.
 
-    The wrist link has the length L and connects the wrist pitch axis to the wrist yaw axis. It lies in a plane with the
-    shaft and is perpendicular to the yaw axis. Therefore the direction d of the wrist link is the direction of the tip
-    position without its component along the yaw axis. The wrist centre p_tip - L d lies on the shaft, which passes
-    through the RCM. The position of the wrist centre determines yaw, pitch and insertion. The remaining rotation
-    consists of roll, wrist pitch and wrist yaw about z, x and y.
+    The wrist link has the length L and connects the wrist pitch axis to the wrist yaw axis. The wrist link lies in a
+    plane with the shaft and is perpendicular to the yaw axis. Therefore the direction d of the wrist link is the
+    direction of the tip position without its component along the yaw axis. The wrist centre p_tip - L d lies on the
+    shaft, which passes through the RCM. The position of the wrist centre determines yaw, pitch and insertion. The
+    remaining rotation consists of roll, wrist pitch and wrist yaw about z, x and y.
 
     Lengths and the pose of the frame on its link are read from the arm's SDF.
     """

@@ -47,7 +47,7 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
         ModelError: No physically consistent links have these base parameters, or the solver did not converge.
     """
     regressor = DynamicRegressor(arm)
-    # phi of a link is a linear function of the ten elements z of its Z. Rotors are not changed.
+    # The parameters phi of a link are a linear function of the ten elements z of Z. Rotors are not changed.
     maps = {i: _parameter_map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
@@ -70,8 +70,8 @@ def _parameter_map(link: LinkInertia) -> NDArray[np.float64]:
 def _is_rotor(arm: Arm, link: str) -> bool:
     """Returns whether a link has no frame dh_<name>.
 
-    Such a link is a rotor. The centre of mass of a rotor is on its axis (see `GravityParameters`) and must remain
-    there.
+    Such a link is a rotor. The centre of mass of a rotor is on its axis (see `GravityParameters`) and must remain on
+    this axis.
     """
     plant = shared_plant(arm)
     frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
@@ -217,11 +217,11 @@ def _assign_rotors(
 ) -> tuple[dict[str, float], list[str]]:
     """Assigns the inertia of each rotor to joints, or adds it to a link in `links` that rotates with the rotor.
 
-    A rotor adds I J_k' J_k to the mass matrix, where I is its inertia and J_k is its row of the transmission matrix. In
-    SDF, a joint can represent only the diagonal of this matrix. This is sufficient if a single joint moves the motor.
-    If several joints move the motor, the inertia is added to a link that rotates by J_k q, such as crank_link or
-    motor_4_link. Half of the inertia is added about each perpendicular axis, so that the link remains physically
-    consistent.
+    A rotor adds I J_k' J_k to the mass matrix, where I is the rotor inertia and J_k is the row of the motor in the
+    transmission matrix. In SDF, a joint can represent only the diagonal of this matrix. This is sufficient if a single
+    joint moves the motor. If several joints move the motor, the inertia is added to a link that rotates by J_k q, such
+    as crank_link or motor_4_link. Half of the inertia is added about each perpendicular axis, so that the link remains
+    physically consistent.
 
     Returns:
         Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are not represented.
@@ -257,8 +257,8 @@ def _unit_rotor_inertia(axis: NDArray[np.float64]) -> NDArray[np.float64]:
 def _rotation_rates(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Returns link -> (rate, axis) for links with a revolute joint.
 
-    rate (n,) is the angular velocity about the joint axis per joint velocity. It includes the rotation of parents with
-    parallel joint axes. axis (3,) is the joint axis in the link's frame.
+    rate (n,) is the angular velocity about the joint axis per joint velocity. The rate includes the rotation of parents
+    with parallel joint axes. axis (3,) is the joint axis in the link's frame.
     """
     context = plant.CreateDefaultContext()
     rotations: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}

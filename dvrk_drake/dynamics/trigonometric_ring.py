@@ -118,7 +118,10 @@ class TrigonometricRing:
         return self._indices[function]
 
     def _slope(self, function: sympy.Expr, q: sympy.Symbol) -> tuple[list[int], float]:
-        """Returns the derivative of a variable's function, as variable indices and a factor of their product."""
+        """Returns the derivative of a variable's function, as the indices of variables and a factor.
+
+        The derivative is the product of these variables, multiplied by the factor.
+        """
         if not function.args:
             return [], float(function == q)
         slope = float(function.args[0].coeff(q))

@@ -45,12 +45,12 @@ class DynamicColumns:
 
     Attributes:
         tau: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
-        base: Matrix (b, p) that maps the p rigid-body parameters to the base parameters. If the base may tilt, it is
-            valid for every gravity direction. The parameters of the links come first, then the rotor inertias, one per
-            actuator.
-        rigid: Regressor columns (r, n, b) of the base parameters.
-        tilts: Derivatives (2, r, n, b) of `rigid` with respect to the x and y components of gravity [s^2/m]. Empty if
-            the arm file does not allow a base tilt.
+        base: Matrix (b, p) that maps the p rigid-body parameters to the base parameters. If the arm file allows a base
+            tilt, the matrix is valid for every gravity direction. The rigid-body parameters are those of the links,
+            then one rotor inertia per actuator.
+        rigid: Regressor columns (r, n, b) of the base parameters for the nominal gravity vector.
+        tilts: Derivatives (2, r, n, b) of `rigid` with respect to the x and y components of gravity [s^2/m]. The array
+            is empty if the arm file does not allow a base tilt.
         effects: Effects, in the order of their columns.
         shapes: Filtered shapes (r, e) of the e effects along their coordinates, one array per actuator. The arrays
             differ if the effort delays of the actuators differ.
@@ -117,8 +117,9 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
         effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
         known = arm.identification.known_effects.get(name, [])
         for which in NAMED_EFFECTS:
-            # If the arm file lists a spring or a cable for a coordinate, no other spring or cable is a candidate there.
-            # A second one would be redundant within the range of the motion and diverge outside this range.
+            # If the arm file lists a spring or a cable for a coordinate, this coordinate gets no candidate springs or
+            # cables. An additional spring or cable would be redundant within the range of the motion, and would diverge
+            # outside this range.
             by_position = which != ASYMMETRIC
             if which in known or (by_position and set(known) - {ASYMMETRIC}):
                 continue
@@ -156,8 +157,8 @@ def dynamic_columns(
         effects: Effects of the model.
     """
     arm = grid.arm
-    # Efforts are linear in gravity. Their derivative with respect to a component of gravity is therefore the effort at
-    # rest for a unit gravity vector along this component.
+    # Efforts are linear in gravity. The derivative of the efforts with respect to a component of gravity is therefore
+    # the efforts at rest for a unit gravity vector along this component.
     tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
     columns = base_columns([regressor, *tilted])
     rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), columns)
@@ -190,7 +191,7 @@ class BaseColumns(NamedTuple):
     Attributes:
         independent: Indices (b,) of the independent columns.
         base: Matrix (b, p) that maps the rigid-body parameters to the base parameters.
-        moves: Mask (n, b), True if an independent column is not always 0 for a joint.
+        moves: Mask (n, b), True where an independent column has nonzero elements for a joint.
     """
 
     independent: NDArray[np.int_]
@@ -212,10 +213,10 @@ class BaseColumns(NamedTuple):
 
 
 def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
-    """Returns the columns that are independent if all regressors of one arm are combined.
+    """Returns the independent columns of the stacked regressors of one arm.
 
-    The regressors differ by their gravity vectors. Rotor terms that couple two actuators are not included, see
-    `rotor_inertias`.
+    The regressors differ only in their gravity vectors. Columns of rotor terms that couple two actuators are omitted
+    (see `rotor_inertias`).
     """
     arm, p = regressors[0].arm, len(regressors[0].values)
     generator = np.random.default_rng(0)

@@ -38,11 +38,11 @@ MIN_EFFECT = 1e-4
 class DynamicIdentification(Identification):
     """Model identified from a motion.
 
-    The model contains `dynamics`. Its base parameters of gravity are computed from the identified links.
+    The model contains `dynamics`. The base parameters of gravity are computed from the identified links.
 
     Attributes:
         grid: Resampled motion.
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
         measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N]. One second at each end of
             the motion is omitted.
         predicted: Predicted efforts (r, n) of the actuators at the same rows, after the same low-pass filter [N m, N].
@@ -65,12 +65,12 @@ def identify_dynamic(
 
     Measured efforts and regressor columns are filtered with the same low-pass filter. The model includes the mandatory
     effects of `drive_effects`. These are an offset of every actuator, friction along every drive coordinate, and the
-    springs, cables and asymmetric friction that the arm file lists. Friction is viscous, smoothed Coulomb and
-    presliding friction. Additional effects are selected by cross-validation over the phase of the motion.
+    springs, cables and asymmetric friction that the arm file lists. The friction model consists of viscous, smoothed
+    Coulomb and presliding friction. Additional effects are selected by cross-validation over the phase of the motion.
 
-    The link parameters are physically consistent. Parameters that the recording does not identify have the values of
-    the SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a base tilt. The
-    cross-validated errors are prediction errors on held-out phases (`cross_validate`).
+    The link parameters are physically consistent. For parameters that the recording does not identify, the estimates
+    are the values of the SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a
+    base tilt. The cross-validated errors are prediction errors on held-out phases (`cross_validate`).
 
     Args:
         recording: Motion with t and tau, in joint or actuator coordinates.
@@ -143,7 +143,7 @@ def motion_problem(
     Args:
         grid: Resampled motion.
         tau: Measured efforts (m, n) of the actuators at the rows of the recording [N m, N].
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
         effects: Effects of the model, all of which are mandatory. If None, the effects of `drive_effects` are mandatory
             and those of `optional_effects` are candidates.
     """

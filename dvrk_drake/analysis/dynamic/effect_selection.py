@@ -26,7 +26,8 @@ class EffectSelection:
 
     Attributes:
         problem: Regression problem with the estimated gravity direction.
-        selection: Stepwise selection that uses all phases. If the base may tilt, its last two unknowns are the tilt.
+        selection: Stepwise selection that uses all phases. If the base may tilt, the last two unknowns are the
+            components of the tilt.
         mandatory: Indices (s,) of the mandatory effects and of the tilt, in this order.
         selected: Indices (f,) of all included effects and of the tilt, in ascending order.
         coefficients: Estimates (k,) of all unknowns of `selection`, 0 for effects that are not included.

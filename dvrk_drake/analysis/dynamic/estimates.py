@@ -75,8 +75,8 @@ class ParameterUncertainty:
 CORRELATION_TIME = 1.0
 #: Ratio of the sampling rate of the rows that are used to twice the cut-off frequency of the low-pass filter.
 _OVERSAMPLING = 2.0
-#: Smallest overlap of a motion with itself after a shift by one period, as a share of the duration. The repeating error
-#: is not estimated if the overlap is smaller.
+#: Smallest overlap of a motion with the same motion shifted by one period, as a share of the duration of the motion.
+#: With a smaller overlap, the errors that repeat are not estimated.
 _MIN_OVERLAP = 0.2
 
 
@@ -110,7 +110,7 @@ def parameter_covariance(
         residuals: Effort residuals (r, n) of the fit [N m, N].
         rate: Rate of the rows [Hz].
         cut_off: Cut-off of the low-pass filter of the efforts [Hz].
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
     """
     step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
     rows = slice(None, None, step)
@@ -162,7 +162,7 @@ def error_covariance(
         fitted: Residuals (r,) of a fit to all rows.
         held_out: Held-out residuals (r,), each for a fit to the other folds.
         rate: Rate of the rows [Hz].
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
     """
     count = len(fitted)
     products = correlation(fitted, held_out)

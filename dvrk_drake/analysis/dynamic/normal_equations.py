@@ -22,7 +22,7 @@ OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
 class SquareSums:
     """Products [X tau]'[X tau] of every actuator, summed over a set of rows.
 
-    X (r, k) contains the regressor columns and tau (r,) the efforts of the actuator at these rows.
+    X (r, k) contains the regressor columns, and tau (r,) contains the efforts of the actuator at these rows.
 
     Attributes:
         size: Number k + 1 of columns. The last column is the measured effort.
@@ -217,7 +217,7 @@ class NonNegativeFit:
         return (x * self._scale)[:-1]
 
     def _minimum(self, S: NDArray[np.float64], constrained: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns y >= 0 that minimises y' H y / 2 - b' y, where S contains H and b of the constrained unknowns.
+        """Returns y >= 0 that minimises y' H y / 2 - b' y. H and b are the elements of S for `constrained`.
 
         The iteration starts from the current positive set. In each iteration, positive unknowns with y <= 0 and zero
         unknowns with a negative gradient change to the other set (Portugal, Judice and Vicente, 1994). If the iteration

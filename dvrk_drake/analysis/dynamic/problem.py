@@ -23,8 +23,8 @@ from dvrk_drake.dynamics.physical_consistency import (
     log_det_curvature,
 )
 
-#: Prior standard deviation of an inertial parameter about its value in the SDF, as a share of its scale (`LinkScale`).
-#: The share was selected by cross-validation.
+#: Prior standard deviation of an inertial parameter about its value in the SDF, as a share of the scale of the
+#: parameter (`LinkScale`). The share was selected by cross-validation.
 LINK_DEVIATION = 0.3
 #: Smallest prior standard deviation of a rotor inertia [kg m^2], and lower bound of a rotor inertia as a share of its
 #: value in the SDF.
@@ -36,10 +36,10 @@ FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
 #: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
 TILT_DEVIATION = 0.05
 #: Smallest information about a direction in parameter space, relative to the prior. Along directions with less
-#: information, the parameters keep the values of the SDF.
+#: information, the estimates are the values of the SDF.
 _MIN_INFORMATION = 1e-2
-#: Factor of the prior standard deviation of the first moments, for rotors that the SDF models as links. It is small
-#: because rotors are balanced.
+#: Factor of the prior standard deviation of the first moments, for rotors that the SDF models as links. The factor is
+#: small because rotors are balanced.
 _BALANCE = 1e-6
 #: Assumed relative error of the efforts, which determines the weights before the first fit.
 _INITIAL_ERROR = 0.1
@@ -52,7 +52,8 @@ class DynamicProblem:
     Attributes:
         columns: Filtered regressor columns of the rigid-body parameters and of all effects.
         regressor: Regressor of the arm. The parameters of the SDF (`regressor.values`) are the prior means.
-        tilt: Change (2,) of the x and y components of gravity [m/s^2]. It is included in `rigid`, but not in `columns`.
+        tilt: Change (2,) of the x and y components of gravity [m/s^2]. The change is included in `rigid`, but not in
+            `columns`.
         fold: Fold (r,) of each row, see `phase_folds`.
         edge: Masks (r, 2) of the rows at the edges of the folds, see `phase_folds`.
         independent: Effective number of independent rows. It can be less than r, because filtered and repeated efforts
@@ -90,7 +91,7 @@ class DynamicProblem:
 
     @cached_property
     def rigid(self) -> NDArray[np.float64]:
-        """Regressor columns (r, n, b) of the base parameters for the gravity direction with `tilt`."""
+        """Regressor columns (r, n, b) of the base parameters for gravity including the change `tilt`."""
         tilts = self.columns.tilts
         return self.columns.rigid + np.tensordot(self.tilt[: len(tilts)], tilts, axes=(0, 0))
 
@@ -200,7 +201,7 @@ class DynamicProblem:
         return scipy.linalg.block_diag(self.columns.base, np.eye(num_effects))
 
     def rigid_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the rigid-body parameters phi (p,) for the unknowns x (k,) of a selection."""
+        """Returns the rigid-body parameters phi (p,) for the unknowns x (k,) of a `StepwiseSelection`."""
         V = self._identifiable
         return self.prior + self.deviation * (V @ x[: V.shape[1]])
 

@@ -26,10 +26,10 @@ class StepwiseSelection:
     """Stepwise selection of effects for one motion. All k unknowns have prior mean 0.
 
     Attributes:
-        equations: Normal equations with columns for the rigid-body unknowns, the effects and the tilt. The efforts are
-            measured minus nominal efforts.
+        equations: Normal equations with columns for the rigid-body unknowns, the effects and the tilt. The efforts in
+            these equations are the measured efforts minus the efforts of the SDF.
         efforts: Sums of squares (folds, n) of the measured efforts.
-        rows: Numbers of rows (folds,) in the folds.
+        rows: Number of rows (folds,) in each fold.
         num_rigid: Number of rigid-body unknowns.
         precision: Reciprocals (k,) of the prior variances of all unknowns.
         non_negative: Mask (k,) of the unknowns that must not be negative.
@@ -96,8 +96,8 @@ class StepwiseSelection:
         A candidate is unnecessary if its removal increases the error by less than half of `MIN_GAIN`.
 
         Args:
-            mandatory: Indices of the effects that are always included, starting at 0.
-            candidates: Indices of the effects that may be added, starting at 0.
+            mandatory: Indices of the effects that are always included. Index 0 is the first effect.
+            candidates: Indices of the effects that may be added. Index 0 is the first effect.
             progress: Callback that receives the estimated completed fraction, 0 to 1.
 
         Returns:

@@ -31,11 +31,12 @@ class ActuatorError:
         rms_error: RMS of measured minus predicted effort [N m, N if prismatic].
         relative_error: rms_error / rms_effort [1], None if rms_effort is 0.
         bias: Share of rms_error^2 due to the mean error.
-        friction_like: Additional share of rms_error^2 that viscous and Coulomb friction in the actuator would explain.
+        friction_like: Additional share of rms_error^2 that viscous and Coulomb friction in the actuator explain.
         position_dependent: Additional share of rms_error^2 that sine and cosine functions of the position explain. The
             functions have half a period and one period over the range of the position.
         other: Remaining share of rms_error^2.
-        repeatability: Relative RMS difference of the efforts between periods [1], None if the motion does not repeat.
+        repeatability: Relative RMS difference of the efforts between periods (see `repeatability_floor`) [1], or None
+            if the motion does not repeat.
         verdict: Verdict on the actuator, see `judge`.
     """
 
@@ -75,7 +76,7 @@ class DynamicValidation(Validation):
 
     @property
     def mean_relative_error(self) -> float:
-        """Mean relative error over the actuators with measured efforts."""
+        """Mean relative error over the actuators whose measured effort is not 0."""
         errors = [a.relative_error for a in self.actuators if a.relative_error is not None]
         return float(np.mean(errors)) if errors else float("nan")
 
