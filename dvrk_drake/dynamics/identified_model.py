@@ -253,7 +253,7 @@ class IdentifiedModel(_Identified):
         try:
             own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
             if arm is not None and own_arm.name != arm.name:
-                raise ModelError(f"the model is of {own_arm.name}, not of {arm.name}")
+                raise ModelError(f"the model is for {own_arm.name}, not for {arm.name}")
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
         except ArmError as error:

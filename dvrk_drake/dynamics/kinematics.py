@@ -23,7 +23,7 @@ def handle_frame(arm: Arm) -> str:
     """
     numbered = [name for name in _frame_names(shared_plant(arm)) if re.fullmatch(r"dh_\d+", name)]
     if not numbered:
-        raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; give the name of the handle's frame")
+        raise ArmError(f"{arm.name}: the SDF has no frames dh_0, dh_1, ...; give the name of the handle's frame")
     return max(numbered, key=lambda name: int(name.removeprefix("dh_")))
 
 
@@ -43,7 +43,7 @@ class ArmFrame:
         self._plant = shared_plant(arm)
         if not self._plant.HasFrameNamed(frame_name):
             known = ", ".join(_frame_names(self._plant))
-            raise ArmError(f'{arm.name}: its SDF has no frame "{frame_name}"; it has {known}')
+            raise ArmError(f'{arm.name}: the SDF has no frame "{frame_name}"; available frames: {known}')
         self._frame = self._plant.GetFrameByName(frame_name)
         self._context = self._plant.CreateDefaultContext()
         # G maps velocities of the independent joints to velocities of the plant.
