@@ -173,5 +173,5 @@ def test_efforts_opposite_to_the_model_are_rejected():
     refuse_opposite_efforts(recording, names, 5.0 + 0.2 * expected + 0.1 * noise, expected)
     refuse_opposite_efforts(recording, names, noise, expected)
     refuse_opposite_efforts(recording, names, 0 * expected, expected)
-    with pytest.raises(RecordingError, match=r"motion\.csv: .*: pitch \(-0\.\d+\)\. Check the signs"):
+    with pytest.raises(RecordingError, match=r"motion\.csv: .*: pitch \(correlation -0\.\d+\)\. Check the signs"):
         refuse_opposite_efforts(recording, names, expected * [1.0, -1.0, 1.0] + 0.3 * noise, expected)
