@@ -31,7 +31,7 @@ def identify(
 
     A recording of poses, or a motion with enough static poses, gives a static model with gravity, cables, springs and
     offsets. Any other motion gives a dynamic model with physically consistent inertial parameters, rotor inertias and
-    friction. With `low_speed_segments`, this motion gives a static model too.
+    friction. If `low_speed_segments` is True, such a motion gives a static model instead.
 
     Args:
         recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.

@@ -22,7 +22,7 @@ class ModelResult:
     """Model with warnings.
 
     Attributes:
-        model: New model.
+        model: Identified or recalibrated model.
         warnings: Findings about the recording or the fit that make the model less reliable. `str` of a finding is one
             line.
     """
@@ -119,8 +119,8 @@ class Validation(ABC):
             overwrite: True to replace the verdicts of an earlier validation, or an existing file with another model.
 
         Raises:
-            ModelError: The model was identified from this recording, or it already has verdicts and `overwrite` is
-                False.
+            ModelError: The model was identified from this recording, or the model already has verdicts and `overwrite`
+                is False.
             DvrkDrakeError: The file exists and contains another model, and `overwrite` is False.
         """
         source = self.recording.source or "recording"

@@ -1,4 +1,4 @@
-"""Validates a model on a recording that it was not identified from, and predicts efforts."""
+"""Validates a model on a recording that was not used for the identification, and predicts efforts."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from dvrk_drake.recordings.recording import Recording
 def validate(
     model: IdentifiedModel, recording: Recording, *, low_speed_segments: bool = False, progress: Progress | None = None
 ) -> StaticValidation | DynamicValidation:
-    """Compares a model's efforts with those of a recording, as `dvrk-drake validate` does.
+    """Compares a model's efforts with the efforts of a recording, as `dvrk-drake validate` does.
 
     For a motion and a model with dynamics, efforts are compared after the low-pass filter of the identification.
     Otherwise, holding torques are compared.
 
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
-        recording: Poses or a motion with efforts (m, n) that the model was not identified from.
+        recording: Poses or a motion with efforts (m, n), not used for the identification of the model.
         low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
             poses.
         progress: Callback that receives the name of the step ("checking the recording" or "validating") and the

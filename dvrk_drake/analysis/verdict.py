@@ -47,7 +47,7 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
 
 
 def rule_text(in_motion: bool) -> str:
-    """Returns the rule of `judge` as text, with its thresholds."""
+    """Returns the rule of `judge` as text, with the thresholds."""
     good, usable, zero = (
         f"{100 * ratio:g} %" if in_motion else f"{ratio:g}"
         for ratio in (GOOD_RATIO, USABLE_RATIO_IN_MOTION if in_motion else USABLE_RATIO_AT_REST, 1.0)

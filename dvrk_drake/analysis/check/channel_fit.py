@@ -22,7 +22,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of their size.
+#: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of the size of each
+#: parameter or coefficient.
 LINK_DEVIATION, EFFECT_DEVIATION = 0.3, 0.5
 #: Prior standard deviation of additional effects, as a share of the RMS effort: for viscous and Coulomb friction, and
 #: for offsets, springs and cables without a coefficient in the arm file.

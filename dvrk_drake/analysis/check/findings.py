@@ -15,7 +15,8 @@ class Finding:
     """Finding about a recording.
 
     Attributes:
-        severity: "note" for information, "warning" if results will be less accurate, "refusal" if they would be wrong.
+        severity: "note" for information, "warning" if results will be less accurate, "refusal" if results would be
+            wrong.
         kind: Short, stable name of the finding, e.g. "repeated rows".
         where: Affected joints, channels or rows.
         what: Description of the problem with numbers, without a final period.
@@ -52,7 +53,7 @@ class JointSignals:
         peak_effort: Largest effort divided by the joint's effort limit [1].
         velocity_gain: Gain of qd relative to dq/dt [1].
         velocity_lag: Lag of qd relative to dq/dt [s].
-        effort_lag: Lag of tau relative to the motion [s], None if it is not significant.
+        effort_lag: Lag of tau relative to the motion [s], None if the lag is not significant.
         work: Mean of tau v divided by rms(tau) rms(v) [1]. Friction increases this value.
         effort_cut_off: Frequency above which noise exceeds the effort signal [Hz].
         velocity_cut_off: Frequency above which noise exceeds the velocity signal [Hz].

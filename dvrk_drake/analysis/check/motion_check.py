@@ -35,7 +35,8 @@ MIN_JITTER = 0.05
 #: An effort has the wrong sign in two cases: its Coulomb friction is more than the first number of standard errors
 #: below 0, or its Coulomb friction is negative and the relative work of the motor is below minus the second number.
 MIN_SIGN_ERRORS, MIN_NEGATIVE_WORK = 5.0, 0.05
-#: Joints are hardly identifiable separately if the correlation of their velocities exceeds this value.
+#: The parameters of two joints are hardly identifiable separately if the correlation of the joint velocities exceeds
+#: this value.
 MIN_CORRELATION = 0.95
 #: Smallest duration of a motion for the estimation of lags, signs and noise [s].
 MIN_DURATION = 10.0

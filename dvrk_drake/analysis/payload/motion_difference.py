@@ -72,7 +72,7 @@ MAX_SHIFT = 5.0
 #: Smallest duration of the motion that both recordings must contain [s].
 MIN_OVERLAP = 5.0
 #: Largest cut-off frequency of the low-pass filter of the difference [Hz]. Efforts of a payload have the frequencies of
-#: the motion, which are lower.
+#: the motion, which are below this value.
 CUT_OFF = 5.0
 #: Expected change of position-dependent torques as a share of an actuator's RMS effort. Between recordings of a PSM
 #: without payload on two days, the RMS change over the actuators is 5.6 % (psm_one and psm_one_no_weight of
@@ -96,7 +96,7 @@ class MotionDifference:
     Attributes:
         grid: Resampled motion of the second recording.
         rows: Mask (r,) of the inner rows of `grid` that the reference also contains. It selects k rows.
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
         shift: Time shift [s]. Time t of the second recording corresponds to time t + shift of the reference.
         tau: Low-pass filtered difference (k, n) of the actuator efforts [N m, N]. The effect of small differences
             between the two motions is predicted by the model and subtracted.

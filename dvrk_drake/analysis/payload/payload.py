@@ -150,8 +150,8 @@ def estimate_payload(
         progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
-        RecordingError: A recording is not a motion of this arm, the recordings are not of the same motion, or they are
-            identical.
+        RecordingError: A recording is not a motion of this arm, the recordings are not of the same motion, or their
+            efforts are identical.
         ModelError: A link does not exist.
     """
     regressor = model.regressor
@@ -297,8 +297,8 @@ def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tupl
 def contradicting_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
     """Returns the payloads on other links that may explain the change, best first.
 
-    A payload on such a link explains the change clearly better. Alternatively, a payload was found on this link and
-    reduces the cross-validated error.
+    A link is listed if a payload on it explains the change clearly better. It is also listed if a payload was found on
+    it and reduces the cross-validated error.
     """
     better = better_links(payload, estimates)
     return [

@@ -1,4 +1,4 @@
-"""Predicts the efforts of a motion with a model, with friction separated from all other efforts."""
+"""Predicts the efforts of a motion and separates friction from all other efforts."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ MAX_OPPOSITE_CORRELATION = -0.3
 def refuse_opposite_efforts(
     recording: Recording, names: tuple[str, ...], tau: NDArray[np.float64], expected: NDArray[np.float64]
 ) -> None:
-    """Rejects measured efforts whose sign is opposite to the predicted efforts. Offsets are ignored.
+    """Rejects measured efforts whose sign is opposite to the sign of the predicted efforts. Offsets are ignored.
 
     Args:
         recording: Recording of the efforts, for the message.

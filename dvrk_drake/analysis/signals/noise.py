@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-#: Duration of the segments for averaged periodograms [s]. The frequency resolution [Hz] is its reciprocal.
+#: Duration of the segments for averaged periodograms [s]. The frequency resolution [Hz] is the reciprocal of this
+#: duration.
 SEGMENT_DURATION = 2.56
 #: Smallest cut-off frequency [Hz].
 MIN_CUT_OFF = 2.0
 #: Smallest ratio of the peak noise in a narrow band to the median noise below and above the band.
 PEAK = 4.0
-#: Noise at the edges of a narrow band as a share of its peak, and largest width of a narrow band [octaves].
+#: Noise at the edges of a narrow band as a share of the peak noise, and largest width of a narrow band [octaves].
 EDGE, MAX_OCTAVES = 0.15, 2.0
 #: Smallest reported RMS of a narrow band, as a share of the RMS of signal and noise.
 MIN_SHARE = 0.03

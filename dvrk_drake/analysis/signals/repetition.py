@@ -24,8 +24,8 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
         D(T)^2 = mean_j mean_t (q_j(t) - q_j(t + T))^2 / (2 var(q_j))
 
     for the joints j that move. D is 0 for an exact repetition and 1 for uncorrelated positions. Candidates for the
-    period are the local minima of D below `SAME_MOTION`. The period is the candidate with the smallest D near the
-    shortest candidate. Parabolic interpolation refines this period.
+    period are the local minima of D below `SAME_MOTION`. Among the candidates near the shortest one, the period is the
+    candidate with the smallest D. Parabolic interpolation refines this period.
 
     Args:
         q: Positions (m, n) at a constant rate [rad, m].

@@ -33,7 +33,7 @@ def static_poses(recording: Recording, arm: Arm) -> Recording | None:
         arm: Arm that was recorded.
 
     Returns:
-        Recording with one row per static pose, in joint coordinates and without times. It may have no rows. The result
+        Recording with one row per static pose, in joint coordinates and without times. This result may have no rows. It
         is None if `recording` is not a motion (`Recording.is_motion`), or its times do not increase.
 
     Raises:
@@ -74,7 +74,7 @@ def stationary_runs(
 ) -> Iterator[NDArray[np.int_]]:
     """Yields the row indices of each segment with low speed.
 
-    A segment ends at the row at which q exceeds `max_distance`. The next segment begins at this row.
+    A segment ends at the row at which the distance of q exceeds `max_distance`. The next segment begins at this row.
 
     Args:
         still: Mask (m,) of the rows with low speed.
@@ -233,8 +233,8 @@ class Poses(NamedTuple):
         recording: Recording with one row per extracted pose, or the unchanged recording.
         measured: Mask (m, n) of the efforts that are holding torques, None if all efforts are holding torques.
         note: Note on how poses were extracted from a motion, "" if no poses were extracted.
-        moves: True if the recording is a motion without enough static poses, from which a dynamic model can be
-            identified.
+        moves: True if the recording is a motion with too few static poses, which is suitable for dynamic identification
+            only.
     """
 
     recording: Recording
