@@ -66,8 +66,8 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         arm: Arm that was recorded.
 
     Returns:
-        One refusal for exchanged or inverted channels. Without a refusal: warnings for scales and offsets, and a note
-        with the joints whose position offset is not identifiable from the recording.
+        One refusal for exchanged or inverted channels. Otherwise, warnings for scales and offsets, and notes with the
+        joints whose effort scale or position offset is not identifiable from the recording.
 
     Raises:
         RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too coarsely.

@@ -287,7 +287,7 @@ def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tupl
     same = [other.link for other in equally_good_links(estimates)]
     mass = f" ({first.body.mass:.3g} +- {first.mass_error:.2g} kg)" if first.found else ""
     what = (
-        f"a payload on {' or '.join(same)}{mass} explains the change better (cross-validated error "
+        f"a payload on {' or '.join(same)}{mass} explains the change of the efforts better (cross-validated error "
         f"{100 * first.relative_error:.1f} % instead of {100 * payload.relative_error:.1f} %)"
     )
     advice = f"Unless the payload is certainly on {payload.link}, run again with --link {first.link}."

@@ -187,8 +187,8 @@ def increasing_times(recording: Recording) -> NDArray[np.float64]:
     if len(decreasing):
         row = int(decreasing[0]) + 1
         raise RecordingError(
-            f"{recording.where(row)}: t = {recording.t[row]:g} s does not increase, after {recording.t[row - 1]:g} s "
-            "in the previous row. Sort the rows by time."
+            f"{recording.where(row)}: t = {recording.t[row]:g} s is not greater than {recording.t[row - 1]:g} s in the "
+            "previous row. Sort the rows by time."
         )
     return recording.t
 
