@@ -37,7 +37,7 @@ def model(
 
     if output is not None:
         if format is None:
-            raise DvrkDrakeError("--output needs a --format: latex, python or c")
+            raise DvrkDrakeError("--output requires --format latex, python or c")
         check_output(output, overwrite=overwrite)
     shown = mounted(load_arm(arm), gravity)
     with Steps("deriving the gravity torque"):
