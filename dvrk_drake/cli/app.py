@@ -108,7 +108,8 @@ Key = Annotated[
     str | None,
     Parameter(
         metavar="FILE",
-        help="Key file to sign and verify messages, created by the command key. The arm and the controller need the same key.",
+        help="Key file to sign and verify messages, created by the command key. "
+        "The arm and the controller need the same key.",
     ),
 ]
 Realtime = Annotated[

@@ -61,7 +61,7 @@ def export(
         coulomb: Also compensate this Coulomb friction of each joint [N m], instead of --friction.
         friction_ratio: Share of the friction of each joint to compensate, 0 to 1. Default: 0.8 0.8 0.8 0.4 0.6 0.6 0.
         dead_band: Speed below which no friction is compensated [rad/s]. Default: 0.02 0.02 0.02 0.01 0.008 0.008 0.01.
-        saturation: Speed above which --friction-ratio is fully compensated [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
+        saturation: Speed above which --friction-ratio is fully reached [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export

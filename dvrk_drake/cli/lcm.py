@@ -121,8 +121,8 @@ def run(
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
         gains: Gains file from the command tune, for the modes damped and hold. Default: the gains of the arm file.
-        friction_ratio: Share of the friction that is compensated in mode gravity, 0 to 0.6. Reduced if the arm could creep.
-        hysteresis_ratio: Share of the wide hysteresis that is compensated in mode gravity, 0 to 0.9.
+        friction_ratio: Share of the friction to compensate in mode gravity, 0 to 0.6. Reduced if the arm could creep.
+        hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
         friction_model: Model that contains the friction, identified from a motion. Default: the model of --model.
     """
     from dvrk_drake.processes.control import control

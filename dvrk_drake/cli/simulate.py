@@ -208,7 +208,7 @@ def transparency(
         path: Recording of the motion of the operator. Default: a motion through random poses.
         speed: Speed factor of the recorded motion. 2 doubles the speed.
         model: Model for gravity compensation. Repeat the option to compare models. Default: the nominal model.
-        friction_ratio: Share of the friction that is compensated, 0 to 0.6.
+        friction_ratio: Share of the friction to compensate, 0 to 0.6.
         simulated_effects: Effects to simulate (docs/simulated_effects.md), e.g. friction cables. Default: all.
         frame: SDF frame at which the operator holds the arm. Default: dh_7 for an MTM, dh_6 for a PSM.
         output: CSV file for the results.
