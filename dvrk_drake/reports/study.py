@@ -11,7 +11,7 @@ from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-#: Maximum number of variations in the answer, and of failed runs that are printed without `verbose`.
+#: Maximum number of variations in the first sentence, and of failed runs that are printed without `verbose`.
 _MAX_COUNT = 3
 
 
