@@ -76,8 +76,8 @@ def collect(
     After an interruption, run the same command again to continue.
 
     Args:
-        poses: Pose file. The option --output reads its poses. The options --teach and --random add poses to it.
-        output: Move the arm to each pose of the pose file, and append one row per pose to this file.
+        poses: Pose file. With --output, the arm moves to its poses. With --teach or --random, poses are added to it.
+        output: Move the arm to each pose of the pose file, and append one row per pose to this CSV file.
         teach: Compensate gravity while you move the arm by hand. Press Enter to add the current pose to the pose file.
         random: Add N random poses to the pose file.
         at_rest: With --teach: also add each pose at which the arm is at rest for one second.
@@ -126,7 +126,9 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     line = LiveLine(sys.stderr)
     teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=_reporter(line))
     event = "Enter or one second of rest" if at_rest else "Enter"
-    print(f"{controller.arm.name} compensates gravity; move it by hand; {event} adds a pose, Ctrl-C ends", flush=True)
+    print(
+        f"{controller.arm.name} compensates gravity; move the arm by hand; {event} adds a pose, Ctrl-C ends", flush=True
+    )
     try:
         control(
             link(),

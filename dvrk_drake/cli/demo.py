@@ -68,7 +68,7 @@ def teleop(
         meshcat = start_scene(port)
         print(
             f"MTML controls PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale are under Open Controls; "
-            "the arms appear after some seconds; Stop, Escape or Ctrl-C ends",
+            "the arms appear after some seconds; press Stop, Escape or Ctrl-C to end",
             flush=True,
         )
         run_live_teleoperation(meshcat)

@@ -75,7 +75,7 @@ def identify(
         read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     result.save(output, overwrite=True)
     if folder is not None:
         from dvrk_drake.reports.figures.identification import plot_identification
@@ -140,7 +140,7 @@ def validate(
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
         validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if save:
         validation.save(model, overwrite=True)
     if json is not None:

@@ -1,4 +1,4 @@
-"""Commands that communicate over LCM: arm, key and run."""
+"""Commands for the control of an arm over LCM: arm, key and run."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def arm(
             for warning in make_realtime():
                 _warn(warning)
         settle_memory()
-        print(f"simulated {simulated_arm.name} on LCM {url}; Ctrl-C ends", flush=True)
+        print(f"simulated {simulated_arm.name} on LCM {url}; press Ctrl-C to end", flush=True)
         pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} steps started more than one period late", flush=True)
 
@@ -121,7 +121,7 @@ def run(
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
         gains: Gains file from the command tune, for the modes damped and hold. Default: the gains of the arm file.
-        friction_ratio: Share of the friction to compensate in mode gravity, 0 to 0.6. Reduced if the arm could creep.
+        friction_ratio: Share of the friction to compensate in mode gravity, 0 to 0.6. It is lower if the arm could creep.
         hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
         friction_model: Model that contains the friction, identified from a motion. Default: the model of --model.
     """

@@ -42,7 +42,7 @@ def check(
     with Steps("reading", "checking the recording") as steps:
         checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if json is not None:
         write_json(json, report.as_dict())
     options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"

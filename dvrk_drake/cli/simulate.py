@@ -72,7 +72,7 @@ def simulate(
         plot_simulation(folder / "positions.png", simulation, loaded)
         print_written(folder)
     if page is not None:
-        print("the page can replay the motion; Stop, Escape or Ctrl-C ends", flush=True)
+        print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)
         until_stopped(page)
 
 

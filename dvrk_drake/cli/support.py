@@ -76,7 +76,7 @@ def interrupt_ends_process() -> Iterator[None]:
 
 
 def quiet_drake() -> None:
-    """Disables Drake's log messages. Drake sets the level on import, so call this afterwards."""
+    """Disables Drake's log messages. Importing Drake sets the log level, so call this function after the import."""
     logging.getLogger("drake").setLevel(logging.WARNING)
 
 
@@ -129,9 +129,9 @@ def _refuse_twice(path: str) -> None:
 #: Maximum number of progress bars on a terminal. Finished steps are removed first.
 MAX_BARS = 6
 
-#: Outputs of this command.
+#: Paths of the outputs of this command.
 _outputs: set[Path] = set()
-#: Folders created by this command, each before its parent.
+#: Folders that this command created. Each folder precedes its parent.
 _made: list[Path] = []
 
 

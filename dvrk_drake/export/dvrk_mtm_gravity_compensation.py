@@ -136,8 +136,8 @@ def compensation_from_model(
     The constant term of a polynomial represents the offset torque of its joint. The first two columns represent the
     cable torque of shoulder_pitch. Polynomials approximate all other effects that depend on one joint position.
 
-    The torque limits are the torque range within the joint limits, extended by 10 % of its width at both ends. The
-    torque limits do not exceed the effort limits of the arm. The torque of joint 7 is zero.
+    The torque limits are the range of the torque within the joint limits, including Coulomb friction. This range is
+    extended by 10 % of its width at both ends, up to the effort limits of the arm. The torque of joint 7 is zero.
 
     Raises:
         ModelError: The model is not of an MTM, an option is invalid, or the torque error exceeds `options.tolerance`.
@@ -172,7 +172,7 @@ def compensation_from_model(
 
 
 def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
-    """Returns the dry friction (7,) of the joints [N m]. Each value is valid if only this joint moves.
+    """Returns the dry friction (7,) of the joints [N m]. Each value is valid if no other joint moves.
 
     The dry friction is the sum of the Coulomb and presliding effects in the model's dynamics. An effect along a
     coordinate that several joints move contributes to the dry friction of each of these joints.

@@ -19,7 +19,7 @@ NUM_JOINTS = 7
 #: Number of parameters: ten for gravity, then five polynomial coefficients for each of the first six joints.
 NUM_PARAMETERS = 40
 _CONTROLLER = "GC_controller"
-#: Key of the arm's name. The controller does not read it.
+#: Key of the arm's name. The controller does not read this key.
 _ARM_NAME = "ARM_NAME"
 #: Field of `GravityCompensationFile` -> key in the file. "sat_vec_vec" is spelled as in the controller's source.
 _KEYS = {
@@ -52,7 +52,7 @@ class GravityCompensationFile:
         friction_ratio: Share of each joint's friction (7,) that is compensated during a motion, 0 to 1.
         sweep: Lower and upper joint positions (2, 7) [rad] in the recording from which the file was computed. None if
             the file does not contain these positions.
-        arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if both are missing.
+        arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if neither contains a name.
     """
 
     positive: NDArray[np.float64] = field(metadata=_PARAMETERS)
@@ -99,7 +99,7 @@ class GravityCompensationFile:
         """Reads a file of the controller.
 
         Raises:
-            ModelError: The file is missing, is not JSON, has another version, or a field is missing or invalid.
+            ModelError: The file is missing, is not JSON or has an unknown version, or a field is missing or invalid.
         """
         content = read_json_input(path, ModelError)
         controller = content.get(_CONTROLLER) if isinstance(content, dict) else None
@@ -144,11 +144,11 @@ def _numbers(value: object) -> NDArray[np.float64]:
     try:
         return np.atleast_1d(np.array(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
-        return np.empty(0)  # check() rejects this length and prints the key
+        return np.empty(0)  # check() rejects this length. Its message contains the key.
 
 
 def _arm_name(value: object, file_name: str) -> str:
-    """Returns the value of ARM_NAME. If it is missing, returns the name of a known arm in the file name, or ""."""
+    """Returns the value of ARM_NAME. Without ARM_NAME, returns the name of a known arm in the file name, or ""."""
     if isinstance(value, str) and value:
         return value
     return next((name.upper() for name in known_arms() if name in file_name.lower()), "")

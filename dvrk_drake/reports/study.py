@@ -24,7 +24,8 @@ def print_study(
         console: Console to print to.
         study: Study to summarize.
         rows: Results by number of the case.
-        study_path: Path of the study, for the suggested next command. None if figures were written already.
+        study_path: Path of the study, for the suggested next command. None if the command has
+            already written figures.
         verbose: Whether to print all failed runs.
     """
     summaries = summarise(study, rows)

@@ -25,7 +25,7 @@ def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = N
     Args:
         console: Console to print to.
         tuning: Tuning to print.
-        gains_path: Path of the written gains, for the suggested next command. None if they were not written.
+        gains_path: Path of the written gains, for the suggested next command. None if the gains were not written.
         verbose: Whether to print the tuning steps, and the comparison for each joint and pose.
     """
     comparison, name = tuning.comparison, tuning.arm.source
