@@ -121,7 +121,7 @@ def run(
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
         gains: Gains file from the command tune, for the modes damped and hold. Default: the gains of the arm file.
-        friction_ratio: Share of the friction to compensate in mode gravity, 0 to 0.6. It is lower if the arm could creep.
+        friction_ratio: Share of friction to compensate in mode gravity, 0 to 0.6. It is lower if the arm could creep.
         hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
         friction_model: Model that contains the friction, identified from a motion. Default: the model of --model.
     """
@@ -290,7 +290,7 @@ def model_warning(path: str, model: IdentifiedModel) -> str:
     if not (bad := unfit({joint.name: verdicts[joint.name] for joint in model.joints}, "usable")):
         return ""
     recording = model.validation.recording
-    return f"{path}: failed validation on {recording}: {', '.join(bad)}; zero torque may be better for these joints"
+    return f"{path}: failed validation on {recording}: {', '.join(bad)}; for these joints, zero torque may be better"
 
 
 def _warn(text: str) -> None:

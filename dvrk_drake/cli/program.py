@@ -118,5 +118,5 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
         if suggestion:
             message += f". {suggestion[0]}"
         elif error.argument.name == renamed.get(""):
-            message += ": it is an option now"
+            message += ": it was a positional argument before"
     return f"dvrk-drake: error: {message}; see {f'dvrk-drake {name}'.rstrip()} --help"

@@ -146,7 +146,7 @@ def compensation_from_model(
     arm = model.arm
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(
-            f"{arm.name} is not an MTM, so the format dvrk-gc is not possible. A PSM needs dvrk-kinematic-gc"
+            f"{arm.name} is not an MTM. The format dvrk-gc supports only an MTM; for a PSM, use dvrk-kinematic-gc"
         )
     check_tolerance(options.tolerance)
     poses = arm.sample_poses(20000, np.random.default_rng(0))
@@ -278,13 +278,13 @@ def _check_errors(
     tilt = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
     limits = ["a last link balanced about its roll axis"]
     if tilt > 0.05:
-        limits.append(f"an upright base instead of one tilted by {tilt:.1f} deg")
+        limits.append(f"an upright base without the tilt of {tilt:.1f} deg")
     if np.any((model.feedforward_scale != 0) & (model.feedforward_scale != 1)):
         limits.append("feedforward scales of 0 or 1")
     reasons = {
         f"gravity {gravity_error.max():.2g} N m (the file requires {', '.join(limits)})": gravity_error.max(),
-        f"effects {effects_error.max():.2g} N m (the file supports polynomials of order 4 in a joint's own position, "
-        "and no torque at joint 7)": effects_error.max(),
+        f"effects {effects_error.max():.2g} N m (the file supports only polynomials of order 4 in the joint's own "
+        "position, and no torque at joint 7)": effects_error.max(),
     }
     raise ModelError(
         f"the controller's file cannot represent this model: the largest torque errors are {errors} N m. "

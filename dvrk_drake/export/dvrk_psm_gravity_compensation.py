@@ -110,7 +110,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     plant = shared_plant(arm)
     if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
         raise ModelError(
-            f"{arm.name} is not a PSM, so the format dvrk-kinematic-gc is not possible. An MTM needs dvrk-gc"
+            f"{arm.name} is not a PSM. The format dvrk-kinematic-gc supports only a PSM; for an MTM, use dvrk-gc"
         )
     check_tolerance(tolerance)
     alpha, A, theta, D = _chain(plant)

@@ -25,7 +25,7 @@ def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) 
     lines = [
         f"% {_title(gravity)}: holding torque, tau = Y(q) beta.",
         "% s_i = sin q_i, c_i = cos q_i, s_{ij} = sin(q_i + q_j), s_{i - j / 2} = sin(q_i - q_j / 2);",
-        f"% m_i c_i in link frame i; {_lengths(gravity)}.",
+        f"% first moments m_i c_i in the frame of link i; {_lengths(gravity)}.",
         r"\begin{align*}",
         *(
             rf"\beta_{{{i + 1}}} &= {_latex_name(text)} = {value:.5g}\ {_latex_unit(unit)} \\"

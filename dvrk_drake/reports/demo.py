@@ -40,8 +40,8 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     identified, nominal = (f"{angle.max():.4f} rad ({arm.joint_names[int(np.argmax(angle))]})" for angle in angles)
     print_answer(
         console,
-        f"Largest rotation of {arm.name} after a release without dry friction: {identified} with the identified model, "
-        f"{nominal} with the nominal model.",
+        f"Largest joint rotation of {arm.name} after a release without dry friction: {identified} with the identified "
+        f"model, {nominal} with the nominal model.",
         f"open {folder}/arm.html in a browser",
     )
     table = make_table(

@@ -75,7 +75,7 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
         "amplitudes, because the planar start pose does not excite these joints.",
         "Our controller regulates the ground-truth MTM of Fig. 5 with all effects except joint stops, because the "
         "start pose is beyond the stops. The controller uses the effort limits of the arm, the identified model, the "
-        "gains of `mechanisms/mtm.yaml` and a rate of 1 kHz. Its largest error in the last second is "
+        "gains of `mechanisms/mtm.yaml` and a rate of 1 kHz. The largest position error in the last second is "
         f"{1e3 * np.abs(ours[-round(1 / PERIOD) :]).max():.1f} mrad, because friction resists small integral efforts.",
         "The solver, joint limits and friction of Gazebo differ from those here. Therefore the phases of the "
         "oscillations cannot be compared. Only the decay of the oscillations is compared.",
