@@ -68,7 +68,7 @@ def test_page_is_served_until_enter_on_a_terminal(tmp_path):
     )
     os.close(terminal)
     printed = b""
-    while b"press Enter" not in printed:
+    while b"Press Enter" not in printed:
         printed += os.read(controller, 1000)
     address = re.search(rb"http://\S+", printed).group().decode()
     with urllib.request.urlopen(address) as page:
@@ -94,5 +94,5 @@ def test_model_is_written_to_the_given_path(tmp_path):
     before = (tmp_path / "own.yaml").read_bytes()
     assert IdentifiedModel.load(tmp_path / "own.yaml").arm.name == arm.name
     again = run(tmp_path, "real_recording.py", "poses.csv", "own.yaml")
-    assert again.returncode == 1 and "exists already" in again.stderr
+    assert again.returncode == 1 and "already exists" in again.stderr
     assert (tmp_path / "own.yaml").read_bytes() == before

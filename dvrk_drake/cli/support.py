@@ -92,7 +92,7 @@ def load_key(path: str | None) -> MessageKey | None:
 
 
 def check_output(path: str, *inputs: str, overwrite: bool) -> None:
-    """Checks an output path before work begins. Rejects a path that is not writable, is an input, or exists already.
+    """Checks an output path before work begins. Rejects a path that is not writable, is an input, or that already exists.
 
     Args:
         path: Path of the output.
@@ -116,7 +116,7 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
         if str(target) == os.path.realpath(input_path):
             raise DvrkDrakeError(f"{path}: is an input file; choose another output file")
     if os.path.exists(target) and not overwrite:
-        raise DvrkDrakeError(f"{path}: exists already; choose another file, or replace it with --overwrite")
+        raise DvrkDrakeError(f"{path} already exists. Choose another file, or replace it with --overwrite.")
 
 
 def _refuse_twice(path: str) -> None:

@@ -34,7 +34,7 @@ from dvrk_drake.recordings.recording import Coordinates, Recording, column_names
 
 Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log"]
 
-#: Mapping from a format to its coordinates. A CSV with a header has no defined coordinates.
+#: Mapping from a format to its coordinates. The format "csv" has no entry, because it does not define its coordinates.
 DEFINED_COORDINATES: dict[str, Coordinates] = {"team-mat": "joint", "wpi-csv": "actuator", "lcm-log": "joint"}
 
 
@@ -58,18 +58,21 @@ def convert(
         output: Path of the CSV to write; an existing file is replaced.
         format: Format of the recording; None to detect it.
         coordinates: Coordinates of q, qd and tau, required for "csv". Other formats define their coordinates.
-        variable: Name of the variable, for "team-mat"; required if several variables match.
-        rate: Sampling rate [Hz] of a CSV without time stamps. None: 200 Hz for "wpi-csv", no times for "csv".
-        arm: For "csv" and "wpi-csv": arm whose joint coordinates are written; None for the coordinates of the file. For
-            "lcm-log": arm whose statuses are read; required if there are several.
-        skip_invalid: Whether to omit and count invalid rows (or poses) instead of refusing the file.
+        variable: For "team-mat": name of the MATLAB variable, required if several variables match.
+        rate: Sampling rate [Hz] of a CSV without time stamps. If None, the rate is 200 Hz for "wpi-csv", and a "csv"
+            gets no time stamps.
+        arm: For "csv" and "wpi-csv": the joint coordinates of this arm are written. If None, the coordinates of the
+            file are written. For "lcm-log": the statuses of this arm are read. The arm is required if the log has
+            statuses of several arms.
+        skip_invalid: Whether to omit invalid rows (or poses) and to count them in `notes`. If False, a file with
+            invalid rows is refused.
 
     Returns:
         Written recording. Its `source`, `lines` and `notes` refer to the original file.
 
     Raises:
-        RecordingError: The file does not have the layout of the format, its coordinates are unknown, or an option does
-            not apply to its format.
+        RecordingError: The file does not have the layout of the format, its coordinates are unknown, or an argument
+            does not apply to its format.
         DvrkDrakeError: The output cannot be written.
     """
     if format is not None and format not in get_args(Format):
@@ -77,7 +80,7 @@ def convert(
     if coordinates is not None and coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
-        raise RecordingError(f"{output} is the input recording. Choose another output.")
+        raise RecordingError(f"{output} is the input recording. Choose another output file.")
     chosen = format or detect_format(path)
     defined = DEFINED_COORDINATES.get(chosen)
     if defined is not None and coordinates not in (None, defined):
@@ -110,8 +113,8 @@ def convert(
     if recording.coordinates == "actuator":
         first, *others = recording.notes
         note = (
-            "in actuator coordinates, which the CSV does not state: pass --coordinates actuator to every command that "
-            "reads the CSV, or convert with --arm"
+            "in actuator coordinates, but the CSV does not state this: pass --coordinates actuator to every command "
+            "that reads the CSV, or convert with --arm"
         )
         if chosen == "wpi-csv":
             note += " (required for a PSM, whose roll is recorded at the joint)"
@@ -147,9 +150,10 @@ def _read_csv(
 
 
 def detect_format(path: str | Path) -> Format:
-    """Returns the format of a file from its first bytes: LCM, MATLAB, or text with or without q1 in a header.
+    """Returns the format of a file, detected from its first bytes and its name.
 
-    The content is checked later by the reader of the format.
+    A text file is a "csv" if its header contains q1, and a "wpi-csv" otherwise. The reader of the format checks the
+    content later.
 
     Raises:
         RecordingError: The file does not exist, is empty, or has none of the formats.

@@ -201,7 +201,7 @@ def test_existing_file_is_kept_without_overwrite(command, tmp_path, monkeypatch,
     error = fails(capsys, *command.split(), "mine.csv")
     assert error.startswith("dvrk-drake: error: mine.csv") and "exists" in error
     if not command.startswith(KEEP_ALWAYS):
-        assert error.endswith("choose another file, or replace it with --overwrite")
+        assert error.endswith("already exists. Choose another file, or replace it with --overwrite.")
     if "none" in command:
         assert "none" in fails(capsys, *command.split(), "mine.csv", "--overwrite")
     assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1

@@ -235,8 +235,9 @@ def _time_factor(recording: Recording) -> float | None:
 
 def _what_and_advice(error: Exception, source: str) -> tuple[str, str]:
     """Returns the first sentence of an error, without the source of the recording, and the other sentences."""
-    what, _, advice = str(error).removeprefix(f"{source}: ").removesuffix(".").partition(". ")
-    return what, f"{advice}." if advice else ""
+    text = str(error).removeprefix(f"{source}: ").removeprefix(f"{source}, ").removeprefix(f"{source} ")
+    what, _, advice = text.partition(". ")
+    return what.removesuffix("."), advice
 
 
 def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -> RecordingReport:

@@ -109,11 +109,11 @@ def test_refuses_efforts_in_another_unit():
 def test_refuses_positions_in_degrees():
     whole = clean_motion()
     degrees = replace(whole, q=np.where(load_arm("psm").prismatic, whole.q, np.degrees(whole.q)))
-    assert "degrees" in found(degrees)["unusable"][0].what
+    assert "degrees" in found(degrees)["unusable"][0].advice
 
 
 def test_refuses_positions_in_millimetres():
-    assert "millimetres" in found(changed(clean_motion(), "q", 2, lambda x: 1000 * x))["unusable"][0].what
+    assert "millimetres" in found(changed(clean_motion(), "q", 2, lambda x: 1000 * x))["unusable"][0].advice
 
 
 def test_refuses_effort_spikes_in_a_motion():
