@@ -92,7 +92,7 @@ def load_key(path: str | None) -> MessageKey | None:
 
 
 def check_output(path: str, *inputs: str, overwrite: bool) -> None:
-    """Checks an output path before work begins. Rejects a path that is not writable, is an input, or that already exists.
+    """Checks an output path before work begins. Rejects an existing file, an input, and a path that is not writable.
 
     Args:
         path: Path of the output.
