@@ -33,7 +33,7 @@ from dvrk_drake.cli.support import (
 from dvrk_drake.errors import ModelError
 
 Recording = Annotated[
-    str, Parameter(help="CSV file with columns q1..qn, tau1..taun, optionally t, qd1..qdn; or LCM log.")
+    str, Parameter(help="CSV file with columns q1..qn and tau1..taun (optionally t and qd1..qdn), or LCM log.")
 ]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 LowSpeedSegments = Annotated[
@@ -63,7 +63,7 @@ def identify(
     A motion determines the full dynamics, including friction. Static poses determine only the holding torque.
 
     Args:
-        method: Method for static poses: robust regression, or the least squares of the paper.
+        method: Method for static poses: robust regression, or the least squares of the paper (Rutfield et al., 2015).
     """
     from dvrk_drake.reports.identification import print_identification
     from dvrk_drake.reports.terminal_tables import make_console
@@ -75,7 +75,7 @@ def identify(
         read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     result.save(output, overwrite=True)
     if folder is not None:
         from dvrk_drake.reports.figures.identification import plot_identification
@@ -120,7 +120,7 @@ def validate(
 
     Args:
         require: Exit with code 2 unless each joint with feedforward has at least this verdict.
-        save: Store the verdicts in the model file, where the command run checks them.
+        save: Store the verdicts in the model file. The command run checks the stored verdicts.
     """
     from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console
@@ -134,13 +134,13 @@ def validate(
             check_output(model, recording, overwrite=True)
             if read.sha256 and read.sha256 == loaded.provenance.sha256:
                 raise ModelError(
-                    f"{read.source}: the model was identified from this recording; --save requires another one"
+                    f"{read.source}: the model was identified from this recording; --save requires another recording"
                 )
             if loaded.validation is not None and not overwrite:
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
         validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if save:
         validation.save(model, overwrite=True)
     if json is not None:
@@ -162,8 +162,8 @@ def validate(
         print_written(model, "verdicts stored")
     if require is not None and (failed := validation.unfit(require)):
         raise ModelError(
-            f"{model}: not {require} on {read.source}: {', '.join(failed)}; identify from a recording with more varied "
-            "poses, or recalibrate"
+            f"{model}: verdicts below {require} on {read.source}: {', '.join(failed)}; identify from a recording with "
+            "more varied poses, or recalibrate"
         )
 
 
@@ -179,11 +179,11 @@ def predict(
 ) -> None:
     """Predict the efforts of a recording with a model.
 
-    For a motion and a model with dynamics: total efforts, low-pass filtered as in the identification.
-    Otherwise: holding efforts.
+    A model with dynamics predicts the total efforts of a motion, low-pass filtered as in the identification.
+    In all other cases, the command predicts the holding efforts.
 
     Args:
-        output: CSV file to write: tau1..taun [N m; N if prismatic], in the coordinates of the recording.
+        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the coordinates of the recording.
     """
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
@@ -210,7 +210,7 @@ def recalibrate(
 ) -> None:
     """Refit the friction and offsets of a model to a short new motion.
 
-    The result is valid for similar motions, positions and speeds only (docs/payload.md).
+    The result is valid only for similar motions, positions and speeds (docs/payload.md).
     """
     from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
@@ -245,7 +245,7 @@ def payload(
     Args:
         reference: Recording of the motion without the payload.
         loaded: Recording of the same motion with the payload.
-        link: SDF link that carries the payload. Default: the link with the smallest cross-validated error.
+        link: SDF link to which the payload is attached. Default: the link with the smallest cross-validated error.
     """
     from dvrk_drake.reports.payload import print_payload
     from dvrk_drake.reports.terminal_tables import make_console

@@ -30,7 +30,7 @@ def check(
     The exit code is 2 if the recording is not suitable for identification.
 
     Args:
-        recording: CSV file with columns q1..qn, tau1..taun, optionally t, qd1..qdn; or LCM log.
+        recording: CSV file with columns q1..qn and tau1..taun (optionally t and qd1..qdn), or LCM log.
     """
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
@@ -42,7 +42,7 @@ def check(
     with Steps("reading", "checking the recording") as steps:
         checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if json is not None:
         write_json(json, report.as_dict())
     options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"
@@ -78,16 +78,16 @@ def convert(
 ) -> None:
     """Convert a recording to the CSV format of this project.
 
-    Formats: csv, lcm-log, team-mat (MATLAB files of JHU and WPI), wpi-csv (CSV of WPI, no header).
+    The formats are csv, lcm-log, team-mat (MATLAB files of JHU and WPI) and wpi-csv (CSV files of WPI without header).
 
     Args:
         recording: File to convert.
         output: CSV file to write.
         input_format: Format of the recording. Default: detected from the content.
-        coordinates: Coordinates of q and tau, required for format csv. The other formats define them.
-        variable: Variable of a team-mat file. Required if several variables match.
-        rate: Sampling rate [Hz] of rows without time stamps. Default: 200 for wpi-csv; csv remains without times.
-        arm: For csv and wpi-csv: convert to joint coordinates of this arm. For lcm-log: arm to read.
+        coordinates: Coordinates of q and tau. Required for csv. All other formats define the coordinates.
+        variable: Variable of a team-mat file that contains the recording. Required if several variables are possible.
+        rate: Sampling rate [Hz] of rows without time stamps. Default: 200 for wpi-csv, no time stamps for csv.
+        arm: For csv and wpi-csv: convert to joint coordinates of this arm. For lcm-log: read messages of this arm.
         skip_invalid: Skip rows with an empty cell, NaN or an infinite value, and print their number.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording

@@ -100,7 +100,7 @@ def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
         assert main(["key", "--output", str(first)]) == main(["key", "--output", str(second)]) == 0
     finally:
         os.umask(before)
-    assert f"{first}: copy it to the other side" in capsys.readouterr().out
+    assert f"{first}: copy the file to the other computer" in capsys.readouterr().out
     assert stat.S_IMODE(first.stat().st_mode) == 0o600
     content = first.read_bytes()
     assert len(content) == 32 and content != second.read_bytes()

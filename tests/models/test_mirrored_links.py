@@ -98,7 +98,7 @@ def test_compare_gc_refuses_a_file_of_another_arm(tmp_path, capsys):
     file.save(path, "MTML", "test")
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 2
     error = refusal(capsys.readouterr().err)
-    assert error.startswith(f"dvrk-drake: error: {path}: the file is of MTML") and "model is of MTMR" in error
+    assert error.startswith(f"dvrk-drake: error: {path}: the file belongs to MTML") and "model belongs to MTMR" in error
     # A file with a wrong arm name is compared. A warning shows that the name is wrong.
     file.save(path, "MTMR", "test")
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 0
@@ -114,7 +114,7 @@ def test_arm_is_taken_from_the_file_name_if_missing(tmp_path):
     for name, arm in (("gc-MTML-12345.json", "MTML"), ("gc-mtmr.json", "MTMR"), ("gc.json", "")):
         file.save(tmp_path / name, "", "test")
         assert GravityCompensationFile.load(tmp_path / name).arm_name == arm
-    with pytest.raises(ModelError, match="the file is of MTMR"):
+    with pytest.raises(ModelError, match="the file belongs to MTMR"):
         compare_compensation(GravityCompensationFile.load(tmp_path / "gc-mtmr.json"), stock("mtml"))
 
 
