@@ -16,7 +16,8 @@ from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
 from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
 
-#: Longest time until the first status [s]. Time without a status after which the live line reports it [s].
+#: Longest time until the first status [s]. Time without a status after which the live line reports missing statuses
+#: [s].
 FIRST_STATUS, SILENCE = 10.0, 0.5
 #: Time without a status of the session after which the statuses of a new session are recorded [s].
 _RESTART = 1.0
@@ -29,7 +30,7 @@ _POLL = 0.1
 
 
 class Recorder:
-    """Appends every status of one arm to a new file as it arrives in real time.
+    """Appends every status of one arm to a new file in real time.
 
     Attributes:
         stream: Filter that counts accepted and rejected statuses.
@@ -65,7 +66,7 @@ class Recorder:
         self._subscription.set_queue_capacity(_QUEUE)
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
-        """Records until `stopped` returns true, or for `duration` from the first message.
+        """Records until `stopped` returns true, or until `duration` has elapsed since the first status.
 
         Args:
             duration: Duration of the recording [s], which may be infinite.
@@ -114,7 +115,7 @@ class Recorder:
         return ", ".join(parts)
 
     def notes(self) -> list[str]:
-        """Returns one line per kind of messages that were not recorded or were lost."""
+        """Returns one line for each reason why messages were not recorded, and for lost messages."""
         left_out = [f"messages not recorded, {reason}: {count}" for reason, count in self.foreign.items()]
         return [*left_out, *self.stream.notes()]
 

@@ -220,7 +220,8 @@ def test_implausible_first_pose_is_a_fault():
     guard = bench.guard
     assert (guard.state, guard.fault_code) == (Status.STATE_FAULT, Status.FAULT_MEASUREMENT)
     assert guard.fault_text == (
-        "outer_yaw is at 40 rad, far outside its limits -0.6981..1.134 rad; check its unit (degrees?) and its zero position"
+        "outer_yaw is at 40 rad, far outside its limits -0.6981..1.134 rad; "
+        "check its unit (degrees?) and its zero position"
     )
     assert bench.output.control_mode == Command.OFF  # no pose was held
     bench.q = Q
@@ -328,9 +329,8 @@ def test_prismatic_joint_in_millimetres_is_reported():
     q = np.zeros(7)
     q[2] = 120.0
     guard.step(0, 0, q, 0 * q, 0 * q)
-    assert (
-        guard.fault_text == "insertion is at 120 m, far outside its limits 0..0.24 m; check its unit (mm?) and its zero position"
-    )
+    text = "insertion is at 120 m, far outside its limits 0..0.24 m; check its unit (mm?) and its zero position"
+    assert guard.fault_text == text
 
 
 def test_off_in_fault_requires_reset():

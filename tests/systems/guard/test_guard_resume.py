@@ -1,4 +1,4 @@
-"""Resume by an operator after the watchdog took over, and expiry by the wall clock in stalls of either side."""
+"""Resume by an operator after a watchdog hold, and expiry by the wall clock in stalls of either side."""
 
 import copy
 
