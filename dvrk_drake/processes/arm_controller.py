@@ -121,7 +121,7 @@ class ArmController:
         return self._sender.get_output_port().Eval(self._sender_context)
 
     def _set_acting(self, acting: bool) -> None:
-        """Stores whether the arm applies the efforts. If it is true, restarts the ramp and latches the pose to hold."""
+        """Stores whether the efforts act on the arm. If they act, restarts the ramp and latches the pose to hold."""
         self._acting = acting
         self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
         # The change of the mode from "gravity" to "hold" latches the pose and resets the integrator.

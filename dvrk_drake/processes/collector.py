@@ -30,7 +30,7 @@ _REST, _REST_TIME, _SETTLE = (2e-3, 2e-4), 0.5, 10.0
 _MEASURE = 0.25
 #: Duration of braking after a stop during a motion [s].
 _BRAKE = 0.3
-#: Largest tracking error of a joint as a share of its range.
+#: Largest allowed tracking error of a joint, as a fraction of the range of the joint.
 _MAX_TRACKING_ERROR = 0.1
 #: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
 #: determines the distance of the approach. Static friction of up to half of this effort changes its sign during the
@@ -184,7 +184,7 @@ class Collector:
                 self._report(f"pose {k + 1} measured, {count} of {len(self.done)}; about {left / 60:.1f} min left")
 
     def _begin(self) -> Steps:
-        """Waits until the efforts act and their ramp is complete. The arm holds the pose at which they began to act."""
+        """Waits until the efforts act and their ramp is complete. The arm holds the pose at the start of the ramp."""
         began = self._time
         while not self._controller.acting:
             if self._time - began > _START:

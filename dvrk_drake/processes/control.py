@@ -141,7 +141,7 @@ class ArmLink:
             return ""
         advice = {
             StatusFilter.OTHER_SESSION: f"; {self.arm.name} was restarted: look at it, then start again",
-            StatusFilter.NOT_AUTHENTIC: "; both sides need the same key (--key)",
+            StatusFilter.NOT_AUTHENTIC: "; the arm and this process need the same key (--key)",
         }
         return f"; ignored: {', '.join(f'{n} {reason}' for reason, n in ignored)}{advice.get(ignored[0][0], '')}"
 

@@ -52,7 +52,7 @@ def open_lcm(url: str = "") -> DrakeLcm:
 
 
 def handle_message(network: lcm.LCM, seconds: float) -> bool:
-    """Handles one message that arrives within `seconds`. Returns whether it arrived. A signal causes no error."""
+    """Handles one message that arrives within `seconds`. Returns whether one arrived. A signal causes no error."""
     ready, _, _ = select.select([network.fileno()], [], [], seconds)
     if ready:
         network.handle()

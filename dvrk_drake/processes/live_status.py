@@ -97,7 +97,7 @@ class LiveStatusMaker:
             self._trips.append(time - 1e-6 * status.command_utime)
 
     def make(self, status: lcmt_dvrk_status, time: float, lost: int) -> LiveStatus:
-        """Returns the live status for the time since the previous one.
+        """Returns the live status for the time since the previous live status.
 
         Args:
             status: Last status of the arm.

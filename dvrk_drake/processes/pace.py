@@ -8,8 +8,8 @@ import os
 import time
 from collections.abc import Callable
 
-#: Priority of SCHED_FIFO. It is above the priority of all processes that are not real-time and below the kernel's own
-#: threads at 99.
+#: Priority of SCHED_FIFO. This priority is above all processes that are not real-time, and below the kernel's own
+#: threads, which have priority 99.
 _PRIORITY = 50
 
 #: Longest delay [s] for which a loop catches up. After a longer delay, the loop continues from the current time.

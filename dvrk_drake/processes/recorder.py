@@ -16,7 +16,7 @@ from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
 from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
 
-#: Longest time until the first status [s]. Time without a status after which the live line reports missing statuses
+#: Longest time until the first status [s]. Time without a status after which the status line reports missing statuses
 #: [s].
 FIRST_STATUS, SILENCE = 10.0, 0.5
 #: Time without a status of the session after which the statuses of a new session are recorded [s].
@@ -72,7 +72,7 @@ class Recorder:
             duration: Duration of the recording [s], which may be infinite.
             stopped: Function that returns whether to stop. It is called at least every 0.1 s.
             show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
-                function that returns the live line.
+                function that returns the text of the status line.
 
         Raises:
             RecordingError: The recording ended before the first status, no status arrived within 10 s, or the file
@@ -97,7 +97,7 @@ class Recorder:
                 self._file.close()
 
     def describe(self) -> str:
-        """Returns the live line with the number of rows, the rate, lost messages and the state of the arm."""
+        """Returns the text of the status line: the number of rows, the rate, lost messages and the state of the arm."""
         now = time.monotonic()
         while self._arrivals and self._arrivals[0] < now - 1:
             self._arrivals.popleft()

@@ -56,8 +56,8 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
 
     Args:
         arm: Simulated arm.
-        pose: Pose (n,) [rad, m]. None: the pose nearest to zero is used, with a distance of 10 % of the range to each
-            limit.
+        pose: Pose (n,) [rad, m]. None: the pose nearest to zero is used that has a distance of at least 10 % of the
+            range from each limit.
 
     Raises:
         StationError: `pose` does not have n entries inside the arm's limits.
@@ -91,8 +91,8 @@ class SimulatedArm:
             driver: Configuration of the driver.
             url: URL of the LCM network.
             q: Initial pose (n,) [rad, m].
-            wall_clock: Function that returns a monotonic time [us]. The guard uses it, so that commands also expire
-                while this process is late or suspended.
+            wall_clock: Function that returns a monotonic time [us]. The guard uses this function, so that commands also
+                expire while this process is late or suspended.
         """
         self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0

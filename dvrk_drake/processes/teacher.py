@@ -84,7 +84,7 @@ class RestDetector:
         self._q: NDArray[np.float64] | None = None
 
     def is_at_rest(self, time: float, q: NDArray[np.float64]) -> bool:
-        """Returns whether the arm is at rest at `time` [s] and q (n,). Call this method for every measurement."""
+        """Returns whether the arm is at rest at `time` [s]. Call this method for every measurement q (n,)."""
         if self._q is None or not np.all(np.abs(q - self._q) <= self._tolerance):  # also true for NaN
             self._q, self._since = q, time
         return time - self._since >= self._duration

@@ -362,7 +362,7 @@ def test_key_verifies_statuses_and_signs_commands():
     for message in (status_bytes(100), MessageKey(bytes([1] * 32)).sign(status_bytes(100)), *corrupted):
         assert linked.link._filter.accept(message, 0.0) is None
     assert linked.receive(status_bytes(101)) is None
-    assert linked.output.endswith("both sides need the same key (--key)")
+    assert linked.output.endswith("the arm and this process need the same key (--key)")
     assert linked.receive(signed).sequence == 100
     linked.link._lcm.subscribe("DVRK_COMMAND_MTML", lambda channel, data: sent.append(data))
     linked.link.send(Command())

@@ -56,7 +56,7 @@ class DriveJoints:
         self.motors: dict[str, JointActuator] = {}
 
     def add_motor(self, name: str, cable: Cable) -> None:
-        """Adds a separate joint for the motor of an actuator and couples it to the arm by an elastic cable.
+        """Adds a separate joint for the motor of an actuator and couples this joint to the arm by an elastic cable.
 
         Afterwards, `joint_of_coordinate` returns the joint of the motor for this actuator. The rotor inertia in the SDF
         is moved from the actuator's joint to the motor.

@@ -343,7 +343,7 @@ class CommandGuard:
         return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
-        """Latches a fault that the arm's driver reports. Call it before each `step` while the fault lasts.
+        """Latches a fault that the arm's driver reports. Call this method before each `step` while the fault lasts.
 
         Args:
             text: Description of the fault, including measured values. The description of the first fault is kept until

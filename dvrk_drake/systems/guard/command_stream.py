@@ -142,7 +142,7 @@ class CommandStream:
     The sequence and time of a command are compared with the sequence and time of the last accepted command, unless that
     command arrived more than `expiry` ago. Refused commands are not used for this comparison. A forged sequence or time
     in a refused command therefore does not end the control of the authentic sender. After a jump of a sender's clock or
-    sequence, its commands are accepted again when `expiry` has elapsed since its last accepted command.
+    sequence, the commands of this sender are accepted again when `expiry` has elapsed since the last accepted command.
 
     Attributes:
         expiry: Time since the last accepted command after which another sender is accepted. After the same time, a

@@ -198,7 +198,7 @@ class Response:
 
 
 class SilentEffort:
-    """Check that measured efforts follow commanded efforts. It detects sensors that read zero and unpowered motors."""
+    """Check that measured efforts follow commanded efforts. It detects sensors that read zero, and unpowered motors."""
 
     text, about_position = "the measured effort does not follow the commanded effort", False
 
