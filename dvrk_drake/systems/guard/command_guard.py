@@ -49,7 +49,7 @@ _ACTIVE = {
 
 
 class CommandGuard:
-    """Watchdog between the sender of commands and the motors of an arm.
+    """Guard between the sender of commands and the motors of an arm.
 
     Call `receive` with every command and `step` once per period (1 ms). Both methods require the time of the arm's
     clock [us]. The status messages use the same clock. `step` returns the output for this period. The caller must apply

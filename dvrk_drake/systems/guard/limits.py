@@ -187,7 +187,7 @@ class GuardLimits:
         return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
 
     def wall_effort(self, q: Vector, v: Vector) -> tuple[Vector, Flags]:
-        """Returns the effort (n,) [N m, N] of the walls at q, v (n,) and the joint flags (n,)."""
+        """Returns the effort of the walls (n,) [N m, N] at q and v (n,), and the joint flags (n,)."""
         flags = np.zeros(len(q), np.int8)
         c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
         if not is_any(np.abs(c - self._middle) > self._free):

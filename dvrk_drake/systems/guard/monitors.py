@@ -49,7 +49,7 @@ class PeriodMonitor:
 
 
 class OscillationMonitor:
-    """Monitor that counts reversals of the commanded efforts, with exponential decay.
+    """Monitor that counts reversals of the commanded efforts. The count decays exponentially.
 
     The alternating part of an effort is x = tau - filter(tau), with a first-order low-pass filter. A reversal is a
     change of x from above h to below -h, or from below -h to above h. The threshold h is the fraction `oscillation` of

@@ -117,7 +117,7 @@ class VelocityConsistency:
         self._tolerance = tolerance + self._memory * settings.velocity_counts * counts
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector]:
-        """Returns the difference e (n,) and the speed s (n,)."""
+        """Returns the initial difference e (n,) and speed s (n,)."""
         return np.zeros_like(sample.q), sample.speed
 
     def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:

@@ -111,7 +111,7 @@ class SimDvrkDriver(Diagram):
         self._receiver.Receive(data)
 
     def SetStalled(self, stalled: bool) -> None:
-        """Stops or restarts the guard, to simulate a bridge whose process is stopped.
+        """Stops or continues the steps of the guard, to simulate a bridge whose process is stopped.
 
         While the guard is stopped, no command is received and the motors keep their last efforts.
         """
