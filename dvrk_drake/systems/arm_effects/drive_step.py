@@ -36,11 +36,11 @@ class DriveStep(LeafSystem):
     - `state_estimated` (2n): measured q, then v of the arm's joints [rad, rad/s; m, m/s on a prismatic joint], delayed
       by the measurement delay.
 
-    **Friction.** An anchor is fixed while the deflection of the spring is below the slip limit. Beyond this limit, the
-    anchor follows the joint at a constant distance; see `effect_step`. The plant evaluates the spring at the end of a
-    step. The anchor is updated afterwards, and this update only reduces the deflection. A spring therefore never
-    returns more energy than was stored in it, and friction adds no energy. At initialization, the deflection of all
-    springs is zero.
+    **Friction.** The anchor of a friction spring is fixed while the deflection of the spring is below the slip limit.
+    Beyond this limit, the anchor follows the joint at a constant distance; see `effect_step`. The plant evaluates the
+    spring at the end of a step. The anchor is updated afterwards, and this update only reduces the deflection. A spring
+    therefore never returns more energy than was stored in it, and friction adds no energy. At initialization, the
+    deflection of all springs is zero.
 
     **Encoders.** A measured actuator position is a whole number of encoder counts. Joint positions follow from the
     transmission. The velocity is the difference of two readings over the time step h, after a first-order low-pass
