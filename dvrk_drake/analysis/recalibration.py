@@ -197,8 +197,8 @@ def cross_validated_errors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns the relative errors (n,) of the model, and the cross-validated errors (n,) after a refit of friction.
 
-    A periodic motion is divided by its phase, so that the fit for a fold does not use repetitions of this fold. The
-    friction and offsets of all actuators that move in both directions are refitted.
+    The folds of a periodic motion are intervals of its phase, so that the fit for a fold does not use repetitions of
+    this fold. The friction and offsets of all actuators that move in both directions are refitted.
 
     Raises:
         RecordingError: The recording is not a motion of this arm.

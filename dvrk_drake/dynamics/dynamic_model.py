@@ -64,7 +64,7 @@ class DynamicModel:
     J is the matrix of `Arm.transmission`.
 
     Attributes:
-        arm: Arm of the model, with the gravity vector of the section.
+        arm: Arm of the model, with the gravity vector of `section`.
         section: Parameters of the model.
         regressor: Regressor of the rigid-body dynamics.
         parameters: Parameters phi (p,) of `regressor`.

@@ -197,7 +197,7 @@ def named_lengths(
 ) -> dict[str, float]:
     """Returns name -> distance between the frames of neighbouring links [m], such as "L2" and "L_crank".
 
-    The entry "1" is 1.0, for coefficients without a length.
+    The entry "1" is 1.0, the factor of terms that contain no length.
     """
     context = plant.CreateDefaultContext()
     lengths = {"1": 1.0}

@@ -220,7 +220,10 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
         relative = Path(mesh_folder(model_path)) / source.parent.name / source.name
         target = model_path.parent / relative
         if copies.setdefault(source, target) != target or list(copies.values()).count(target) > 1:
-            raise ArmError(f"{source}: another mesh of the model has the same name and folder name; rename one of them")
+            raise ArmError(
+                f"{source}: another mesh file of the model has the same file name, in a folder with the same name. "
+                "Rename one of the files"
+            )
         for file in _referenced_files(source):
             copies[source.parent / file] = target.parent / file
         uri.text = relative.as_posix()

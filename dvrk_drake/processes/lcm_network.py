@@ -52,7 +52,10 @@ def open_lcm(url: str = "") -> DrakeLcm:
 
 
 def handle_message(network: lcm.LCM, seconds: float) -> bool:
-    """Handles one message that arrives within `seconds`. Returns whether one arrived. A signal causes no error."""
+    """Handles one message that arrives within `seconds`, and returns whether one arrived.
+
+    A signal of the operating system, such as SIGINT, does not raise an error.
+    """
     ready, _, _ = select.select([network.fileno()], [], [], seconds)
     if ready:
         network.handle()

@@ -77,7 +77,8 @@ class FrictionCompensator(LeafSystem):
         check_ratios(ratio, hysteresis_ratio)
         if not (1 <= widening <= 10 and 0 < period < 1):
             raise ControllerError(
-                f"widening must be 1..10 and period must be 0..1 s; got {widening:g} and {period:g} s"
+                f"widening must be 1..10 and period must be larger than 0 and smaller than 1 s; got {widening:g} and "
+                f"{period:g} s"
             )
         n = friction.arm.num_joints
         error = np.zeros(n) if holding_error is None else holding_error

@@ -202,7 +202,7 @@ def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
 
 def _exchange(arm: Arm, channels: tuple[int, ...], which: str, gain: float) -> Finding:
     names = " and ".join(arm.joint_names[k] for k in channels)
-    what = f"{which} are exchanged. The arm model fits the recording much better without the exchange"
+    what = f"{which} are exchanged. The arm model fits the recording much better if they are swapped"
     advice = "Correct the columns of the file and check it again."
     return Finding("refusal", "exchanged channels", names, what, advice, channels, gain)
 

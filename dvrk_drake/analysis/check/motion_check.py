@@ -1,4 +1,4 @@
-"""Checks the times, noise and repetition of a motion, and the consistency of its channels."""
+"""Checks the times, noise and repetition of a motion, and the consistency of its positions, velocities and efforts."""
 
 from __future__ import annotations
 

@@ -40,8 +40,8 @@ NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
 class DynamicColumns:
     """Low-pass filtered regressor columns and efforts of a motion at r rows.
 
-    For each actuator, tau = rigid (base phi) + effects c, where phi are the rigid-body parameters and c are the effect
-    coefficients.
+    For actuator i, tau[:, i] = rigid[:, i] (base phi) + E_i c. Here phi are the rigid-body parameters, and c are the
+    coefficients of the effects. The effect columns are E_i = shapes[i] * rows[:, i].
 
     Attributes:
         tau: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
@@ -52,10 +52,9 @@ class DynamicColumns:
         tilts: Derivatives (2, r, n, b) of `rigid` with respect to the x and y components of gravity [s^2/m]. The array
             is empty if the arm file does not allow a base tilt.
         effects: Effects, in the order of their columns.
-        shapes: Filtered shapes (r, e) of the e effects along their coordinates, one array per actuator. The arrays
-            differ if the effort delays of the actuators differ.
-        rows: Velocities (e, n) of the coordinates of the effects per unit velocity of each actuator. The effect columns
-            of actuator i are shapes[i] * rows[:, i].
+        shapes: Filtered efforts (r, e) of the e effects along their coordinates for coefficients of 1, one array per
+            actuator. The arrays differ if the effort delays of the actuators differ.
+        rows: Ratios (e, n) of the velocity along the coordinate of each effect to the velocity of each actuator.
     """
 
     tau: NDArray[np.float64]

@@ -363,7 +363,10 @@ class _Problems:
 
     @classmethod
     def of(cls, link: LinkInertia, columns: NDArray[np.float64], difference: MotionDifference) -> _Problems:
-        """Creates the problems for the ten regressor columns (m, n, 10) of the link on the grid of the motion."""
+        """Creates the least-squares problems of the link from its ten regressor columns (m, n, 10).
+
+        The columns are sampled on the grid of the motion.
+        """
         grid, n = difference.grid, difference.grid.arm.num_joints
         at_rows = np.stack([grid.at_rows(columns[:, i], i) for i in range(n)], axis=1)
         filtered = grid.filter_efforts(at_rows)[difference.rows]

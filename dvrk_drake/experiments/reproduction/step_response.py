@@ -124,7 +124,7 @@ def oscillation_modes(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], N
         faulty: See `simulate_paper_controller`.
 
     Returns:
-        Eigenvalues (k,) [1/s] with positive imaginary part, and the joint components (n, k) of their eigenvectors.
+        Eigenvalues (k,) [1/s] with positive imaginary part, and the position components (n, k) of their eigenvectors.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
