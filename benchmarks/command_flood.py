@@ -1,14 +1,15 @@
-"""Measures the step rate and the control of a simulated arm while another process floods its command channel.
+"""Measures the step rate of a simulated arm, and the effect of its controller, while its command channel is flooded.
 
     python benchmarks/command_flood.py [--seconds 5] [--kinds garbage,session,...] [--no-key]
 
-`dvrk-drake arm` runs at 1 kHz. A small controller answers each status with efforts. A third process publishes foreign
-messages on the command channel as fast as possible. Each kind of message is measured without and with the flood:
+`dvrk-drake arm` runs at 1 kHz. A small controller sends an effort command for each status. A third process publishes
+foreign messages on the command channel as fast as possible. The benchmark measures without and with this flood, for
+each kind of message:
 
     garbage     300 random bytes
     session     a valid command of another session
     sender      a valid command of another sender
-    copy        a valid command that copies the sender's id, with a much higher sequence number
+    copy        a valid command with the controller's sender id and a much higher sequence number
 
 Columns of the table:
 
@@ -20,7 +21,8 @@ Columns of the table:
     accepted    accepted commands per second
     ignored     ignored and refused commands per second
 
-The arm, the controller and the measuring process use real-time scheduling if the system permits it. The flood does not.
+The arm, the controller and the measuring process use real-time scheduling if the system permits it. The flooding
+process does not.
 
 The benchmark requires a multicast route:
 
@@ -58,7 +60,7 @@ SENDER, OTHER = 5, 6
 
 
 def answer_to(status: lcmt_dvrk_status, effort: list[float]) -> lcmt_dvrk_command:
-    """Returns a valid command with `effort` (n,) [N m, N] that answers `status`."""
+    """Returns a valid command with `effort` (n,) [N m, N] for a received status."""
     command = lcmt_dvrk_command()
     command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, status.sequence, SENDER
     command.status_utime, command.session_id = status.utime, status.session_id
@@ -89,7 +91,7 @@ def control(file: Path | None) -> None:
 
 
 def flood(kind: str, data: bytes, count: multiprocessing.Value) -> None:
-    """Publishes one message as fast as possible until the process ends; writes the number of messages to `count`."""
+    """Publishes a message repeatedly as fast as possible until the process ends; writes the number to `count`."""
     network = lcm.LCM()
     status = lcmt_dvrk_status.decode(data)
     command = answer_to(status, [0.0] * status.num_joints)
@@ -121,7 +123,7 @@ class Observer:
         self.states.append(lcmt_dvrk_status.decode(data).guard_state)
 
     def listen(self, seconds: float) -> tuple[lcmt_dvrk_status, float]:
-        """Returns the last status after receiving for this time, and the current time [s]."""
+        """Receives statuses for `seconds`; returns the last status and the current time [s]."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             handle_message(self.network, left)

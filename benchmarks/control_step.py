@@ -12,12 +12,13 @@ Rows:
     cpp         Drake's InverseDynamics (gravity compensation) on a controller plant, PidController, and Adder.
                 InverseDynamics ignores couplers. Therefore it uses the whole tree, and a MatrixGain multiplies its
                 output by G' (transposed linkage matrix). This row is the reference.
-    cpp_serial  The same on a plant of the seven independent joints, without the MatrixGain. Its gravity is wrong,
-                since the counterweight is on the linkage. The row is a lower bound of the time without a linkage.
+    cpp_serial  As cpp, but on a plant of the seven independent joints and without the MatrixGain. The gravity torque is
+                wrong, since the counterweight is on the linkage. The row is a lower bound of the time without a
+                linkage.
     none        No control, but the constant effort that balances the start pose.
 
 The column `control` is the time of a row minus the time of row `none`. The integral of PidController is a continuous
-state. The cpp rows integrate it with explicit Euler at 1 ms. They have no delay, unlike the python row.
+state. The cpp rows integrate it with explicit Euler at 1 ms. Unlike the python row, the cpp rows have no delay.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def serial_plant(arm: Arm) -> MultibodyPlant:
 
 
 def tree_state_order(station: ArmStation, plant: MultibodyPlant) -> bool:
-    """Returns whether the station's plant and the controller's have their joints in the same order."""
+    """Returns whether the plants of the station and of the controller have their joints in the same order."""
     return np.array_equal(tree_selector(station.plant, station.arm), tree_selector(plant, station.arm))
 
 
@@ -139,12 +140,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", metavar="FILE", help="write the results to this file")
     parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
-    parser.add_argument("--seconds", type=float, default=0.5, help="simulated time of one repetition")
+    parser.add_argument("--seconds", type=float, default=0.5, help="simulated time of one repetition [s]")
     arguments = parser.parse_args()
     arm = load_arm("mtml")
     rows = {row: start(row, arm) for row in ("python", "cpp", "cpp_serial", "none")}
 
-    # The comparison requires equal efforts. Compare the first efforts after the limits.
+    # The comparison requires equal efforts. Compare the first efforts, clamped to the limits.
     ours, theirs = (effort(rows[row][2], rows[row][0].get_context()) for row in ("python", "cpp"))
     difference = np.abs(ours - np.clip(theirs, -arm.effort_limits, arm.effort_limits)).max()
     assert difference < 1e-9, f"The efforts of python and cpp differ by {difference:.2g} N m."

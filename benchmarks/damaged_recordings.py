@@ -6,14 +6,14 @@ FOLDER contains the public recordings (docs/public_recordings.md). NAME is a mot
 psm_one (PSM). Each damage is applied separately to each motion. Outcomes:
 
     refused         the check or the identification refuses the recording
-    warned          there is a new warning, or the cross-validated error of an actuator exceeds half of its effort
-    harmless        the error on the undamaged motion does not rise, for any actuator, both by more than half and by
-                    more than 5 % of the actuator's effort
-    undetectable    the error rises, and a note of the check names this joint as one whose offset or scale cannot be
-                    checked
-    undetected      the error rises without such a note
+    warned          there is a new warning, or the cross-validated error of an actuator exceeds half of its RMS effort
+    harmless        there is no actuator whose error on the undamaged motion rises by more than half and also by more
+                    than 5 % of its RMS effort
+    undetectable    the error of an actuator rises by more than in `harmless`, and a note of the check states that the
+                    offset or the scale of the damaged joint cannot be checked
+    undetected      the error of an actuator rises by more than in `harmless`, without such a note
 
-The script also prints the findings about the channels of the undamaged recordings. There should be none.
+The script also prints the findings about the channels of the undamaged recordings. There should be no such findings.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ CHANNEL_KINDS = ("exchanged channels", "effort sign", "effort scale", "position 
 
 
 def damages(recording: Recording, arm: Arm) -> Iterator[tuple[str, str, Recording]]:
-    """Yields the kind of each damage, its channels, and the damaged recording."""
+    """Yields the kind of each damage, the damaged channels, and the damaged recording."""
     n, tau, qd = arm.num_joints, recording.measured_effort(), np.asarray(recording.qd)
     for i, j in combinations(range(n), 2):
         order = np.arange(n)

@@ -16,7 +16,7 @@ with a zero-phase Butterworth filter of order 6 (5.65 Hz for the MTM, 16.96 Hz f
     ours, cross-validated        prediction of phases of the motion that were not used for the fit
     repeatability of the motion  smallest possible error of any function of q, v and vd over all periods
     ours on FILE                 model identified from the first motion, on another recording
-    FILE, refitted friction      the same after refitting friction to the other half of the phases
+    FILE, refitted friction      the same model and recording, after refitting friction to the other half of the phases
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@
     make benchmark        or        pip install '.[benchmark]' && python benchmarks/dynamic_regressor.py [--json FILE]
 
 Pinocchio's model contains the linkage and the instrument as a tree. Before the timing, the script checks that both
-libraries compute equal torques; Pinocchio's are multiplied by the linkage matrix. Pinocchio has no batch function, so
-a Python loop calls it for each sample, and each sample overwrites the previous regressor. Our function returns the
-regressors of all samples. It is timed with preallocated memory ("ours") and with new memory in each call.
+libraries compute equal torques. For this check, it multiplies Pinocchio's torques by the linkage matrix. Pinocchio has
+no batch function, so a Python loop calls it for each sample, and each sample overwrites the previous regressor. Our
+function returns the regressors of all samples. Our function is timed with preallocated memory ("ours") and with new
+memory in each call.
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
     python benchmarks/false_alarms.py [--minutes 30] [--processes 2]
 
-Each line is one use, with the reason if the guard held the arm or reported a fault. Collections use the Collector of
-`dvrk-drake collect`. In teleoperation a simulated hand moves an MTML, and a PSM follows.
+A use is a combination of arm, control mode and motion. The output has one line per use. If the guard held the arm or
+reported a fault, the line contains the reason. Collections use the Collector of `dvrk-drake collect`. In teleoperation
+a simulated hand moves an MTML, and a PSM follows.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def run(use, seconds):
 
 
 def step(arm, seconds, check=lambda: "", until=lambda: False):
-    """Simulates an arm for `seconds` or until an alarm of its guard, a reason from `check`, or `until`; see `run`."""
+    """Simulates an arm for `seconds`, or until a guard alarm, a text from `check` or a true `until`; see `run`."""
     acted = False
     while arm.ticks * PERIOD < seconds and not until():
         arm.step()
@@ -129,7 +130,7 @@ def teleoperate(path, seconds):
 
 
 def task(arguments):
-    """Runs one use in a separate process and prints its line."""
+    """Simulates one use in a separate process and prints the line of this use."""
     use, seconds = arguments
     start = time.monotonic()
     simulated, problem = run(use, seconds)

@@ -3,7 +3,7 @@
     make benchmark        or        pip install '.[benchmark]' && python benchmarks/gravity_regressor.py [--json FILE]
 
 Pinocchio's model is the serial chain of the independent joints, without the linkage. Before the timing, the script
-checks that the torques of the serial chain are equal.
+checks that both libraries compute equal torques for this chain.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def main() -> None:
     reference = np.array([pinocchio.computeGeneralizedGravity(pin_model, pin_data, pose) for pose in q[:200]])
     ours = model.torque(q[:200], serial.base_values)
     rotor = plant.GetBodyByName("motor_4_link").default_mass() * np.linalg.norm(arm.gravity)
-    # Pinocchio's chain lacks the rotor on the platform. The torques may differ only by the weight of the rotor.
+    # Pinocchio's chain lacks the rotor on the platform. The torques may differ only by the torque of the rotor's
+    # weight.
     assert np.abs(ours - reference).max() < rotor * 0.7, np.abs(ours - reference).max()
 
     beta, out = model.gravity.base_values, np.empty(arm.num_joints)

@@ -3,8 +3,8 @@
     python benchmarks/guard_step.py [--other CHECKOUT]
 
 The reference is the time to encode and decode the command. With another checkout of this repository, e.g. of an older
-commit, both versions are measured alternately. Times are CPU times, and the minimum over many batches, since other
-processes can only increase them.
+commit, both versions are measured alternately. Times are CPU times. Each is the minimum over many batches, since other
+processes can only increase the time.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ print(1e6 * min(times), 1e6 * min(messages))
 
 
 def cost(checkout: Path, arm: str) -> tuple[float, float]:
-    """Returns the minimum times of a period and of encoding and decoding its command [us]."""
+    """Returns the minimum time of a period, and the minimum time to encode and decode a command [us]."""
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-c", WORKER, arm]
     output = subprocess.run(command, cwd=checkout, env=environment, check=True, capture_output=True).stdout

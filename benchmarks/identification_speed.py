@@ -26,10 +26,10 @@ import yaml
 HERE = Path(__file__).resolve().parents[1]
 RECORDINGS = {"mtm_one": "mtmr", "psm_one": "psm"}
 ARMS = ("mtml", "psm")
-#: Arguments of the command in this checkout and in the other one. Edit the latter if its options have other names.
+#: Arguments of the command in this and in the other checkout. Edit the latter if the other checkout has other options.
 IDENTIFY = ("identify", "{recording}", "--arm", "{arm}", "--coordinates", "actuator", "--output", "model.yaml")
 IDENTIFY_BASE = IDENTIFY
-#: Prints the formulas. The last line is the CPU time and the wall time of the derivation.
+#: Program that prints the formulas, and then the CPU time and the wall time of the derivation in the last line.
 DERIVE = """
 import sys, time
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
@@ -85,7 +85,7 @@ def identify(checkout: Path, command: Sequence[str], recording: Path, arm: str) 
 
 
 def _errors(model: dict) -> tuple[float, ...]:
-    """Returns the relative RMS errors of the actuators, each of the fit and cross-validated."""
+    """Returns two relative RMS errors of each actuator: of the fit, and cross-validated."""
     kinds = ("rms_fit", "rms_cross_validation")
     return tuple(a[kind] / a["rms_effort"] for a in model["dynamics"]["actuators"] for kind in kinds)
 

@@ -1,14 +1,14 @@
-"""Measures the time from `kill -9` of a controller until the guard of the simulated arm holds, over LCM.
+"""Measures the time from `kill -9` of a controller until the guard of the simulated arm holds the arm, over LCM.
 
     python benchmarks/kill_controller.py [--kills 10] [--realtime]
 
 The script starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold` as separate processes. It kills the
 controller after its efforts have acted for 0.3 s to 0.6 s. Then it starts a new controller with `run --reset` for the
-next kill. It does this on an otherwise idle computer, and with two busy processes.
+next kill. The script measures on an otherwise idle computer, and with two busy processes.
 
-The measurement starts just before the call that sends the signal. It ends at the time that the guard read from its
-clock in the step in which it decided to hold. All processes use the same monotonic clock. Therefore the result does not
-include the network or a measuring process.
+The measurement starts just before the call that sends the signal. It ends at the clock time of the step in which the
+guard changed to HOLD. All processes use the same monotonic clock. Therefore the result does not include delays of the
+network or of a measuring process.
 
 A busy computer may suspend the controller for longer than its command is valid. The watchdog then holds the arm before
 the kill. The script counts such an attempt and repeats it.

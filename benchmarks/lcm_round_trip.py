@@ -9,12 +9,12 @@ arms:
     simulated   arm of `dvrk-drake arm`, which receives a command after it has computed its next state
 
 The controllers are separate processes: `dvrk-drake run --mode hold`, and an echo, which only decodes a status and
-encodes a command. Each is measured on an otherwise idle computer, with `dvrk-drake view --live` and a client of its
-page, and with a busy process on every core. Each condition is measured without and with real-time scheduling
-(`--realtime`, with one core each for arm and controller).
+encodes a command. Each controller is measured under three conditions: on an otherwise idle computer, with `dvrk-drake
+view --live` and a client of its page, or with a busy process on every core. Each condition is measured without and with
+real-time scheduling (`--realtime`). With real-time scheduling, arm and controller have one core each.
 
-A period without a fresh command is one in which no answer to the last status arrived. The rows of the echo show how
-often the computer itself causes this.
+The column "no fresh command" is the number of periods in which no command for the last status arrived. The rows of the
+echo show how often the computer itself causes such periods.
 
 The benchmark requires a multicast route:
 
@@ -68,7 +68,7 @@ class Times:
         self.sent.append(time.monotonic())
 
     def store_answer(self, data: bytes, first: int) -> lcmt_dvrk_command:
-        """Decodes a command and stores the time if it answers the last status. `first` is the first sequence number."""
+        """Decodes a command; stores the time if it answers the last status. `first` is the first sequence number."""
         now, command = time.monotonic(), lcmt_dvrk_command.decode(data)
         if command.sequence == first + len(self.sent) - 1:
             self.answered.setdefault(len(self.sent) - 1, now)
@@ -266,7 +266,7 @@ def report(name: str, trips: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Prints the table. Its ratio is that of the median to the median of the echo."""
+    """Prints the table. The ratio in the table is the median divided by the median of the echo."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--seconds", type=float, default=60.0, help="duration of each measurement [s]; default: 60")
     parser.add_argument("--arm", choices=ARMS, help="measure only this arm")

@@ -6,7 +6,8 @@ The same work is timed without and with a key. Rows:
 
     arm         work of the arm: decode one command, pass it to the guard, encode one status
     controller  work of the controller: decode one status, encode one command
-    foreign     rejection of one message by the arm: of another session, or signed with another key
+    foreign     rejection of one message by the arm. Without a key, the message belongs to another session. With a key,
+                the message is signed with another key.
 
 No messages are sent.
 """

@@ -2,10 +2,11 @@
 
     python benchmarks/motion_coverage.py [--arms 16] [--noise 0.05] [--spread 0.15]
 
-Each arm has different links and rotors. They are those of the SDF, sheared and shifted by the share `spread` of their
-size, but inside their bounding boxes. At 0.15 the masses differ from those of the SDF by 30 % (1 sigma), which is the
-prior of `identify`. The drives have viscous, Coulomb and presliding friction. The motion has a period of 10 s and is
-recorded for 20 s at 200 Hz. The efforts have white noise, given as a share of their RMS. The script takes some minutes.
+Each arm has different links and rotors. The links are those of the SDF, randomly sheared and shifted by about the share
+`spread` of their size, inside their bounding boxes. At 0.15 the masses differ from those of the SDF by 30 % (1 sigma),
+as in the prior of `identify`. The drives have viscous, Coulomb and presliding friction. The motion has a period of
+10 s and is recorded for 20 s at 200 Hz. The efforts have white noise. Its standard deviation is the share `noise` of
+the RMS effort. The script takes several minutes.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def main() -> int:
         "--noise",
         type=float,
         default=0.05,
-        help="standard deviation of the noise, as a share of the efforts; default: %(default)s",
+        help="standard deviation of the noise, as a share of the RMS effort; default: %(default)s",
     )
     parser.add_argument(
         "--spread", type=float, default=0.15, help="size of the changes of the links, see above; default: %(default)s"

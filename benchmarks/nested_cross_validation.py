@@ -2,9 +2,9 @@
 
     python benchmarks/nested_cross_validation.py MOTION.csv --arm mtmr [--coordinates actuator]
 
-For each fold, the script removes the rows of two twelfths of the phases and of the neighbouring tenths of a second. It
-then selects the effects and estimates all parameters from the other rows. `identify` subtracts the sums of squares of
-the fold instead, and linearises the base tilt. Both results should be equal.
+For each fold, the script removes the rows of two twelfths of the period, and of the tenth of a second before and after
+them. It then selects the effects and estimates all parameters from the other rows. `identify` instead subtracts the
+sums of squares of the fold from those of all rows, and linearises the base tilt. Both errors should be equal.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python benchmarks/payload_coverage.py [--seeds 40]
 
-Each arm has different links, friction, springs and cables; see tests/support/loaded_arm.py for their sizes.
+Each arm has different links, friction, springs and cables. tests/support/loaded_arm.py defines their random changes.
 """
 
 from __future__ import annotations

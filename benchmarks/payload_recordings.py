@@ -5,8 +5,9 @@
 FOLDER contains psm_one.csv, psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in actuator
 coordinates, with a header and times (docs/public_recordings.md).
 
-The first table has the estimated payloads. The second one shows how the error depends on the duration of the recording
-to which friction is refitted. The third one compares refitting on the same phases of the motion and on other phases.
+The first table contains the estimated payloads. The second table shows how the model error depends on the duration of
+the recording to which friction is refitted. The third table compares the model errors after refitting to the same
+phases of the motion and to other phases.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def main() -> int:
         for name, link, mass, position in WEIGHTS:
             (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])
             _print_payload(arm, read(name), reference, name, payload, mass, np.array(position))
-    # Add the torque of an exactly known payload to the recording without payload of the other day.
+    # To the recording of the other day, which has no payload, add the torque of an exactly known payload.
     for reference, other in (("psm_one_no_weight", "psm_one"), ("psm_one", "psm_one_no_weight")):
         model = models[reference].dynamic_model
         for _, link, mass, position in WEIGHTS:
@@ -100,7 +101,7 @@ def _print_payload(
 
 
 def _print_seconds(model: IdentifiedModel, whole: Recording) -> None:
-    """Prints the errors on the last two thirds after refitting friction to the first seconds."""
+    """Prints the errors on the last two thirds of the recording after refitting friction to its first seconds."""
     evaluation = _rows(whole, slice(len(whole) // 3, None))
 
     def percent(which: IdentifiedModel) -> str:

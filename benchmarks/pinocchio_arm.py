@@ -20,7 +20,7 @@ JOINT_MODELS = {
 def build_pinocchio(arm: Arm, plant: MultibodyPlant, joint_names: Sequence[str]) -> pinocchio.Model:
     """Returns a Pinocchio model of the links that these joints move.
 
-    The frame of each link is at its joint and parallel to the base frame.
+    The frame of each link is at its joint. In the zero pose, it is parallel to the base frame.
     """
     context = plant.CreateDefaultContext()
     model = pinocchio.Model()

@@ -1,4 +1,4 @@
-"""Compares the computing times of the PSM with closed loops and of its open tree in simulation.
+"""Compares the computing times of simulations of the PSM: with closed loops, and as an open tree.
 
     python benchmarks/psm_simulation.py [--json FILE] [--repetitions N] [--seconds S]
 
@@ -12,15 +12,15 @@ Rows:
     ball         ArmStation with both loops closed by ball constraints; SAP with a time step of 1 ms.
     mimic        ArmStation as a tree with coupled joints; SAP with a time step of 1 ms.
     cenic_mimic  Continuous plant with coupled joints and Drake's error-controlled integrator CENIC, accuracy 1e-4.
-                 The samples of the controller limit its steps to 1 ms.
-    cenic_ball   The same with ball constraints.
+                 The samples of the controller limit the integration steps to 1 ms.
+    cenic_ball   As cenic_mimic, but with ball constraints.
     fixed_mimic  Row cenic_mimic with fixed steps of 1 ms, without error control.
     fixed_ball   Row cenic_ball with fixed steps of 1 ms, without error control.
-    free_mimic   CENIC with coupled joints and without controller, while the arm falls. It shows the steps that CENIC
-                 selects.
+    free_mimic   CENIC with coupled joints and without controller, while the arm falls. The row shows the step size
+                 that CENIC selects.
 
 Columns:
-    closure        largest distance between the two halves of a cut pin, at 50 times of the motion
+    closure        largest distance between the two frames of a loop closure, at 50 times of the motion
     remote centre  largest distance of the end link's remote centre from its nominal position, at the same times
 
 The script omits rows that the installed version of Drake cannot run, and prints the reason. CENIC supports ball
@@ -108,7 +108,7 @@ class StationRow:
         self.simulator = Simulator(self.diagram)
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
-        """Sets the arm to q (n,), at rest."""
+        """Sets the arm to the pose q (n,) with zero velocities."""
         self.station.SetPositions(self.station.GetMyMutableContextFromRoot(root), q)
 
     def get_positions(self, root: Context) -> np.ndarray:
@@ -150,7 +150,7 @@ class CenicRow:
             integrator.set_fixed_step_mode(True)
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
-        """Sets the arm to q (n,), at rest."""
+        """Sets the arm to the pose q (n,) with zero velocities."""
         set_arm_positions(self.plant, self.plant.GetMyMutableContextFromRoot(root), ARM, q)
 
     def get_positions(self, root: Context) -> np.ndarray:
@@ -168,7 +168,7 @@ def add_control(builder: DiagramBuilder, trajectory: PiecewisePolynomial, state,
 
 
 def restart(row: StationRow | CenicRow, q: np.ndarray) -> None:
-    """Sets the arm to q, at rest, and the time to 0."""
+    """Sets the arm to the pose q with zero velocities, and the time to 0."""
     root = row.simulator.get_mutable_context()
     root.SetTime(0.0)
     row.diagram.SetDefaultContext(root)
@@ -187,7 +187,7 @@ def steps_per_second(row: StationRow | CenicRow, start: np.ndarray, seconds: flo
 
 
 def closure_errors(row: StationRow | CenicRow, seconds: float) -> tuple[float, float]:
-    """Returns the largest distances between the halves of a pin, and of the remote centre from the origin [m]."""
+    """Returns the largest distances between loop closure frames, and of the remote centre from the origin [m]."""
     plant, root = row.plant, row.simulator.get_context()
     pins, centre = 0.0, 0.0
     for time in np.linspace(0.0, seconds, 51)[1:]:
@@ -207,7 +207,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", help="write the results to this file")
     parser.add_argument("--repetitions", type=int, default=11, help="number of repetitions; default: %(default)s")
-    parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of one repetition")
+    parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of one repetition [s]")
     arguments = parser.parse_args()
     trajectory = motion(arguments.seconds)
     start, end = (trajectory.value(time)[:, 0] for time in (0.0, arguments.seconds))

@@ -3,8 +3,9 @@
     python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort position hold] [--processes 2]
 
 Each fault of tests/support/faulty_arm.py is simulated for each joint of an arm with all effects of its file. The joints
-move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or are at rest. Each fault begins at three times of
-two motions. The table has the largest values. Its columns are:
+move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or are at rest. A moving arm has three trials per
+fault, with different start times of the fault and two motions. The table contains the largest values over the trials.
+Its columns are:
 
     found       trials in which the guard detected the fault, and all trials
     ms          largest time from the fault to its detection [ms]
@@ -35,7 +36,7 @@ TRIALS = ((2.6, 0), (3.2, 1), (3.8, 0))
 
 
 class Trial:
-    """Simulated arm at the time before a fault."""
+    """Simulated arm at the start of a fault."""
 
     def __init__(self, name, use, begin, seed):
         self.begin, self.arm = begin, FaultyArm(name, use, seed=seed)
@@ -43,7 +44,7 @@ class Trial:
             self.arm.step()
 
     def outcome(self, task):
-        """Returns the outcome of one (fault, joint). Call this in a forked process, since it changes the arm."""
+        """Returns the outcome of a task (fault, joint). Call this in a forked process, since it changes the arm."""
         return self.arm.fail(*task, self.begin)
 
 

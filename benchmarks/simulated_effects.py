@@ -6,7 +6,7 @@ All rows simulate the same ArmStation at 1 kHz. A GravityPidController in mode "
 cubic trajectory, so that friction sticks and slips. Rows:
 
     ideal               arm without effects
-    none                computation of effects without any effect
+    none                arm with an empty set of effects, but with the system that computes effects
     friction, ...       one effect of the arm's file
     N cables stretch    elastic cables at N actuators; the files of the arms do not contain elastic cables
     all                 all effects of the arm's file, without and with the elastic cables
@@ -14,7 +14,7 @@ cubic trajectory, so that friction sticks and slips. Rows:
 The repetitions of the rows alternate, so that other processes slow all rows equally. Times are CPU times of this
 process, minima over the repetitions. The real-time factor is simulated time divided by CPU time.
 
-The result depends on the memory allocator. To select a faster one, see docs/simulated_effects.md.
+The result depends on the memory allocator. To select a faster allocator, see docs/simulated_effects.md.
 """
 
 from __future__ import annotations

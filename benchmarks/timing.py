@@ -24,9 +24,9 @@ def measured_times(
     Args:
         functions: Functions by name.
         repetitions: Number of measured calls of each function.
-        prepare: Function called with the name before each call. Its time is not included.
-        clock: Clock [s]. Default: CPU time of this process. `time.perf_counter` has a lower overhead and suits
-            functions that take some microseconds.
+        prepare: Function called with the name before each call. The time of `prepare` is not included.
+        clock: Clock [s]. Default: CPU time of this process. `time.perf_counter` has a lower overhead, so it is better
+            for functions that take a few microseconds.
 
     Returns:
         Times (repetitions,) of each function [s], by name.

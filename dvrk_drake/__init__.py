@@ -1,7 +1,7 @@
 """Models, identification, gravity compensation and simulation of da Vinci Research Kit arms with Drake.
 
-The public API is `import dvrk_drake as dvrk`, then `dvrk.load_arm`, `dvrk.identify` and the other names in `__all__`.
-A module is imported when one of its names is first used, because importing drake and numba takes seconds.
+The public API consists of the names in `__all__`, such as `load_arm` and `identify`. Each module is imported when one
+of its names is first used, because importing drake and numba takes seconds.
 """
 
 from __future__ import annotations

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 
 class DvrkDrakeError(Exception):
-    """Base class of all errors that this package raises deliberately; the command line exits with code 2.
+    """Base class of all errors that this package raises deliberately.
+
+    For these errors, the command line exits with code 2.
 
     Attributes:
-        findings: Findings of `check` in the recording that caused the error; `str` of each is one line.
+        findings: Findings of `check` for the recording that caused the error. `str(finding)` is a text of one line.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -38,7 +40,7 @@ class IdentificationError(DvrkDrakeError):
 
 
 class ControllerError(DvrkDrakeError):
-    """Error for gains, limits or a period that a controller cannot use."""
+    """Error for settings that a controller cannot use, or for an arm that it cannot control."""
 
 
 class KeyFileError(DvrkDrakeError):

@@ -1,6 +1,8 @@
 """Identifies a real right master arm from a recording, like `dvrk-drake identify`.
 
-python real_recording.py FILE.csv [MODEL.yaml]: writes the model only if MODEL.yaml is given.
+python real_recording.py FILE.csv [MODEL.yaml]
+
+The script writes the model only if MODEL.yaml is given.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Simulates teleoperation: a hand moves a master arm with gravity compensation, and a PSM follows at scale 1/3."""
+"""Simulates teleoperation: a hand moves a master arm with gravity compensation, and a PSM follows at a scale of 1/3."""
 
 import sys
 

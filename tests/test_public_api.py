@@ -131,7 +131,7 @@ def test_verdicts_are_stored_and_not_replaced_by_default(poses, tmp_path):
     dvrk.validate(model, recording).save(tmp_path / "model.yaml")
     stored = dvrk.IdentifiedModel.load(tmp_path / "model.yaml")
     assert stored.validation.verdicts == dvrk.validate(model, recording).verdicts
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"has verdicts from poses\.csv already"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"already has verdicts from poses\.csv"):
         dvrk.validate(stored, recording).save(tmp_path / "model.yaml")
 
 

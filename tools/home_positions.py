@@ -14,7 +14,8 @@ def home_positions(sdf: Path) -> dict[str, tuple[float, float, float]]:
     origins: dict[str, tuple[float, float, float]] = {}
     for part in (*model.findall("link"), *model.findall("frame")):
         x, y, z = (1000 * float(number) for number in part.findtext("pose", "0 0 0").split()[:3])
-        # Frames on links of other files (of an instrument on the arm) are not used, so they remain relative.
+        # Frames on links of other files, e.g. of the instrument, are not needed. Their positions remain relative to the
+        # link.
         base = origins.get(part.get("attached_to", ""), (0.0, 0.0, 0.0))
         origins[part.get("name", "")] = (base[0] + x, base[1] + y, base[2] + z)
     return origins

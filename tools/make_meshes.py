@@ -11,7 +11,7 @@ from shapes import Body, write_gltf
 
 SDF_FOLDER = Path(__file__).parents[1] / "dvrk_drake/models/sdf"
 
-# By name of the model, which is also the name of its SDF and its folder of meshes: functions that make its bodies.
+# Functions that make the bodies of a model, by the name of the model. Its SDF and its mesh folder have the same name.
 MODELS: dict[str, Callable[[Path], dict[str, Callable[[], Body]]]] = {
     "mtm": mtm_shapes.bodies,
     "psm": psm_shapes.bodies,

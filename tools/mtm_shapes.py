@@ -1,11 +1,12 @@
 """Shapes of the links of the MTM.
 
 All numbers are millimetres in the link frame: +X to the operator's left, +Y toward the operator, +Z up. The lengths
-between joints are read from mtm.sdf. Linkage and arm lie in parallel planes. Their ranges along x are:
+between joints are read from mtm.sdf. The links lie in parallel planes. The ranges of their parts along x are:
 
     -56 yoke | -34 pulleys, cables -27 | -25 arm 25 | 28 crank 37 | 39 coupler 47 | 56 yoke
 
-The brackets of the wrist lie in shells around the wrist centre, so that they do not collide. Their radii are:
+The brackets of the wrist lie in spherical shells around the wrist centre, so that they do not collide. The radii of the
+shells are:
 
     handle < 56 | yaw 56..72 | pitch 72..104 | platform > 105
 """
@@ -32,7 +33,7 @@ class Lengths:
 
     @classmethod
     def read(cls, sdf: Path) -> "Lengths":
-        """Reads the lengths from the poses of the links in the home pose, which have no rotation."""
+        """Reads the lengths from the positions of the links in the home pose, in which the links are not rotated."""
         where = home_positions(sdf)
         platform, wrist = where["platform_link"], where["wrist_pitch_link"]
         return cls(-where["forearm_link"][2], -platform[1], wrist[2] - platform[2], -where["coupler_link"][1])
@@ -147,7 +148,7 @@ def arc(centre: cad.Vector, *points: tuple[float, float, float]) -> cad.Edge:
 
 
 def platform_link(lengths: Lengths) -> Body:
-    """Returns the hub at the end of the forearm, and the curved bracket from it up to the pitch axis."""
+    """Returns the hub at the end of the forearm, and the curved bracket from the hub up to the pitch axis."""
     rise, radius = lengths.rise, 114.0
     half = radius / 2**0.5
     wrist = cad.Vector(0, 0, rise)

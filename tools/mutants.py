@@ -1,8 +1,8 @@
 """Mutation testing: changes one operator, constant or statement at a time and lists the changes that no test detects.
 
-Each mutant is tested in a fork of a process that has imported Drake and numpy. The tests that last detected a mutant
-run first, then the fastest tests. Tests marked slow do not run. Modules that numba compiles are refused, since numba
-would use the unchanged functions from its cache.
+Each mutant is tested in a fork of a process that has imported Drake and numpy. Tests that recently detected a mutant
+run first, then the fastest tests. Tests marked slow do not run. The script refuses modules that numba compiles, since
+numba would use the unchanged functions from its cache.
 """
 
 import ast
@@ -111,9 +111,10 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
 
 class _Tests:
-    """Runs tests in a forked process that imports a mutant instead of its module. The object is also a pytest plugin.
+    """Runs tests in a forked process that imports a mutant instead of the module.
 
-    `shared` contains the sort key of each test. Its key "" contains the CPU time of the process and its modules.
+    The object is also a pytest plugin. `shared` contains the sort key of each test. The value of its key "" is the CPU
+    time of the process and the names of the imported modules.
     """
 
     def __init__(self, tests: list[str], shared: Any, limit: float, mutant: Mutant | None = None) -> None:

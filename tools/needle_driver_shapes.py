@@ -1,7 +1,8 @@
 """Shapes of the large needle driver.
 
-All numbers are millimetres. The housing is on the carriage of the arm, in the frame of the carriage (the base frame in
-the home pose). Each other body is in its link frame. Parts of the wrist lie side by side along their axis of rotation:
+All numbers are millimetres. The housing is fixed to the carriage of the arm. Its coordinates are in the frame of the
+carriage, which coincides with the base frame in the home pose. The coordinates of each other body are in the frame of
+its link. Parts of the wrist lie side by side along their axis of rotation:
 
     pitch axis (x): 0 pitch link 2.4 | 2.6 ears of the shaft
     yaw axis (y):   0 fingers 2.3    | 2.6 ears of the pitch link

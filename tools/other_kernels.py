@@ -1,8 +1,9 @@
-"""Runs a command with the numerical kernels of another CPU, since OpenBLAS, numpy and numba round differently on it.
+"""Runs a command with the numerical kernels of another CPU, with which OpenBLAS, numpy and numba round differently.
 
     python tools/other_kernels.py make test-fast
 
-A CPU with AVX-512 runs the kernels of a CPU without it. Any other CPU runs the kernels of a CPU without AVX.
+On a CPU with AVX-512, the command uses the kernels for a CPU without AVX-512. On any other CPU, it uses the kernels for
+a CPU without AVX.
 """
 
 import os

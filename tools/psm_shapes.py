@@ -1,14 +1,15 @@
 """Shapes of the links of the PSM.
 
-All numbers are millimetres in the base frame in the home pose. Its origin is the remote centre of motion (RCM), +Z is
-up, and the arm lies toward -Y. Each body is then moved into its link frame. The pivots are read from psm.sdf. Links lie
-in parallel planes, symmetric about x = 0, so that they do not collide. Their ranges along x are:
+All numbers are millimetres in the base frame in the home pose. The origin of this frame is the remote centre of motion
+(RCM), +Z is up, and the arm lies toward -Y. Each body is then moved into its link frame. The pivots are read from
+psm.sdf. Links lie in parallel planes, symmetric about x = 0, so that they do not collide. The ranges of their parts
+along x are:
 
     0 bars 13 | 15 front crank 20 | 22 back crank 30 | 32 counterweight 43 | 45 yaw fork 57 | motors
               | 15 end link 25    | 27 carriage 34
 
-The bars move between the flanges of the end link, a channel that is open at the back. Behind the back crank the fork is
-empty up to 200 mm from the pivot A, which is the reach of the crank and the counterweight.
+The end link is a channel that is open at the back, and the bars move between its flanges. Behind the back crank, the
+yaw fork is empty up to 200 mm from the pivot of the crank. The back crank and the counterweight reach that far.
 """
 
 from collections.abc import Callable

@@ -24,12 +24,12 @@ CHROMIUM_FLAGS = (
     "--hide-scrollbars",
     "--virtual-time-budget=8000",
 )
-# Drake's page has a control panel that no option hides.
+# Meshcat's page has a control panel that no option hides.
 HIDE_PANEL = "<style>.dg, #status-message, #stats-plot { display: none !important; }</style>"
 
 
 def write_picture(html: str, file: Path, width: int, height: int, chromium: str) -> None:
-    """Draws a page written by `Meshcat.StaticHtml` with Chromium."""
+    """Draws the page `html` from `Meshcat.StaticHtml` with Chromium; writes the picture to `file`."""
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "scene.html"
         page.write_text(html.replace("</head>", HIDE_PANEL + "</head>", 1))

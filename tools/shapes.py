@@ -59,7 +59,7 @@ def plate(axis: str, low: float, high: float, circles: Sequence[Circle], edge: f
 
 
 def swept(path: cad.Edge | cad.Wire, outward: Point, *sections: tuple[float, float, float]) -> cad.Part:
-    """Returns the sweep of rounded rectangles along a path. `outward` is the thickness direction at the start.
+    """Returns the sweep of rounded rectangles along a path. `outward` is the direction of the thickness at the start.
 
     Each section consists of width, thickness and corner radius. Sections are evenly spaced on the path.
     """
@@ -93,14 +93,14 @@ def bolts(
     at: Sequence[float] = (0, 0),
     phase: float = 0.5,
 ) -> list[cad.Part]:
-    """Returns screw heads on a circle. `phase` is the position of the first one as a share of the spacing."""
+    """Returns screw heads on a circle. `phase` is the position of the first screw as a share of the spacing."""
     angles = [2 * pi * (index + phase) / count for index in range(count)]
     places = [(at[0] + circle * cos(angle), at[1] + circle * sin(angle)) for angle in angles]
     return [disc(axis, low, high, radius, place) for place in places]
 
 
 def both(make: Callable[[float], Sequence[cad.Shape] | cad.Shape]) -> list[cad.Shape]:
-    """Returns the result of `make` for either side, +1 and -1, of the plane x = 0."""
+    """Returns the results of `make` for both sides of the plane x = 0, +1 and -1."""
     made = [make(side) for side in (1.0, -1.0)]
     return [part for one in made for part in (one if isinstance(one, list) else [one])]
 
@@ -120,7 +120,8 @@ def fused(material: str, *solids: cad.Shape) -> Body:
     """Returns the union of the solids in one material.
 
     Raises:
-        ValueError: The CAD kernel lost a solid. It does so silently if faces almost coincide. Move them apart.
+        ValueError: The CAD kernel lost a solid. The kernel loses solids without an error if faces almost coincide. Move
+            the faces apart.
     """
     union = solids[0].fuse(*solids[1:])
     bounds, expected = union.bounding_box(), cad.Compound(children=list(solids)).bounding_box()

@@ -29,24 +29,26 @@ def identify(
 ) -> StaticIdentification | DynamicIdentification:
     """Checks a recording and identifies the arm's model from it, as `dvrk-drake identify` does.
 
-    A recording of poses gives a static model with gravity, cables and springs. A motion with enough static poses also
-    gives a static model. Any other motion gives the full dynamics: physically consistent inertial parameters, rotors
-    and friction.
+    A recording of poses, or a motion with enough static poses, gives a static model with gravity, cables, springs and
+    offsets. Any other motion gives a dynamic model with physically consistent inertial parameters, rotor inertias and
+    friction. If `low_speed_segments` is True, such a motion gives a static model instead.
 
     Args:
         recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.
         arm: Arm that was recorded, with the gravity direction of its mounting, see `Arm.with_gravity`.
         method: Method for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
-        low_speed_segments: True to treat the low-speed segments of a motion without static poses as poses.
-        progress: Callback that receives the step, "checking the recording" or "identifying", and its finished share,
-            0 to 1.
+        low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
+            poses.
+        progress: Callback that receives the name of the step ("checking the recording" or "identifying") and the
+            finished share of the step (0 to 1).
 
     Returns:
         Result with the model as `model`, the recording used for the fit as `recording`, and `warnings`. The method
         `save` of the result writes the model file.
 
     Raises:
-        RecordingError: The recording does not fit the arm, or `check` rejects it, see `findings` of the error.
+        RecordingError: The recording does not fit the arm, or `check` rejects the recording. The attribute `findings`
+            of the error contains the reasons.
         IdentificationError: The recording does not determine a model.
 
     Example:
@@ -89,7 +91,7 @@ def _friction_in_segments(result: StaticIdentification, measured: NDArray[np.boo
         return ()
     what = (
         "friction in low-speed segments is not separated from gravity, so the torque of "
-        f"{', '.join(commanded)} may be worse than zero torque at other poses"
+        f"{', '.join(commanded)} may be less accurate than zero torque at other poses"
     )
     advice = "Cross-validation does not detect this error. Validate the model on static poses before you use it."
     return (Finding("warning", "low-speed segments", result.recording.source or "recording", what, advice),)

@@ -28,30 +28,35 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Number of folds for cross-validation. A motion that repeats is divided by its phase.
 FOLDS = 4
-#: Prior standard deviations: of a friction scale about 1, and of an offset as a share of the RMS effort.
+#: Prior standard deviation of a friction factor (prior mean 1), and prior standard deviation of the change of an offset
+#: as a share of the RMS effort (prior mean 0).
 SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
-#: Assumed relative error of the efforts.
+#: Assumed RMS residual of the fit, as a share of the RMS effort.
 _RELATIVE_ERROR = 0.1
-#: Time over which errors are correlated, because they are model errors [s].
+#: Assumed correlation time of the residuals [s]. Residuals are correlated because they are mainly model errors.
 _CORRELATION_TIME = 0.1
-#: Smallest share of the time in which an actuator must move in each direction.
+#: Smallest share of the time that an actuator must move in each direction. Otherwise, its friction is not fitted.
 MIN_SHARE = 0.1
-#: Largest accepted mean relative error after the refit.
+#: Largest accepted relative error after the refit, as the mean over the actuators.
 MAX_ERROR = 0.7
 
 
 @dataclass(frozen=True)
 class RecalibratedActuator:
-    """Recalibration of one actuator. Errors are |tau_f - tau_hat| / |tau_f|.
+    """Recalibration of one actuator.
+
+    A relative error is |tau_f - tau_hat| / |tau_f|, where tau_f is the low-pass filtered measured effort and tau_hat is
+    the predicted effort after the same filter.
 
     Attributes:
         name: Name of the joint of the actuator.
         before: Relative error of the model before recalibration [1].
         after: Cross-validated relative error after refitting friction and offset [1].
         kept: True if the new model has the refitted friction and offset.
-        reason: Reason why they are not in the new model, or "".
-        dry: Factor by which the dry friction of the actuator changes [1], None if the model has none.
-        viscous: Factor by which the viscous friction of the actuator changes [1], None if the model has none.
+        reason: Reason why the new model has the earlier friction and offset, "" if `kept` is True.
+        dry: Factor by which the dry friction of the actuator changes [1], None if the model has no such friction.
+        viscous: Factor by which the viscous friction of the actuator changes [1], None if the model has no such
+            friction.
         offset: Change of the offset [N m, N].
     """
 
@@ -71,8 +76,9 @@ class Recalibration(ModelResult):
 
     Attributes:
         actuators: Recalibration of the actuators, in the arm's order.
-        shared: Factors of the friction at coordinates that several actuators move, for example "finger_1 dry" [1].
-        seconds: Duration of the motion, without one second at each end [s].
+        shared: Factors by which the friction changes at coordinates that several actuators move, for example "finger_1
+            dry" [1].
+        seconds: Duration of the motion without the first and the last second [s].
     """
 
     actuators: list[RecalibratedActuator]
@@ -83,21 +89,23 @@ class Recalibration(ModelResult):
 def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Recalibration:
     """Checks a short motion and refits a model's friction and offsets to it, as `dvrk-drake recalibrate` does.
 
-    The error decreases for similar motions. For other positions and speeds, the improvement can be much smaller.
+    The model error decreases for motions similar to the recording. For other positions and speeds, the model error can
+    decrease much less.
 
     Args:
         model: Model identified from a motion.
-        recording: Motion with efforts (m, n) from another day, in joint or actuator coordinates.
-        progress: Callback that receives the step, "checking the recording" or "refitting friction", and its finished
-            share, 0 to 1.
+        recording: Motion with efforts (m, n), recorded after the motion of the identification, in joint or actuator
+            coordinates.
+        progress: Callback that receives the name of the step ("checking the recording" or "refitting friction") and the
+            finished share of the step (0 to 1).
 
     Returns:
-        Result with the new model as `model`, the errors of each actuator before and after as `actuators`, and
+        Result with the new model as `model`, the errors of each actuator before and after the refit as `actuators`, and
         `warnings`.
 
     Raises:
-        RecordingError: `check` rejects the recording, the model error remains too large, or no actuator moves in both
-            directions.
+        RecordingError: `check` rejects the recording, efforts have the wrong sign, the model error remains too large,
+            or no actuator moves in both directions.
         ModelError: The model has no dynamics.
 
     Example:
@@ -123,15 +131,15 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
 
 
 def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
-    """Fits a factor of the dry and of the viscous friction of every coordinate, and an offset of every actuator.
+    """Fits factors of dry and viscous friction for every coordinate, and a change of the offset for every actuator.
 
     Rigid bodies, springs and cables do not change. The errors are cross-validated over `FOLDS` folds of the motion. If
-    the error of an actuator does not decrease, its offset, its friction, and friction that it shares with other
-    actuators keep their values. The remaining terms are fitted again, finally to the whole recording.
+    the error of an actuator does not decrease, the offset of this actuator and the friction at all of its coordinates
+    keep their values. The remaining factors and offsets are fitted again. The last fit uses the whole recording.
 
     Raises:
-        RecordingError: The recording is not a motion of this arm, efforts have the wrong sign, or no actuator moves in
-            both directions.
+        RecordingError: The recording is not a motion of this arm, efforts have the wrong sign, no actuator moves in
+            both directions, or the model error remains too large.
         ModelError: The model has no dynamics.
     """
     fit = _Fit(model.dynamic_model, recording)
@@ -150,9 +158,9 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
         after = fit.cross_validated_error(free)
     if not np.mean(np.minimum(before, after)) < MAX_ERROR:
         raise RecordingError(
-            f"{recording.source or 'recording'}: the mean relative error of the model is {100 * np.mean(after):.0f} % "
-            f"with fitted friction ({100 * np.mean(before):.0f} % before); at most {100 * MAX_ERROR:.0f} % is allowed. "
-            "Check the arm and the coordinates of the recording."
+            f"{recording.source or 'recording'}: the mean relative error over the actuators is "
+            f"{100 * np.mean(after):.0f} % with fitted friction ({100 * np.mean(before):.0f} % before); at most "
+            f"{100 * MAX_ERROR:.0f} % is allowed. Check the arm and the coordinates of the recording."
         )
     x = fit.solve(free, np.ones(len(fit.tau), dtype=bool))
     actuators = []
@@ -187,10 +195,10 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
 def cross_validated_errors(
     model: IdentifiedModel, recording: Recording, folds: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the relative errors (n,) of the model, and the cross-validated errors (n,) after refitting its friction.
+    """Returns the relative errors (n,) of the model, and the cross-validated errors (n,) after a refit of friction.
 
-    A periodic motion is divided by its phase, so that no fold is predicted from its own repetition. All actuators that
-    move in both directions are refitted.
+    The folds of a periodic motion are intervals of its phase, so that the fit for a fold does not use repetitions of
+    this fold. The friction and offsets of all actuators that move in both directions are refitted.
 
     Raises:
         RecordingError: The recording is not a motion of this arm.
@@ -201,7 +209,7 @@ def cross_validated_errors(
 
 
 class _Fit:
-    """Least-squares fit of x = (friction factors, offsets), with priors about the values of the model."""
+    """Least-squares fit of x = (friction factors, changes of offsets), with the values of the model as prior means."""
 
     def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
         grid = motion_grid(recording, model.arm, model.section.signals)
@@ -225,7 +233,10 @@ class _Fit:
         return self._relative(np.sum(self._residuals(x) ** 2, axis=0))
 
     def cross_validated_error(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Returns the relative errors (n,) on held-out folds. Rows next to a held-out fold are not used for its fit."""
+        """Returns the relative errors (n,) on held-out folds.
+
+        The fit that predicts a fold does not use the rows next to this fold.
+        """
         squares = np.zeros(len(self.names))
         for fold in range(self._folds):
             held_out = self._fold == fold
@@ -244,11 +255,11 @@ class _Fit:
         return np.asarray(np.sqrt(squares / np.maximum(size, np.finfo(float).tiny)))
 
     def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Returns x (k + n,) for some rows of the motion.
+        """Returns x (k + n,), fitted to some rows of the motion.
 
         Args:
-            free: Mask (n,) of the actuators whose friction and offset are fitted. Friction that is shared with another
-                actuator is not fitted.
+            free: Mask (n,) of the actuators whose friction and offset are fitted. The friction at a coordinate is
+                fitted only if all actuators that move the coordinate are in the mask.
             rows: Mask (r,) of the rows.
         """
         k, n = len(self.keys), len(self.names)
@@ -270,12 +281,12 @@ class _Fit:
         return x
 
     def scale(self, x: NDArray[np.float64], coordinate: str, part: FrictionPart) -> float | None:
-        """Returns the factor of one part of the friction of a coordinate, None if the model has no such friction."""
+        """Returns the factor of the dry or viscous friction of a coordinate, None if the model has no such friction."""
         return float(x[self.keys.index((coordinate, part))]) if (coordinate, part) in self.keys else None
 
 
 def _moves_in_both_directions(model: DynamicModel, grid: MotionGrid) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the actuators that move in both directions, by `MIN_SHARE` and `REST_SPEED`."""
+    """Returns a mask (n,) of the actuators that move in both directions (limits: `MIN_SHARE` and `REST_SPEED`)."""
     v = model.arm.transmission.velocity(grid.v)
     share = np.minimum(np.mean(v > 0, axis=0), np.mean(v < 0, axis=0))
     speed = np.sqrt(np.mean(v**2, axis=0))
@@ -283,7 +294,7 @@ def _moves_in_both_directions(model: DynamicModel, grid: MotionGrid) -> NDArray[
 
 
 def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64]) -> DynamicSection:
-    """Returns the dynamic section with the refitted friction and offsets x (k + n,)."""
+    """Returns the section of the model with the refitted friction and offsets x (k + n,)."""
     scales = dict(zip(fit.keys, x[: len(fit.keys)], strict=True))
     offsets = {f"actuator.{name}": float(c) for name, c in zip(fit.names, x[len(fit.keys) :], strict=True) if c}
     effects = []

@@ -22,8 +22,9 @@ class ModelResult:
     """Model with warnings.
 
     Attributes:
-        model: New model.
-        warnings: Findings that make the model less reliable, about the recording or the fit; `str` of each is one line.
+        model: Identified or recalibrated model.
+        warnings: Findings about the recording or the fit that make the model less reliable. `str` of a finding is one
+            line.
     """
 
     model: IdentifiedModel
@@ -40,7 +41,7 @@ class ModelResult:
             overwrite: True to replace an existing file.
 
         Raises:
-            DvrkDrakeError: The file exists, or cannot be written.
+            DvrkDrakeError: The file exists and `overwrite` is False, or the file cannot be written.
         """
         refuse_existing(path, overwrite)
         self.model.save(path)
@@ -52,8 +53,9 @@ class Identification(ModelResult):
 
     Attributes:
         recording: Recording used for the fit: distinct poses in joint coordinates, or the motion as recorded.
-        note: Note on how poses were extracted from a motion, or "".
-        num_rows: Number of rows of the recording, or of poses extracted from it, before repeated poses are averaged.
+        note: Note on how poses were extracted from a motion, "" if no poses were extracted.
+        num_rows: Number of rows of the recording, or number of poses extracted from a motion, before repeated poses are
+            averaged.
     """
 
     recording: Recording
@@ -68,8 +70,8 @@ class Validation(ABC):
     Attributes:
         model: Model that was validated.
         recording: Recording used for the comparison: poses, or the motion as recorded.
-        warnings: Findings about the recording or the comparison; `str` of each is one line.
-        note: Note on how poses were extracted from a motion, or "".
+        warnings: Findings about the recording or the comparison. `str` of a finding is one line.
+        note: Note on how poses were extracted from a motion, "" if no poses were extracted.
     """
 
     model: IdentifiedModel
@@ -85,11 +87,11 @@ class Validation(ABC):
     @property
     @abstractmethod
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each joint without excluded measurements [1]; None if nothing was measured."""
+        """RMS error / RMS effort of each joint without excluded measurements [1], None if the effort is 0."""
 
     @property
     def verdict(self) -> Verdict:
-        """Least favourable of the verdicts."""
+        """Least favourable verdict of all joints."""
         return worst(self.verdicts)[0]
 
     def __repr__(self) -> str:
@@ -98,27 +100,28 @@ class Validation(ABC):
 
     @abstractmethod
     def as_dict(self) -> dict:
-        """Returns the data of `validate --json`."""
+        """Returns the output of `validate --json` as a dictionary."""
 
     def unfit(self, required: Requirement) -> list[str]:
-        """Returns the joints whose verdict is worse than `required`, each with its verdict."""
+        """Returns the joints whose verdict is worse than `required`, each as "name (verdict)"."""
         return unfit(self.verdicts, required)
 
     @property
     def of_same_recording(self) -> bool:
-        """True if the model was identified from this recording, so that the errors are errors of the fit."""
+        """True if the model was identified from this recording. The errors are then errors of the fit."""
         return bool(self.recording.sha256) and self.recording.sha256 == self.model.provenance.sha256
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the model with these verdicts. `dvrk-drake run` prints a warning for a model without verdicts.
+        """Writes the model with the verdicts. `dvrk-drake run` prints a warning for a model without verdicts.
 
         Args:
             path: File of the model, or a new file.
-            overwrite: True to replace verdicts from another recording, or another file.
+            overwrite: True to replace the verdicts of an earlier validation, or an existing file with another model.
 
         Raises:
-            ModelError: The model was identified from this recording, or already has verdicts.
-            DvrkDrakeError: The file exists and contains another model.
+            ModelError: The model was identified from this recording, or the model already has verdicts and `overwrite`
+                is False.
+            DvrkDrakeError: The file exists and contains another model, and `overwrite` is False.
         """
         source = self.recording.source or "recording"
         if self.of_same_recording:
@@ -127,7 +130,9 @@ class Validation(ABC):
             )
         if self.model.validation is not None and not overwrite:
             saved = self.model.validation.recording
-            raise ModelError(f"{path} has verdicts from {saved} already. Replace them with overwrite=True.")
+            raise ModelError(
+                f"{path}: the model already has verdicts from {saved}. Set overwrite=True to replace these verdicts."
+            )
         if not self._is_own_file(path):
             refuse_existing(path, overwrite)
         summary = ValidationSummary(self.recording.source, self.recording.sha256, dict(self.verdicts))
@@ -147,7 +152,7 @@ class Prediction:
 
     Attributes:
         tau: Predicted efforts (m, n), in the coordinates of the recording [N m; N].
-        warnings: Findings of `check`; `str` of each is one line.
+        warnings: Findings of `check`. `str` of a finding is one line.
     """
 
     tau: NDArray[np.float64]

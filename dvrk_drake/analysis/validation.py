@@ -1,4 +1,4 @@
-"""Validates a model on a recording that it was not identified from, and predicts efforts."""
+"""Validates a model on a recording that was not used for the identification, and predicts efforts."""
 
 from __future__ import annotations
 
@@ -21,23 +21,25 @@ from dvrk_drake.recordings.recording import Recording
 def validate(
     model: IdentifiedModel, recording: Recording, *, low_speed_segments: bool = False, progress: Progress | None = None
 ) -> StaticValidation | DynamicValidation:
-    """Compares a model's efforts with those of a recording, as `dvrk-drake validate` does.
+    """Compares a model's efforts with the efforts of a recording, as `dvrk-drake validate` does.
 
     For a motion and a model with dynamics, efforts are compared after the low-pass filter of the identification.
     Otherwise, holding torques are compared.
 
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
-        recording: Poses or a motion with efforts (m, n) that the model was not identified from.
-        low_speed_segments: True to treat the low-speed segments of a motion without static poses as poses.
-        progress: Callback that receives the step, "checking the recording" or "validating", and its finished share, 0
-            to 1.
+        recording: Poses or a motion with efforts (m, n), not used for the identification of the model.
+        low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
+            poses.
+        progress: Callback that receives the name of the step ("checking the recording" or "validating") and the
+            finished share of the step (0 to 1).
 
     Returns:
         Result with `verdict`, `verdicts` and `relative_errors` of the joints, `warnings`, and detailed errors.
 
     Raises:
-        RecordingError: The recording does not fit the model's arm, or `check` rejects it, see `findings` of the error.
+        RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute
+            `findings` of the error contains the reasons.
         IdentificationError: `low_speed_segments` is True, but the motion has no low-speed segments.
 
     Example:
@@ -83,16 +85,17 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
         recording: Poses or a motion. Efforts are not required.
-        progress: Callback that receives the step, "checking the recording" or "predicting", and its finished share, 0
-            to 1.
+        progress: Callback that receives the name of the step ("checking the recording" or "predicting") and the
+            finished share of the step (0 to 1).
 
     Returns:
         Result with efforts `tau` (m, n) [N m; N] in the coordinates of the recording, and `warnings`. For a motion and
-        a model with dynamics, these are the total motor efforts after the low-pass filter of the identification.
-        Otherwise, they are holding torques.
+        a model with dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification.
+        Otherwise, `tau` contains holding torques.
 
     Raises:
-        RecordingError: The recording does not fit the model's arm, or `check` rejects it, see `findings` of the error.
+        RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute
+            `findings` of the error contains the reasons.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -103,7 +106,7 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
         (3, 7)
     """
     arm = model.arm
-    # `find_poses` and `require_usable` require efforts.
+    # `find_poses` and `require_usable` require efforts, so zeros replace missing efforts.
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
     if model.dynamics is None or not find_poses(measured, arm).moves:
         step_progress(progress, "predicting")(0.0)

@@ -1,6 +1,6 @@
-"""Judges from the error on a recording whether the model torque of a joint may be commanded.
+"""Judges from the error of a model on a recording whether the model torque of a joint may be commanded.
 
-docs/identification.md has the evidence for the thresholds.
+docs/benchmarks.md contains the evidence for the thresholds.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ Requirement = Literal["good", "usable"]
 
 #: Largest ratio of the RMS error to the RMS measured effort for the verdict "good".
 GOOD_RATIO = 0.35
-#: Largest ratio for the verdict "usable" at rest. Zero torque has a ratio of 1.
+#: Largest ratio for the verdict "usable" at rest. The ratio of zero torque is 1.
 USABLE_RATIO_AT_REST = 1.0
 #: Largest ratio for the verdict "usable" in motion, where the model includes friction.
 USABLE_RATIO_IN_MOTION = 0.5
-#: Largest error, as a share of the effort limit, that is "usable" at any ratio, because friction supports the joint.
+#: Largest RMS error, as a share of the effort limit, for the verdict "usable" at any ratio. Friction holds the joint
+#: despite such an error.
 SMALL_ERROR = 0.02
 
 
@@ -29,8 +30,8 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
     """Returns the verdict on one joint.
 
     Args:
-        effort: RMS measured effort, which is the error of zero torque [N m; N]; 0 if not measured.
-        error: RMS of measured minus predicted effort [N m; N]; NaN if unknown.
+        effort: RMS measured effort [N m; N], which is also the RMS error of zero torque. 0 if no effort was measured.
+        error: RMS of measured minus predicted effort [N m; N], NaN if unknown.
         effort_limit: Effort limit of the joint [N m; N].
         in_motion: True if the recording is a motion and the model has dynamics.
         commanded: False if identification disabled the feedforward of this joint.
@@ -46,15 +47,15 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
 
 
 def rule_text(in_motion: bool) -> str:
-    """Returns the rule of `judge` as text, with its thresholds."""
+    """Returns the rule of `judge` as text, with the thresholds."""
     good, usable, zero = (
         f"{100 * ratio:g} %" if in_motion else f"{ratio:g}"
         for ratio in (GOOD_RATIO, USABLE_RATIO_IN_MOTION if in_motion else USABLE_RATIO_AT_REST, 1.0)
     )
     return (
-        f"ratio: error / measured effort; zero torque has {zero}. good: ratio up to {good}. usable: ratio up to "
-        f"{usable}, or error up to {100 * SMALL_ERROR:g} % of the effort limit. do not use: all other joints. off: the "
-        "model commands no torque. not judged: no effort was measured."
+        f"ratio: RMS error / RMS measured effort ({zero} for zero torque). good: ratio up to {good}. usable: ratio up "
+        f"to {usable}, or error up to {100 * SMALL_ERROR:g} % of the effort limit. do not use: all other joints. off: "
+        "the model commands no torque. not judged: no effort was measured."
     )
 
 
@@ -65,7 +66,10 @@ def worst(verdicts: Mapping[str, Verdict]) -> tuple[Verdict, list[str]]:
 
 
 def unfit(verdicts: Mapping[str, str], required: Requirement) -> list[str]:
-    """Returns the joints that do not meet a requirement, with their verdicts. The verdict "off" meets all."""
+    """Returns the joints that do not meet a requirement, with their verdicts.
+
+    The verdict "off" meets every requirement.
+    """
     accepted = ("good", "off") if required == "good" else ("good", "usable", "off")
     return [f"{name} ({verdict})" for name, verdict in verdicts.items() if verdict not in accepted]
 
@@ -74,12 +78,12 @@ def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...
     """Returns a warning for the joints whose relative error in motion exceeds `USABLE_RATIO_IN_MOTION`.
 
     Args:
-        errors: Relative error of each joint [1]; None if nothing was measured.
+        errors: Relative error of each joint [1], None if the measured effort is 0.
     """
     bad = [f"{name} ({100 * e:.0f} %)" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
     if not bad:
         return ()
-    what = "the model error exceeds half of the effort"
+    what = "the RMS error of the model exceeds half of the RMS effort"
     advice = (
         "Do not use the model for these joints. Check the arm, the signs and units of the columns, and --coordinates."
     )

@@ -1,6 +1,6 @@
-"""Command line of dvrk_drake. Invalid input gives one line on stderr and exit code 2.
+"""Command line of dvrk_drake. For invalid input, a command prints one line on stderr and returns exit code 2.
 
-The imports of this module are fast, so that Ctrl-C gives one line of output even during the start.
+The imports of this module are fast, so that Ctrl-C prints one line instead of a traceback even during the start.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns the exit code: 0 for success, 2 for invalid input.
+    """Runs one command and returns the exit code, e.g. 0 for success and 2 for invalid input.
 
     Without `arguments`, the function uses the arguments of the process and installs a handler for Ctrl-C.
     """
@@ -27,6 +27,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def leave(*_: object) -> None:
-    """Ends the process immediately on a signal. The handler is installed only while no file is partly written."""
+    """Signal handler that ends the process immediately. It is installed only while no file is partly written."""
     os.write(2, b"dvrk-drake: interrupted\n")
     os._exit(130)

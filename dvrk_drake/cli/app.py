@@ -1,8 +1,8 @@
 """Command-line application: groups of commands, and options that several commands share.
 
 An option has the same name in all commands. Input files (recordings, scenarios, studies) are positional arguments.
-All other arguments are options: --arm, --model, --output (a file), --folder, --plots (a folder), --json, --overwrite,
---verbose.
+All other arguments are options, e.g. --arm, --model, --output (a file), --folder, --plots (a folder), --json,
+--overwrite and --verbose.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _check_seconds(_: object, value: float | None) -> None:
 
 
 def whole_number(_: object, tokens: Sequence[Token]) -> int:
-    """Converts a string to an integer. The conversion of cyclopts would round 1.5."""
+    """Converts a string to an integer. The default conversion of cyclopts would round 1.5 instead of rejecting it."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -57,7 +57,7 @@ def _check_seed(_: object, value: int) -> None:
 
 
 def one_of(title: str, least: int = 1) -> Group:
-    """Returns a group of mutually exclusive options, of which at least `least` (0 or 1) is given."""
+    """Returns a group of mutually exclusive options. If `least` is 1, one of the options is required."""
 
     def check(arguments: ArgumentCollection) -> None:
         if not least <= sum(argument.has_tokens for argument in arguments) <= 1:
@@ -74,11 +74,16 @@ Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written
 Coordinates = Annotated[
     Literal["joint", "actuator"], Parameter(help="Coordinates of q, qd and tau in a CSV recording.")
 ]
+Topic = Annotated[
+    str | None,
+    Parameter(metavar="TOPIC", help="ROS bag: JointState topic or its namespace. Default: measured_js of the arm."),
+]
 Gravity = Annotated[
     tuple[float, float, float] | None,
     Parameter(
         metavar="X Y Z",
-        help="Gravity vector in the base frame of the arm [m/s^2], for another mounting. Default: from the arm file.",
+        help="Gravity vector in the base frame of the arm [m/s^2], e.g. for a tilted base. Default: the vector in "
+        "the arm file.",
     ),
 ]
 Overwrite = Annotated[
@@ -97,16 +102,25 @@ Seconds = Annotated[float, Parameter(metavar="S", validator=_check_seconds)]
 Port = Annotated[int | None, Parameter(converter=whole_number, help="TCP port of the web page. Default: a free port.")]
 LcmUrl = Annotated[
     str,
-    Parameter(metavar="URL", show_default=False, help="LCM network. Default: $LCM_DEFAULT_URL, or the default of LCM."),
+    Parameter(
+        metavar="URL",
+        show_default=False,
+        help="URL of the LCM network. Default: $LCM_DEFAULT_URL, or else the default URL of LCM.",
+    ),
 ]
 Key = Annotated[
     str | None,
-    Parameter(metavar="FILE", help="Key file to sign messages, from dvrk-drake key. Both sides need the same key."),
+    Parameter(
+        metavar="FILE",
+        help="Key file to sign and verify messages, created by the command key. "
+        "The arm and the controller need the same key.",
+    ),
 ]
 Realtime = Annotated[
     bool,
     Parameter(show_default=False, help="Request real-time scheduling. Print a warning if it is not permitted."),
 ]
 Set = Annotated[
-    list[str] | None, Parameter(metavar="KEY=VALUE", help="Change a value of the scenario. The option can be repeated.")
+    list[str] | None,
+    Parameter(metavar="KEY=VALUE", help="Change a value of the scenario. Repeat the option to change several values."),
 ]

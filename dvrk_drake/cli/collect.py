@@ -76,13 +76,13 @@ def collect(
     After an interruption, run the same command again to continue.
 
     Args:
-        poses: File of poses. --output reads it, --teach and --random add poses to it.
-        output: Move the arm to each pose, and append one row per pose to this file.
-        teach: Compensate gravity while you move the arm by hand. Enter adds the current pose to the file.
-        random: Add N random poses to the file.
-        at_rest: With --teach: also add each pose at which the arm rests for one second.
+        poses: Pose file. With --output, the arm moves to its poses. With --teach or --random, poses are added to it.
+        output: Move the arm to each pose of the pose file, and append one row per pose to this CSV file.
+        teach: Compensate gravity while you move the arm by hand. Press Enter to add the current pose to the pose file.
+        random: Add N random poses to the pose file.
+        at_rest: With --teach: also add each pose at which the arm is at rest for one second.
         both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
-        traverse_time: Time to move a joint over its full range, 1 to 60 s. It sets the speed between poses.
+        traverse_time: Time to move a joint over its full range, 1 to 60 s. This time defines the speed between poses.
     """
     check_output(poses, overwrite=True)
     if random is not None:
@@ -119,14 +119,16 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     from dvrk_drake.processes.teacher import EnterKey, Teacher
     from dvrk_drake.recordings.pose_file import load_poses_if_any
 
-    load_poses_if_any(poses, load_arm(controlled.arm))  # reject a bad file before connecting to the arm
+    load_poses_if_any(poses, load_arm(controlled.arm))  # rejects an invalid file before the arm is connected
     with interrupt_ends_process():
         controller, link, _ = ready_controller(controlled, "gravity")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=_reporter(line))
     event = "Enter or one second of rest" if at_rest else "Enter"
-    print(f"{controller.arm.name} compensates gravity; move it by hand; {event} adds a pose, Ctrl-C ends", flush=True)
+    print(
+        f"{controller.arm.name} compensates gravity; move the arm by hand; {event} adds a pose, Ctrl-C ends", flush=True
+    )
     try:
         control(
             link(),
@@ -184,7 +186,9 @@ def _visit(
         raise KeyboardInterrupt
     if collector.unsettled:
         numbers = ", ".join(map(str, collector.unsettled))
-        raise CollectionError(f"the arm did not come to rest at poses {numbers}. Run the command again to repeat them")
+        raise CollectionError(
+            f"the arm did not come to rest at poses {numbers}. Run the command again to repeat these poses"
+        )
 
 
 def _reporter(line: LiveLine) -> Callable[[str], None]:

@@ -23,7 +23,7 @@ def demo(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Collect poses of a simulated arm, identify it, and test the model.
+    """Collect poses of a simulated arm, identify a model, and test the model.
 
     Args:
         arm: Arm to simulate.
@@ -56,7 +56,7 @@ def teleop(
     Move the MTM with sliders in a browser, or play a recorded hand motion with --output.
 
     Args:
-        output: Play a recorded hand motion, write an animation to this page, and print the tracking error of the PSM.
+        output: Play a recorded hand motion, write an animation to this HTML file, and print the PSM's tracking error.
     """
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.files import atomic_write
@@ -68,7 +68,7 @@ def teleop(
         meshcat = start_scene(port)
         print(
             f"MTML controls PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale are under Open Controls; "
-            "the arms appear after some seconds; Stop, Escape or Ctrl-C ends",
+            "the arms appear after some seconds; press Stop, Escape or Ctrl-C to end",
             flush=True,
         )
         run_live_teleoperation(meshcat)
@@ -93,14 +93,14 @@ def reproduce(
     seed: Seed = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Reproduce the figures and tables of the paper.
+    """Reproduce the figures and tables of the paper (Rutfield et al., 2015).
 
     The command writes a page that compares published and reproduced numbers.
     Without the recording of the paper, Fig. 4 is omitted and a different MTM is simulated.
 
     Args:
         what: Table, figure or experiment to reproduce.
-        data: Folder of mtm_2015_good72.csv (docs/reproduction.md). Default: $DVRK_DRAKE_SHARED/data/mtm_static.
+        data: Folder with mtm_2015_good72.csv (docs/reproduction.md). Default: $DVRK_DRAKE_SHARED/data/mtm_static.
     """
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
     from dvrk_drake.reports.reproduction.run import NAMES

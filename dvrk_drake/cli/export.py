@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from dvrk_drake.export.model_export import Format
 
 _SOURCE = one_of("Source (one is required)")
-_GRAVITY_COMPENSATION = Group("Options of --dvrk-gc (--gc-tolerance: also of --dvrk-kinematic-gc)")
-SourceArm = Annotated[Arm | None, Parameter(group=_SOURCE, help="Use the nominal model of this arm, from its SDF.")]
+_GRAVITY_COMPENSATION = Group("Options for --dvrk-gc (--gc-tolerance: also for --dvrk-kinematic-gc)")
+SourceArm = Annotated[
+    Arm | None, Parameter(group=_SOURCE, help="Use the nominal model of this arm, with the masses of the SDF.")
+]
 SourceModel = Annotated[Model | None, Parameter(group=_SOURCE)]
 PerJoint = Annotated[
     tuple[float, float, float, float, float, float, float] | None,
@@ -46,20 +48,20 @@ def export(
 ) -> None:
     """Export a model as SDF, URDF or gravity-compensation file of the dVRK.
 
-    One call can write several files. Export an identified model: the masses in the SDF of an arm are estimates.
+    One call can write several files. Export an identified model, because the masses in the SDF are only estimates.
 
     Args:
-        sdf: SDF file to write, with the inertias of the model. Its meshes are copied to a folder next to it.
-        urdf: URDF file to write, like --sdf. The linkage becomes mimic joints.
-        dvrk_gc: Gravity-compensation file of the dVRK controller for an MTM.
-        dvrk_kinematic_gc: Gravity-compensation file of the dVRK controller for a PSM.
+        sdf: SDF file to write, with the inertias of the model. The meshes are copied to a folder next to the file.
+        urdf: URDF file to write, with the inertias of the model. Joints of the linkage become mimic joints.
+        dvrk_gc: Gravity-compensation file to write for an MTM, in the format of the dVRK controller.
+        dvrk_kinematic_gc: Gravity-compensation file to write for a PSM, in the format of the dVRK controller.
         diff: Print the differences between the SDF of the arm and the exported SDF.
-        gc_tolerance: Largest accepted error of the file with respect to the model [N m; N]. Default: 1e-6.
-        friction: Also compensate the dry friction of the model, which must be identified from a motion.
-        coulomb: Coulomb friction of each joint [N m], instead of --friction.
-        friction_ratio: Share of --friction or --coulomb to compensate, 0 to 1. Default: 0.8 0.8 0.8 0.4 0.6 0.6 0.
-        dead_band: Speeds [rad/s] without friction compensation. Default: 0.02 0.02 0.02 0.01 0.008 0.008 0.01.
-        saturation: Speeds [rad/s] from which the full share is compensated. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
+        gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: 1e-6.
+        friction: Also compensate the dry friction of the model. The model must be identified from a motion.
+        coulomb: Also compensate this Coulomb friction of each joint [N m], instead of --friction.
+        friction_ratio: Share of the friction of each joint to compensate, 0 to 1. Default: 0.8 0.8 0.8 0.4 0.6 0.6 0.
+        dead_band: Speed below which no friction is compensated [rad/s]. Default: 0.02 0.02 0.02 0.01 0.008 0.008 0.01.
+        saturation: Speed above which --friction-ratio is fully reached [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export
@@ -90,7 +92,7 @@ def export(
         "dead_band": dead_band,
         "saturation": saturation,
     }
-    # All files are computed before the first is written, so that an error leaves no partial output.
+    # All files are computed before the first file is written, so that an error leaves no partial output.
     origin = model or arm or ""
     with Steps(f"exporting {loaded.arm.name}"):
         exports = {format: prepare_export(loaded, format, origin=origin, **settings) for format in outputs}

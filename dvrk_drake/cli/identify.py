@@ -16,6 +16,7 @@ from dvrk_drake.cli.app import (
     Model,
     Overwrite,
     Plots,
+    Topic,
     Verbose,
     app,
     one_of,
@@ -33,7 +34,7 @@ from dvrk_drake.cli.support import (
 from dvrk_drake.errors import ModelError
 
 Recording = Annotated[
-    str, Parameter(help="CSV file with columns q1..qn, tau1..taun, optionally t, qd1..qdn; or LCM log.")
+    str, Parameter(help="CSV with columns q1..qn, tau1..taun (optionally t, qd1..qdn), ROS bag, or LCM log.")
 ]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 LowSpeedSegments = Annotated[
@@ -51,6 +52,7 @@ def identify(
     arm: Arm,
     output: NewModel,
     coordinates: Coordinates = "joint",
+    topic: Topic = None,
     method: Literal["robust", "paper"] = "robust",
     low_speed_segments: LowSpeedSegments = False,
     gravity: Gravity = None,
@@ -63,7 +65,7 @@ def identify(
     A motion determines the full dynamics, including friction. Static poses determine only the holding torque.
 
     Args:
-        method: Method for static poses: robust regression, or the least squares of the paper.
+        method: Method for static poses: robust regression, or the least squares of the paper (Rutfield et al., 2015).
     """
     from dvrk_drake.reports.identification import print_identification
     from dvrk_drake.reports.terminal_tables import make_console
@@ -72,10 +74,10 @@ def identify(
     recorded_arm = mounted(dvrk.load_arm(arm), gravity)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
-        read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
+        read = dvrk.read_recording(recording, recorded_arm, coordinates, topic=topic, progress=steps)
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     result.save(output, overwrite=True)
     if folder is not None:
         from dvrk_drake.reports.figures.identification import plot_identification
@@ -92,11 +94,11 @@ def identify(
 
 
 def _model_and_recording(
-    model: str, recording: str, coordinates: Literal["joint", "actuator"], steps: Steps
+    model: str, recording: str, coordinates: Literal["joint", "actuator"], topic: str | None, steps: Steps
 ) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
     """Loads a model and a recording of its arm, and prints the notes on the recording."""
     loaded = dvrk.IdentifiedModel.load(model)
-    read = dvrk.read_recording(recording, loaded.arm, coordinates, progress=steps)
+    read = dvrk.read_recording(recording, loaded.arm, coordinates, topic=topic, progress=steps)
     print_notes(recording, read.notes)
     return loaded, read
 
@@ -108,6 +110,7 @@ def validate(
     *,
     model: Model,
     coordinates: Coordinates = "joint",
+    topic: Topic = None,
     require: Literal["good", "usable"] | None = None,
     save: Annotated[bool, Parameter(show_default=False)] = False,
     low_speed_segments: LowSpeedSegments = False,
@@ -120,7 +123,7 @@ def validate(
 
     Args:
         require: Exit with code 2 unless each joint with feedforward has at least this verdict.
-        save: Store the verdicts in the model file, where the command run checks them.
+        save: Store the verdicts in the model file. The command run checks the stored verdicts.
     """
     from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console
@@ -128,19 +131,19 @@ def validate(
     if json is not None:
         check_output(json, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "validating") as steps:
-        loaded, read = _model_and_recording(model, recording, coordinates, steps)
+        loaded, read = _model_and_recording(model, recording, coordinates, topic, steps)
         folder = plots_folder(plots, overwrite=overwrite)
         if save:
             check_output(model, recording, overwrite=True)
             if read.sha256 and read.sha256 == loaded.provenance.sha256:
                 raise ModelError(
-                    f"{read.source}: the model was identified from this recording; --save requires another one"
+                    f"{read.source}: the model was identified from this recording; --save requires another recording"
                 )
             if loaded.validation is not None and not overwrite:
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
         validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if save:
         validation.save(model, overwrite=True)
     if json is not None:
@@ -162,8 +165,8 @@ def validate(
         print_written(model, "verdicts stored")
     if require is not None and (failed := validation.unfit(require)):
         raise ModelError(
-            f"{model}: not {require} on {read.source}: {', '.join(failed)}; identify from a recording with more varied "
-            "poses, or recalibrate"
+            f"{model}: verdicts below {require} on {read.source}: {', '.join(failed)}; identify from a recording with "
+            "more varied poses, or recalibrate"
         )
 
 
@@ -175,22 +178,23 @@ def predict(
     model: Model,
     output: Annotated[str, Parameter(metavar="FILE.csv")],
     coordinates: Coordinates = "joint",
+    topic: Topic = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict the efforts of a recording with a model.
 
-    For a motion and a model with dynamics: total efforts, low-pass filtered as in the identification.
-    Otherwise: holding efforts.
+    A model with dynamics predicts the total efforts of a motion, low-pass filtered as in the identification.
+    In all other cases, the command predicts the holding efforts.
 
     Args:
-        output: CSV file to write: tau1..taun [N m; N if prismatic], in the coordinates of the recording.
+        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the coordinates of the recording.
     """
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "predicting") as steps:
-        prediction = dvrk.predict(*_model_and_recording(model, recording, coordinates, steps), progress=steps)
+        prediction = dvrk.predict(*_model_and_recording(model, recording, coordinates, topic, steps), progress=steps)
     tau = prediction.tau
     write_csv(output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
     print_warnings(make_console(), prediction.warnings)
@@ -205,19 +209,20 @@ def recalibrate(
     model: Model,
     output: NewModel,
     coordinates: Coordinates = "joint",
+    topic: Topic = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
     """Refit the friction and offsets of a model to a short new motion.
 
-    The result is valid for similar motions, positions and speeds only (docs/payload.md).
+    The result is valid only for similar motions, positions and speeds (docs/payload.md).
     """
     from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "refitting friction") as steps:
-        result = dvrk.recalibrate(*_model_and_recording(model, recording, coordinates, steps), progress=steps)
+        result = dvrk.recalibrate(*_model_and_recording(model, recording, coordinates, topic, steps), progress=steps)
     result.save(output, overwrite=True)
     print_recalibration(make_console(), result, model_path=output, verbose=verbose)
     print_written(output)
@@ -233,6 +238,7 @@ def payload(
     model: Annotated[Model | None, Parameter(group=_SOURCE, help="Model identified from a motion.")] = None,
     link: Annotated[str | None, Parameter(metavar="NAME")] = None,
     coordinates: Coordinates = "joint",
+    topic: Topic = None,
     gravity: Gravity = None,
     json: Json = None,
     overwrite: Overwrite = False,
@@ -245,7 +251,7 @@ def payload(
     Args:
         reference: Recording of the motion without the payload.
         loaded: Recording of the same motion with the payload.
-        link: SDF link that carries the payload. Default: the link with the smallest cross-validated error.
+        link: SDF link to which the payload is attached. Default: the link with the smallest cross-validated error.
     """
     from dvrk_drake.reports.payload import print_payload
     from dvrk_drake.reports.terminal_tables import make_console
@@ -258,7 +264,8 @@ def payload(
     recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
         without_payload, with_payload = (
-            dvrk.read_recording(path, recorded_arm, coordinates, progress=steps) for path in (reference, loaded)
+            dvrk.read_recording(path, recorded_arm, coordinates, topic=topic, progress=steps)
+            for path in (reference, loaded)
         )
         for recording in (without_payload, with_payload):
             print_notes(recording.source, recording.notes)

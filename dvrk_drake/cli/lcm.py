@@ -1,4 +1,4 @@
-"""Commands that communicate over LCM: arm, key and run."""
+"""Commands for the control of an arm over LCM: arm, key and run."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ControlledArm:
         bool,
         Parameter(
             show_default=False,
-            help="Print and clear a fault of the arm, and resume control after its guard took over.",
+            help="Print and clear a fault of the arm. If the watchdog of the guard holds the arm, resume control.",
         ),
     ] = False
 
@@ -59,8 +59,8 @@ def arm(
     """Run a simulated arm with its driver and command guard on LCM.
 
     Args:
-        driver: Configuration file of the driver (docs/lcm.md). Default: the default driver.
-        pose: Initial joint positions [rad; m if prismatic]. Default: near zero, inside the joint limits.
+        driver: Configuration file of the driver (docs/lcm.md). Default: the default configuration.
+        pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.
         meshcat: Show the arm in a web browser.
     """
     from dvrk_drake.models.arm import load_arm
@@ -85,7 +85,7 @@ def arm(
             for warning in make_realtime():
                 _warn(warning)
         settle_memory()
-        print(f"simulated {simulated_arm.name} on LCM {url}; Ctrl-C ends", flush=True)
+        print(f"simulated {simulated_arm.name} on LCM {url}; press Ctrl-C to end", flush=True)
         pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} steps started more than one period late", flush=True)
 
@@ -95,12 +95,15 @@ def key(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
     """Create a key to sign LCM messages.
 
     Args:
-        output: New key file. Only its owner can read it.
+        output: New key file. Only the owner of the file can read it.
     """
     from dvrk_drake.models.lcm_messages import create_key_file
 
     create_key_file(output)
-    print_written(output, "copy it to the other side, e.g. with scp -p, and use --key on both sides")
+    print_written(
+        output,
+        "copy the file to the other computer, e.g. with scp -p, and give it with --key to the arm and the controller",
+    )
 
 
 @app.command(group=HARDWARE)
@@ -117,10 +120,10 @@ def run(
 
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
-        gains: Gains from the command tune, for modes damped and hold. Default: the gains of the arm file.
-        friction_ratio: Compensated share of the friction in mode gravity, 0 to 0.6. Reduced if the arm could creep.
-        hysteresis_ratio: Compensated share of the wide hysteresis in mode gravity, 0 to 0.9.
-        friction_model: Model with the friction, identified from a motion. Default: --model.
+        gains: Gains file from the command tune, for the modes damped and hold. Default: the gains of the arm file.
+        friction_ratio: Share of friction to compensate in mode gravity, 0 to 0.6. It is lower if the arm could creep.
+        hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
+        friction_model: Model that contains the friction, identified from a motion. Default: the model of --model.
     """
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
@@ -159,7 +162,7 @@ def _gains(path: str, mode: Mode, arm: str) -> Gains:
     """Loads the file given with --gains.
 
     Raises:
-        ControllerError: The file contains no gains, the gains are for another arm, or the mode uses no gains.
+        ControllerError: The mode uses no gains, or the gains are not valid for the arm.
     """
     from dvrk_drake.errors import ControllerError
     from dvrk_drake.models.arm import load_arm
@@ -176,11 +179,13 @@ def _gains(path: str, mode: Mode, arm: str) -> Gains:
 def _friction_compensator(
     controlled: ControlledArm, mode: Mode, ratio: float, hysteresis_ratio: float, friction_model: str | None
 ) -> FrictionCompensator | None:
-    """Returns the compensator for --friction-ratio and --hysteresis-ratio, and warns if a ratio is reduced.
+    """Returns the compensator for --friction-ratio and --hysteresis-ratio, and warns if it reduces a friction ratio.
+
+    Returns None if both ratios are 0.
 
     Raises:
-        ControllerError: A ratio is not safe.
-        ModelError: The model has no friction.
+        ControllerError: A ratio is out of range, the mode is not gravity, or no suitable model is given.
+        ModelError: The model contains no friction or belongs to another arm.
     """
     if ratio == hysteresis_ratio == 0:
         return None
@@ -216,7 +221,10 @@ def _friction_compensator(
     elements = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
     ratios = {e.coordinate: r for e, r, springs_back in elements if not springs_back}
     if reduced := ", ".join(f"{name} {r:.2f}" for name, r in ratios.items() if r < 0.99 * ratio):
-        _warn(f"the friction ratio is reduced, because friction must resist the error of the gravity model: {reduced}")
+        _warn(
+            "the friction ratio is reduced, because friction must resist the error of the gravity model. Ratios: "
+            f"{reduced}"
+        )
     return compensator
 
 
@@ -228,13 +236,14 @@ def ready_controller(
 ) -> tuple[ArmController, Callable[[], ArmLink], float]:
     """Returns a controller for the arm, a function that opens the link to the arm, and the status period [s].
 
-    With --reset, a latched fault is printed and cleared, and an arm that is held by its watchdog resumes. The link
-    accepts only the session that was checked here, so it rejects an arm that is restarted in the meantime.
+    With --reset, the function prints and clears a latched fault of the arm. It also resumes control of an arm that the
+    watchdog holds. The link accepts only the session of the arm that this function checked. It therefore rejects an arm
+    that was restarted in the meantime.
 
     Args:
         controlled: Options of the command.
         mode: Control mode.
-        friction: Compensator of friction and hysteresis. None: not compensated.
+        friction: Compensator of friction and hysteresis. None: friction is not compensated.
         gains: Gains for holding. None: the default gains of the arm.
 
     Raises:
@@ -269,7 +278,7 @@ def ready_controller(
 
 
 def model_warning(path: str, model: IdentifiedModel) -> str:
-    """Returns a warning about joints that failed validation or were only cross-validated, or ""."""
+    """Returns a warning if the model was not validated or a joint failed the validation, otherwise ""."""
     from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
 
     if model.validation is None:
@@ -281,7 +290,7 @@ def model_warning(path: str, model: IdentifiedModel) -> str:
     if not (bad := unfit({joint.name: verdicts[joint.name] for joint in model.joints}, "usable")):
         return ""
     recording = model.validation.recording
-    return f"{path}: failed validation on {recording}: {', '.join(bad)}; zero torque may be better for these joints"
+    return f"{path}: failed validation on {recording}: {', '.join(bad)}; for these joints, zero torque may be better"
 
 
 def _warn(text: str) -> None:

@@ -37,7 +37,7 @@ def model(
 
     if output is not None:
         if format is None:
-            raise DvrkDrakeError("--output needs a --format: latex, python or c")
+            raise DvrkDrakeError("--output requires --format latex, python or c")
         check_output(output, overwrite=overwrite)
     shown = mounted(load_arm(arm), gravity)
     with Steps("deriving the gravity torque"):
@@ -87,7 +87,7 @@ def view(
     url = open_lcm(lcm_url).get_lcm_url() if live else ""
     meshcat = start_meshcat(shown, port=port)
     arm_view = ArmView(shown, meshcat)
-    ending = "Stop, Escape or Ctrl-C ends"
+    ending = "press Stop, Escape or Ctrl-C to end"
     if live:
         link = ArmLink(shown, url, replays=True)
         print(f"{shown.name} live at {meshcat.web_url()}; {ending}", flush=True)

@@ -26,14 +26,15 @@ from dvrk_drake.cli.app import app
 from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
-# The matrices are small. With several threads, BLAS threads mostly wait for each other, for minutes on a busy computer.
+# The matrices are small. Several BLAS threads would mostly wait for each other, on a busy computer for minutes.
 # The variable must be set before numpy is imported, which happens in the commands.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 #: Importing these modules adds their commands to the application.
 COMMANDS = model, recordings, identify, export, simulate, demo, lcm, collect
 
-#: Options that were renamed in version 0.1, by command. "" stands for a positional argument that became an option.
+#: Mapping from each command to its options that were renamed in version 0.1. The key "" stands for a positional
+#: argument that became an option.
 RENAMED = {
     "model": {"": "--arm", "--latex": "--format latex", "--python": "--format python", "--c": "--format c"},
     "view": {"": "--arm"},
@@ -54,7 +55,7 @@ RENAMED = {
 
 
 def run(arguments: Sequence[str] | None) -> int:
-    """Runs one command and returns the exit code. Without `arguments`, uses the arguments and Ctrl-C of the process."""
+    """Runs one command and returns the exit code. See `dvrk_drake.cli.main` for `arguments`."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     try:
         command, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
@@ -64,7 +65,7 @@ def run(arguments: Sequence[str] | None) -> int:
     try:
         if arguments is None:
             gc.disable()  # modules are never freed, and garbage collection takes a tenth of the import time
-        if command.__module__.startswith("dvrk_drake."):  # neither the help nor the version
+        if command.__module__.startswith("dvrk_drake."):  # not for --help and --version
             import_interruptibly()
         if arguments is None:
             gc.freeze()
@@ -77,7 +78,8 @@ def run(arguments: Sequence[str] | None) -> int:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # The reader (head, less) closed the pipe. As in other programs, a failed verdict must not return exit code 0.
+        # The reader of the output (e.g. head) closed the pipe. The exit code must not be 0, because a verdict may have
+        # failed.
         sys.stderr.close()
         return 128 + signal.SIGPIPE
     except OSError as error:  # for example a full disk
@@ -116,5 +118,5 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
         if suggestion:
             message += f". {suggestion[0]}"
         elif error.argument.name == renamed.get(""):
-            message += ": it is an option now"
+            message += ": it was a positional argument before"
     return f"dvrk-drake: error: {message}; see {f'dvrk-drake {name}'.rstrip()} --help"

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import IDENTIFY, Arm, Coordinates, Json, Overwrite, Plots, Verbose, app
+from dvrk_drake.cli.app import IDENTIFY, Arm, Coordinates, Json, Overwrite, Plots, Topic, Verbose, app
 from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_notes, print_written, write_json
 from dvrk_drake.errors import RecordingError
 
@@ -20,6 +20,7 @@ def check(
     *,
     arm: Arm,
     coordinates: Coordinates = "joint",
+    topic: Topic = None,
     json: Json = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
@@ -30,7 +31,7 @@ def check(
     The exit code is 2 if the recording is not suitable for identification.
 
     Args:
-        recording: CSV file with columns q1..qn, tau1..taun, optionally t, qd1..qdn; or LCM log.
+        recording: CSV with columns q1..qn, tau1..taun (optionally t, qd1..qdn), ROS bag, or LCM log.
     """
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
@@ -40,9 +41,9 @@ def check(
         check_output(json, recording, overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps("reading", "checking the recording") as steps:
-        checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
+        checked = dvrk.read_recording(recording, recorded_arm, coordinates, topic=topic, progress=steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
-    # Save before printing: the reader of the output may close the pipe (head).
+    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if json is not None:
         write_json(json, report.as_dict())
     options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"
@@ -68,9 +69,10 @@ def convert(
     /,
     *,
     output: Annotated[str, Parameter(metavar="FILE.csv")],
-    input_format: Literal["csv", "team-mat", "wpi-csv", "lcm-log"] | None = None,
+    input_format: Literal["csv", "team-mat", "wpi-csv", "lcm-log", "ros-bag"] | None = None,
     coordinates: Literal["joint", "actuator"] | None = None,
     variable: Annotated[str | None, Parameter(metavar="NAME")] = None,
+    topic: Topic = None,
     rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
     arm: Annotated[str | None, Parameter(metavar="ARM")] = None,
     skip_invalid: Annotated[bool, Parameter(show_default=False)] = False,
@@ -78,16 +80,16 @@ def convert(
 ) -> None:
     """Convert a recording to the CSV format of this project.
 
-    Formats: csv, lcm-log, team-mat (MATLAB files of JHU and WPI), wpi-csv (CSV of WPI, no header).
+    The formats are csv, ros-bag, lcm-log, team-mat (MATLAB files of JHU and WPI) and wpi-csv (CSV files of WPI).
 
     Args:
         recording: File to convert.
         output: CSV file to write.
         input_format: Format of the recording. Default: detected from the content.
-        coordinates: Coordinates of q and tau, required for format csv. The other formats define them.
-        variable: Variable of a team-mat file. Required if several variables match.
-        rate: Sampling rate [Hz] of rows without time stamps. Default: 200 for wpi-csv; csv remains without times.
-        arm: For csv and wpi-csv: convert to joint coordinates of this arm. For lcm-log: arm to read.
+        coordinates: Coordinates of q and tau. Required for csv. All other formats define the coordinates.
+        variable: Variable of a team-mat file that contains the recording. Required if several variables are possible.
+        rate: Sampling rate [Hz] of rows without time stamps. Default: 200 for wpi-csv, no time stamps for csv.
+        arm: csv, wpi-csv: convert to joint coordinates of this arm. ros-bag, lcm-log: read messages of this arm.
         skip_invalid: Skip rows with an empty cell, NaN or an infinite value, and print their number.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording
@@ -99,6 +101,7 @@ def convert(
         format=input_format,
         coordinates=coordinates,
         variable=variable,
+        topic=topic,
         rate=rate,
         arm=None if arm is None else dvrk.load_arm(arm),
         skip_invalid=skip_invalid,

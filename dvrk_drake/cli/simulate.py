@@ -72,7 +72,7 @@ def simulate(
         plot_simulation(folder / "positions.png", simulation, loaded)
         print_written(folder)
     if page is not None:
-        print("the page can replay the motion; Stop, Escape or Ctrl-C ends", flush=True)
+        print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)
         until_stopped(page)
 
 
@@ -100,7 +100,7 @@ def study(
 
     Args:
         study: YAML file of the study.
-        output: Results file, .csv or .parquet. An existing file of the same study is continued, not replaced.
+        output: Results file, .csv or .parquet. If it contains runs of this study, only missing runs are simulated.
         workers: Number of processes on this computer, 1 to 1024. Default: one per core.
         scheduler: Address of a Dask cluster that runs the study, e.g. tcp://host:8786.
     """
@@ -195,7 +195,7 @@ def transparency(
     speed: Annotated[float | None, Parameter(metavar="S")] = None,
     model: Annotated[list[str] | None, Parameter(metavar="MODEL.yaml")] = None,
     friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.5,
-    simulated_effects: Annotated[list[str] | None, Parameter(metavar="PART ..", consume_multiple=True)] = None,
+    simulated_effects: Annotated[list[str] | None, Parameter(metavar="EFFECT ..", consume_multiple=True)] = None,
     frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
     output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
     plots: Plots = None,
@@ -207,8 +207,8 @@ def transparency(
     Args:
         path: Recording of the motion of the operator. Default: a motion through random poses.
         speed: Speed factor of the recorded motion. 2 doubles the speed.
-        model: Model for compensation. Repeat to compare models. Default: the nominal model from the SDF.
-        friction_ratio: Compensated share of the friction, 0 to 0.6.
+        model: Model for gravity compensation. Repeat the option to compare models. Default: the nominal model.
+        friction_ratio: Share of the friction to compensate, 0 to 0.6.
         simulated_effects: Effects to simulate (docs/simulated_effects.md), e.g. friction cables. Default: all.
         frame: SDF frame at which the operator holds the arm. Default: dh_7 for an MTM, dh_6 for a PSM.
         output: CSV file for the results.
@@ -261,7 +261,7 @@ def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> li
 
     Raises:
         ModelError: A model belongs to another arm, or two models have the same name.
-        ControllerError: A friction ratio is not allowed.
+        ControllerError: The friction ratio is out of range.
     """
     from dvrk_drake.dynamics.friction_compensation import check_ratios
     from dvrk_drake.experiments.transparency import Compensation
@@ -273,7 +273,9 @@ def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> li
         if name in models:
             raise ModelError(f"--model {path}: two models have the file name {name}; rename one of the files")
         if "=" in path and not Path(path).is_file():
-            raise ModelError(f"--model {path}: no such file; give only the path of the model file")
+            raise ModelError(
+                f"--model {path}: no such file. The form NAME=PATH is not supported; give the path of the model file"
+            )
         models[name] = dvrk.IdentifiedModel.load(path, arm)
     if not models:
         models["SDF"] = dvrk.IdentifiedModel.from_arm(arm)

@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 def import_interruptibly() -> None:
     """Imports the modules that all commands need, so that Ctrl-C during the import ends the process at once.
 
-    Without this, extension modules print a traceback. No file is partly written at that time. Signal handlers remain
-    unchanged in a thread or in a test.
+    Without this function, Ctrl-C prints a traceback while an extension module is imported. No file is partly written at
+    that time. The function does nothing in a thread, or if the modules are imported already.
     """
-    # This module imports the slow modules that all commands need.
+    # This module imports all slow modules that the commands need.
     modules = ("dvrk_drake.reports.identification",)
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
@@ -76,12 +76,12 @@ def interrupt_ends_process() -> Iterator[None]:
 
 
 def quiet_drake() -> None:
-    """Disables Drake's log messages. Drake sets the level on import, so call this afterwards."""
+    """Disables Drake's log messages. Importing Drake sets the log level, so call this function after the import."""
     logging.getLogger("drake").setLevel(logging.WARNING)
 
 
 def load_key(path: str | None) -> MessageKey | None:
-    """Returns the key from the file given with --key, or None.
+    """Returns the key from the file given with --key. Returns None without --key.
 
     Raises:
         KeyFileError: The key cannot be used.
@@ -92,7 +92,7 @@ def load_key(path: str | None) -> MessageKey | None:
 
 
 def check_output(path: str, *inputs: str, overwrite: bool) -> None:
-    """Checks an output path before work begins. Rejects a path that is not writable, is an input, or that already exists.
+    """Checks an output path before work begins. Rejects an existing file, an input, and a path that is not writable.
 
     Args:
         path: Path of the output.
@@ -129,9 +129,9 @@ def _refuse_twice(path: str) -> None:
 #: Maximum number of progress bars on a terminal. Finished steps are removed first.
 MAX_BARS = 6
 
-#: Outputs of this command.
+#: Paths of the outputs of this command.
 _outputs: set[Path] = set()
-#: Folders created by this command, each before its parent.
+#: Folders that this command created. Each folder precedes its parent.
 _made: list[Path] = []
 
 
@@ -157,7 +157,7 @@ def new_folder(path: str, *, overwrite: bool) -> Path:
 
 
 def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
-    """Creates the folder given with --plots, if any, and imports the plotting modules."""
+    """Creates the folder given with --plots, and imports the plotting modules. Does nothing without --plots."""
     if path is None:
         return None
     with interrupt_ends_process():
@@ -172,7 +172,7 @@ def print_written(path: str | Path, what: str = "") -> None:
 
 @contextmanager
 def folders_only_for_results() -> Iterator[None]:
-    """Context manager that removes empty folders created in the block after an error or Ctrl-C."""
+    """Context manager that, after an error or Ctrl-C, removes the empty folders that were created in the block."""
     _made.clear()
     _outputs.clear()
     try:
@@ -185,7 +185,7 @@ def folders_only_for_results() -> Iterator[None]:
 
 
 def until_stopped(meshcat: Meshcat, update: Callable[[], object] = lambda: None) -> None:
-    """Serves a Meshcat page until its Stop button, Escape or Ctrl-C is pressed. Calls `update` repeatedly."""
+    """Calls `update` repeatedly, and serves a Meshcat page until the Stop button, Escape or Ctrl-C is pressed."""
     meshcat.AddButton("Stop", "Escape")
     with suppress(KeyboardInterrupt):
         while meshcat.GetButtonClicks("Stop") == 0:
@@ -206,7 +206,7 @@ def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
 
 
 def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
-    """Prints one line per warning. Warnings about overoptimistic results are printed on stderr."""
+    """Prints one line per warning. Warnings that concern the validity of the result are printed on stderr."""
     for warning in warnings:
         if warning.kind in ("low-speed segments", "same recording", "other link"):
             print(f"dvrk-drake: {warning}", file=sys.stderr, flush=True)
@@ -230,7 +230,7 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
 
 
 def mounted(arm: Arm, gravity: Sequence[float] | None) -> Arm:
-    """Returns the arm with the mounting given with --gravity."""
+    """Returns the arm with the gravity vector given with --gravity. Without --gravity, returns the arm unchanged."""
     if gravity is None:
         return arm
     return arm.with_gravity(gravity)
@@ -239,11 +239,11 @@ def mounted(arm: Arm, gravity: Sequence[float] | None) -> Arm:
 class Steps:
     """Shows the current step of a command on stderr.
 
-    On a terminal it shows bars with the remaining time, otherwise it prints one line per step.
+    On a terminal, the class shows bars with the remaining time. Otherwise it prints one line per step.
     The class implements `dvrk_drake.progress.Progress`. A step "fig5: releasing" is part of the step "fig5".
 
     Args:
-        first: Name of the step that begins with the block.
+        first: Name of the first step, which starts at the beginning of the `with` block.
         names: Names of the other steps.
     """
 

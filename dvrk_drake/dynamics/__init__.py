@@ -1,1 +1,1 @@
-"""Equations of motion of an arm: symbolic gravity, base parameters, joint effects, identified models."""
+"""Equations of motion of an arm: symbolic gravity, base parameters, drive effects and identified models."""

@@ -1,9 +1,9 @@
-"""Models of friction, cable and spring torques in the drive, each linear in one coefficient.
+"""Models of friction, cable and spring torques in the drive. Each model is linear in one coefficient.
 
-An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`). A coordinate is an actuator, a joint
-that several actuators move, or a location of friction. The effect adds coefficient * shape(x, v, state) to the effort
-along its coordinate. A shape that depends only on position is an expression. A shape that depends on velocity or has a
-state is a step function.
+An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`). The coordinate is the position of an
+actuator, the position of a joint, or a combination of joint positions that the arm's files name. The effect adds
+coefficient * shape(x, v, state) to the effort along its coordinate. A shape that depends only on position is defined by
+an expression. A shape that depends on velocity or on a state is computed step by step.
 """
 
 from __future__ import annotations
@@ -30,14 +30,17 @@ class EffectKind:
     """Kind of an effect.
 
     Attributes:
-        unit: Unit of the coefficient for a revolute coordinate. For a prismatic one, N replaces N m and m replaces rad.
-        scale: Meaning of `ActuatorEffect.scale` for this kind; "" if it has none.
-        dissipative: True if it dissipates energy in all motions, so its coefficient must not be negative.
-        revolute: True if it is allowed for revolute coordinates only.
+        unit: Unit of the coefficient for a revolute coordinate. For a prismatic coordinate, N replaces N m and m
+            replaces rad.
+        scale: Meaning of `ActuatorEffect.scale` for this kind, or "" if the kind has no scale.
+        dissipative: True if the effect dissipates energy in all motions. The coefficient of such an effect must not be
+            negative.
+        revolute: True if the kind is allowed for revolute coordinates only.
         loaded: True if the shape is multiplied by the load of the coordinate [N m, N].
-        code: Code of the kind in `effect_step`. 0 for kinds that depend on position only.
-        position_shape: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None. These
-            effects also act at rest. f provides sin, cos, Min and Max for numbers or symbols.
+        code: Code of the kind in `effect_step`. It is 0 for kinds that depend on position only.
+        position_shape: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None.
+            Effects with this function also act at rest. The argument f provides sin, cos, Min and Max for numbers or
+            symbols.
     """
 
     unit: str
@@ -62,13 +65,14 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "presliding forward": EffectKind("N m", "travel before sliding [rad, m]", code=6),
     # Friction of gears and cables, which increases with the load.
     "load coulomb": EffectKind("1", _WIDTH, dissipative=True, loaded=True, code=2),
-    # The torque is constant outside the range of the recording, because extrapolation of a line would be unbounded.
+    # The torque is constant outside the range of the recording, because a linear extrapolation would be unbounded.
     "spring": EffectKind(
         "N m/rad",
         "largest |x| of the linear range [rad, m]",
         position_shape=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
     ),
-    # One period per revolution: a spring or cable attached off the axis. More: an eccentric pulley or cable stranding.
+    # A spring or cable that is attached off the axis causes one period per revolution. An eccentric pulley or the
+    # strands of a cable cause more periods.
     "cable sine": EffectKind(
         "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.sin(s * x)
     ),
@@ -77,13 +81,13 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     ),
 }
 _NUMERIC = SimpleNamespace(sin=np.sin, cos=np.cos, Min=np.minimum, Max=np.maximum)
-#: Kinds that depend on position only and therefore act at rest. Friction at rest has no unique value.
+#: Kinds of effects that depend on position only. Their torque at rest is unique, unlike the torque of friction.
 POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.position_shape is not None)
 
 
 @numba.njit(cache=True)
 def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
-    """Returns the next state and the shape of a kind. The shape is NaN for a kind that depends on position only.
+    """Returns the next state and the shape. The shape is NaN for a kind that depends on position only.
 
     Args:
         code: Code of the kind.
@@ -101,7 +105,7 @@ def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple
         # Additional friction in the direction +x.
         return z, max(math.tanh(v / scale), 0.0)
     if code == 4:
-        # Additional friction at low speed, which decreases within five widths of the smoothed sign.
+        # Additional friction at low speed, which becomes small above five widths of the smoothed sign.
         return z, math.tanh(v / scale) * math.exp(-((v / (5.0 * scale)) ** 2))
     if code == 5:
         # Elasto-plastic (Prandtl) element: a spring that slides at a deflection of `scale`. Several parallel elements
@@ -144,7 +148,7 @@ class ActuatorEffect:
 
     def position_shape(self, x: sympy.Expr) -> sympy.Expr:
         """Returns the shape at position x [rad, m] of the coordinate. The kind must be in `POSITION_KINDS`."""
-        import sympy  # Importing sympy takes 0.3 s, and motions do not need it.
+        import sympy  # Importing sympy takes 0.3 s, and sympy is not needed for motions.
 
         scale = sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale)
         return sympy.sympify(self._shape(sympy, x, scale))
@@ -196,7 +200,10 @@ def _run_effect(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale
 
 
 def distinct_coordinates(arm: Arm) -> list[str]:
-    """Returns the coordinates without those that are proportional to a preceding one. All actuators are included."""
+    """Returns the names of all coordinates, except coordinates that are proportional to a preceding coordinate.
+
+    The actuators come first, so all of them are included.
+    """
     rows = arm.effect_coordinates
     kept: list[str] = []
     for name in rows:
@@ -207,30 +214,32 @@ def distinct_coordinates(arm: Arm) -> list[str]:
 
 
 def is_prismatic(arm: Arm, coordinate: str) -> bool:
-    """Returns whether a coordinate is that of a prismatic actuator or joint."""
+    """Returns whether a coordinate is the position of a prismatic actuator or joint."""
     return any(p and coordinate.endswith(f".{n}") for p, n in zip(arm.prismatic, arm.joint_names, strict=True))
 
 
 def joint_row(arm: Arm, coordinate: str) -> NDArray[np.float64]:
-    """Returns the row (n,) from joint velocities to the velocity of a coordinate.
+    """Returns the row (n,) that maps joint velocities to the velocity of a coordinate.
 
-    An effort f along the coordinate is the joint effort row * f.
+    An effort f along the coordinate corresponds to the joint efforts row * f.
     """
     return np.asarray(arm.effect_coordinates[coordinate] @ arm.transmission.matrix)
 
 
 def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns positions (m,) [rad, m] of a coordinate at joint positions q (m, n) [rad, m]."""
+    """Returns the positions (m,) [rad, m] of a coordinate at joint positions q (m, n) [rad, m]."""
     return np.asarray(arm.transmission.position(q) @ arm.effect_coordinates[coordinate])
 
 
 def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
-    """Returns a spring whose linear range exceeds the positions x (m,) [rad, m] of a recording by 1 %."""
+    """Returns a spring effect whose linear range is 1 % larger than the largest |x| of positions x (m,) [rad, m]."""
     return ActuatorEffect(coordinate, "spring", float(f"{1.01 * np.abs(x).max():.3g}"))
 
 
 def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFECT_KINDS) -> str:
-    """Returns why an effect is not valid for an arm, with the allowed values; "" if it is valid.
+    """Returns a message that explains why an effect is not valid for an arm, or "" if it is valid.
+
+    The message includes the allowed values.
 
     Args:
         arm: Arm of the effect.

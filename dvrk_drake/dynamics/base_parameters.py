@@ -1,4 +1,4 @@
-"""Computes base parameters, which are the identifiable combinations of link parameters, and their names."""
+"""Computes base parameters and their names. Base parameters are the identifiable combinations of link parameters."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class StandardParameter:
 class BaseParameters:
     """Base parameters beta = combination phi of standard parameters phi (p,).
 
-    The regressor of beta consists of the columns `columns` of the regressor of phi.
+    The regressor for beta consists of the columns `columns` of the regressor for phi.
 
     Attributes:
-        columns: Index (b,) of the standard parameter with the regressor column of each base parameter.
-        combination: Coefficients (b, p).
+        columns: Indices (b,) of the standard parameters whose regressor columns form the regressor for beta.
+        combination: Matrix (b, p) that maps phi to beta.
         names: Names (b,), such as "L2 (m2+...+m7) + m2 c2x".
         units: Units (b,) of the base parameters.
     """
@@ -67,11 +67,13 @@ class BaseParameters:
 def independent_columns(
     regressor: NDArray[np.float64], tolerance: float = 1e-9
 ) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
-    """Returns independent columns of a regressor, and B (b, p) with regressor = regressor[:, columns] B.
+    """Returns indices of independent columns of a regressor, and the combinations that give all columns.
+
+    The indices `columns` (b,) and the matrix B (b, p) satisfy regressor = regressor[:, columns] B.
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
-        tolerance: Relative magnitude below which a column counts as dependent.
+        tolerance: Largest norm of the independent part of a dependent column, relative to the largest column norm.
     """
     R, pivots = scipy.linalg.qr(regressor, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > tolerance * abs(R[0, 0])))
@@ -90,16 +92,17 @@ def reduce_to_base(
 ) -> BaseParameters:
     """Computes base parameters whose regressor columns come as early as possible in `preference`.
 
-    This is a QR decomposition with pivots in the order of `preference` instead of their magnitude. For an exact
-    regressor, the order affects only the form of the base parameters. Reference: Gautier, "Numerical calculation of the
-    base inertial parameters of robots" (1991).
+    The method is a QR decomposition. Its pivots are chosen in the order of `preference` instead of by magnitude. For an
+    exact regressor, the order affects only the form of the base parameters. Reference: Gautier, "Numerical calculation
+    of the base inertial parameters of robots" (1991).
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
         parameters: Standard parameters (p,).
-        preference: Permutation of 0 to p - 1.
-        lengths: Name -> coefficient, such as a length [m] or a product of lengths. Names replace equal coefficients.
-        tolerance: Relative magnitude below which a column counts as dependent.
+        preference: Permutation of the column indices 0 to p - 1, most preferred column first.
+        lengths: Name -> coefficient, such as a length [m] or a product of lengths. In the names of base parameters, the
+            name replaces the value of the coefficient.
+        tolerance: Largest norm of the independent part of a dependent column, relative to the largest column norm.
     """
     scale = np.linalg.norm(regressor, axis=0).max()
     columns: list[int] = []
@@ -121,7 +124,7 @@ def reduce_to_base(
 
 
 def _snap_to_known(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDArray[np.float64]:
-    """Replaces coefficients within rounding error of 0, +-1 or a named length by the exact values."""
+    """Corrects coefficients that differ from 0, +-1 or a named length only by rounding errors."""
     known = np.array([0.0, 1.0, -1.0, *lengths.values(), *(-v for v in lengths.values())])
     nearest = known[np.argmin(np.abs(combination[..., None] - known), axis=-1)]
     return np.where(np.abs(combination - nearest) < 1e-9, nearest, combination)
@@ -143,7 +146,7 @@ def _format_combination(
         elif coefficient and parameter.axis:
             moments.append((coefficient, str(parameter)))
         elif coefficient:
-            # Rounding gives equal coefficients the same key, also if they have no name.
+            # After rounding, coefficients that differ only by rounding errors have the same key.
             groups.setdefault(round(coefficient, 12), []).append(parameter)
     terms = inertias + [(coefficient, _sum_of_masses(group)) for coefficient, group in groups.items()] + moments
     text = ""
@@ -158,7 +161,7 @@ def _format_combination(
 
 
 def _sum_of_masses(group: Sequence[StandardParameter]) -> str:
-    """Formats masses, e.g. "(m2+...+m7)" for more than three consecutive links or "(m2+m_coupler)" otherwise."""
+    """Formats a sum of masses: "(m2+...+m7)" for more than three consecutive links, otherwise e.g. "(m2+m_coupler)"."""
     if len(group) == 1:
         return str(group[0])
     numbers = [int(p.label) for p in group if p.label.isdigit()]

@@ -1,4 +1,4 @@
-"""Generates Python source and functions compiled with numba from symbolic expressions."""
+"""Generates Python source code and compiled functions (numba) from symbolic expressions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SharedTerms:
     """Array of expressions after common subexpression elimination.
 
     Attributes:
-        assignments: Symbol and expression of each common subexpression, in order of use.
+        assignments: Symbol and expression of each common subexpression, in the order of evaluation.
         entries: Index and expression of each array element that is not identically zero.
         shape: Shape of the array.
     """
@@ -48,15 +48,16 @@ def python_source(
     docstring: str = "",
     functions: Mapping[str, str] | None = None,
 ) -> str:
-    """Returns source of a Python function `name(*arguments, out)` that fills the array `out`.
+    """Returns the source of a Python function `name(*arguments, out)` that fills the array `out`.
 
     Args:
         name: Name of the function.
         arguments: Name and symbols of each argument. An argument with one symbol of the same name is a scalar. Other
             arguments are arrays with one element per symbol.
         terms: Expressions to compute.
-        docstring: Docstring of the function; none if empty.
-        functions: sympy function name -> function to call. By default, the functions of `math` are called.
+        docstring: Docstring of the function. If it is "", the function has no docstring.
+        functions: Name of a sympy function -> name of the function to call. By default, the functions of `math` are
+            called.
     """
     lines = [f"def {name}({', '.join(n for n, _ in arguments)}, out):"]
     if docstring:
@@ -75,7 +76,7 @@ def compile_function(
 ) -> Callable[..., None]:
     """Compiles the function of `python_source` with numba for float64. Arrays must be C-contiguous.
 
-    Sine and cosine are the functions of `trigonometry`.
+    Sine and cosine are computed by the functions in `trigonometry`.
     """
     namespace: dict[str, Any] = {"math": math, "sin": sin, "cos": cos}
     exec(python_source(name, arguments, terms, functions={"sin": "sin", "cos": "cos"}), namespace)
@@ -85,7 +86,7 @@ def compile_function(
 
 
 def compile_batch(function: Callable[..., None], num_arguments: int, shape: tuple[int, ...]) -> Callable:
-    """Compiles a loop of `function` over the rows of its first argument.
+    """Compiles a loop that calls `function` for each row of its first argument.
 
     Args:
         function: Compiled function with an output array of the given shape as its last argument.
@@ -116,7 +117,7 @@ def compile_batch(function: Callable[..., None], num_arguments: int, shape: tupl
 
 
 def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:
-    """Returns the machine code of a compiled function with one signature, which is called without type checks.
+    """Returns the machine code of a compiled function with one signature. Calls do not check types.
 
     The caller must pass arrays of exactly the compiled types.
     """
@@ -125,7 +126,7 @@ def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:
 
 
 def is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
-    """Returns whether an argument is a scalar, which has one symbol of the same name."""
+    """Returns whether an argument is a scalar. A scalar argument has a single symbol with the name of the argument."""
     return len(symbols) == 1 and symbols[0].name == name
 
 

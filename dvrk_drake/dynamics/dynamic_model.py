@@ -1,4 +1,4 @@
-"""Efforts of an identified arm in motion, from its links, rotors and drive effects."""
+"""Computes the efforts of an arm in motion from its identified links, rotors and drive effects."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from dvrk_drake.models.schema_fault import number_fault
 def effect_shapes(
     regressor: DynamicRegressor, effects: Sequence[ActuatorEffect], q: ArrayLike, v: ArrayLike
 ) -> Iterator[NDArray[np.float64]]:
-    """Yields the shape (m,) of each effect along its coordinate x = h a, starting from state 0.
+    """Yields the shape (m,) of each effect along its coordinate, starting from state 0.
 
-    The load of a coordinate is |h tau| / (h h), where tau are the actuator efforts that compensate gravity according to
-    the SDF.
+    The coordinate is x = h a for actuator positions a. The load of the coordinate is |h tau| / (h h). Here, tau are the
+    actuator efforts that compensate gravity according to the SDF.
 
     Args:
         regressor: Regressor of the arm.
@@ -47,22 +47,24 @@ def effect_shapes(
 
 
 def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.float64]:
-    """Returns the actuator efforts (m, n) [N m, N] that compensate gravity at poses q (m, n), for the SDF's links."""
+    """Returns the actuator efforts (m, n) [N m, N] that compensate gravity at poses q (m, n), according to the SDF."""
     rest = np.zeros_like(q, dtype=np.float64)
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: Largest gravity effort of an actuator that carries no weight [N m, N].
+#: Gravity effort above which an actuator compensates gravity [N m, N]. Smaller efforts are rounding errors.
 MIN_WEIGHT = 1e-9
-#: Number of random poses at which the gravity efforts are computed.
+#: Number of random poses at which the gravity efforts are compared with `MIN_WEIGHT`.
 WEIGHING_POSES = 20
 
 
 class DynamicModel:
     """Dynamic model of one arm: tau_actuator = J'^-1 Y(q, v, vd) phi + sum of effects.
 
+    J is the matrix of `Arm.transmission`.
+
     Attributes:
-        arm: Arm of the model, with the gravity vector of the section.
+        arm: Arm of the model, with the gravity vector of `section`.
         section: Parameters of the model.
         regressor: Regressor of the rigid-body dynamics.
         parameters: Parameters phi (p,) of `regressor`.
@@ -81,7 +83,7 @@ class DynamicModel:
         self.regressor = DynamicRegressor(self.arm)
         check_section(self.regressor, section)
         phi = [x for link in section.links for x in link.parameters] + [rotor.value for rotor in section.rotors]
-        # Elements that couple two rotors are 0, because no motor has them (see `rotor_inertias`).
+        # Parameters that couple two rotors are 0, because real motors have no such coupling (see `rotor_inertias`).
         self.parameters = np.concatenate([phi, np.zeros(len(self.regressor.values) - len(phi))])
         self.effects = tuple(map(ActuatorEffect.of, section.effects))
         self.coefficients = np.array([e.coefficient for e in section.effects])
@@ -93,11 +95,12 @@ class DynamicModel:
 
     @cached_property
     def holding_effects(self) -> tuple[int, ...]:
-        """Indices of the effects that act at rest as they do in motion.
+        """Indices of the effects that have the same torque at rest and in motion.
 
-        These are the position-dependent effects, except the offset of an actuator that carries weight. Such an offset
-        can be an error of the gravity model or direction-dependent friction, which are not present at rest. If the
-        coordinate also has a cable cosine, the offset is part of that curve and is included.
+        These are the position-dependent effects, except the offset of an actuator that compensates gravity. Such an
+        offset can be caused by an error of the gravity model or by direction-dependent friction, so the offset may be
+        wrong at rest. If the coordinate also has a cable cosine, the offset is part of the cable torque and is
+        included.
         """
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
         poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))
@@ -127,7 +130,8 @@ class DynamicModel:
     def effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """Returns the actuator efforts (m, n) [N m, N] for an evenly sampled joint motion (m, n).
 
-        Effects with memory start from state 0 at the first sample. Effects with a small travel require 400 Hz or more.
+        Effects with a state start from state 0 at the first sample. Presliding effects with a small travel require a
+        sampling rate of 400 Hz or more.
         """
         return self.rigid_body_effort(q, v, vd) + self.effect_effort(q, v)
 

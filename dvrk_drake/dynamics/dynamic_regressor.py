@@ -1,4 +1,4 @@
-"""Regressor of an arm's full dynamics, and its base parameters, which a motion can identify."""
+"""Computes the regressor of an arm's full dynamics and the corresponding base parameters."""
 
 from __future__ import annotations
 
@@ -32,22 +32,24 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Number of samples per regressor in `torque`.
+#: Number of samples in a chunk, for which `torque` computes one regressor.
 _CHUNK = 256
 
 
 class DynamicRegressor:
     """Regressor Y of the inverse dynamics tau = Y(q, v, vd) phi of an arm, including linkage and rotors.
 
-    tau is the torque on the n independent joints. phi (p,) contains the ten inertial parameters of every moving link,
-    then the inertias of the rotors in actuator coordinates. The parameters of a link are about the origin of its SDF
-    frame and expressed in this frame. The joints are read from the arm's MultibodyPlant. tau equals the plant's inverse
-    dynamics minus gravity forces, projected through the linkage with G'. Friction and joint damping are not included.
+    tau (n,) are the efforts of the independent joints [N m, N]. phi (p,) contains the ten inertial parameters of every
+    moving link, then the inertias of the rotors in actuator coordinates. The parameters of a link are about the origin
+    of its SDF frame and expressed in this frame. The joints are read from the arm's MultibodyPlant. Without friction
+    and joint damping, tau equals G' (tau_id - tau_g). Here, tau_id is the inverse dynamics of the plant, tau_g are its
+    generalized gravity forces, and G is the matrix of `Arm.linkage`.
 
     Attributes:
-        arm: Arm of the regressor. Its `gravity` specifies the mounting.
-        links: Moving links with the parameters of their SDF, in the order of the columns.
-        rotors: Rotor parameters, in the order of their columns, which follow those of the links.
+        arm: Arm of the regressor. Its `gravity` specifies the orientation of the base.
+        links: Moving links with their parameters in the SDF, in the order of the regressor columns.
+        rotors: Rotor parameters, in the order of their regressor columns. These columns follow the columns of the
+            links.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -80,7 +82,7 @@ class DynamicRegressor:
 
     @cached_property
     def values(self) -> NDArray[np.float64]:
-        """Parameters (p,) of the SDF."""
+        """Parameters phi (p,) of the SDF."""
         return np.concatenate([*(link.parameters for link in self.links), [rotor.value for rotor in self.rotors]])
 
     def regressor(
@@ -94,7 +96,7 @@ class DynamicRegressor:
                 so callers that process many samples in chunks should reuse one.
 
         Raises:
-            ModelError: The arrays do not have these shapes, or `out` is not C-contiguous float64.
+            ModelError: The arrays do not have the required shapes, or `out` is not C-contiguous float64.
         """
         motion = self._checked_motion(q, v, vd)
         shape = (*motion[0].shape, len(self.names))
@@ -184,9 +186,9 @@ _AXES = tuple(parameter_axis(name) for name in PARAMETER_NAMES)
 class DynamicBaseParameters:
     """Base parameters beta = base.combination phi_F, with tau = Y_base beta = Y phi for every motion.
 
-    phi_F (p,) contains the ten parameters of each link in its frame dh_<label>, then the parameters of the rotors. A
-    link without such a frame uses its SDF frame. `base.names` refer to phi_F. phi (p,) contains the parameters of
-    `DynamicRegressor`, in the SDF frames.
+    phi_F (p,) contains the ten parameters of each link in its frame dh_<label>, then the parameters of the rotors. For
+    a link without such a frame, the SDF frame is used. `base.names` refers to phi_F. phi (p,) contains the parameters
+    of `DynamicRegressor`, in the SDF frames.
 
     Attributes:
         standard_parameters: Standard parameters phi_F (p,).
@@ -208,12 +210,13 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
     """Derives the base parameters numerically from the regressor at random states.
 
     The states are chosen so that gravity, velocity and acceleration terms have similar magnitude. The base parameters
-    depend on the mounting: on a tilted arm, additional parameters of the first links can affect the torque.
+    depend on the orientation of the base. If the base is tilted, additional parameters of the first links can affect
+    the torque.
 
     Args:
         model: Regressor of the arm.
-        coupled_rotors: False to exclude the coupling terms between two rotors, which no motor has (see
-            `rotor_inertias`). These are the last columns of the regressor, and p is reduced by their number.
+        coupled_rotors: False to exclude the terms that couple two rotors. Real motors have no such terms (see
+            `rotor_inertias`). The last columns of the regressor belong to these terms, so p is reduced by their number.
 
     Raises:
         ArmError: The arm's SDF has no frames dh_1, dh_2, ...
@@ -244,7 +247,7 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
 def _link_frames(
     model: DynamicRegressor, plant: MultibodyPlant, bodies: dict[str, tuple[RigidBody, RigidTransform]]
 ) -> list[tuple[str, RigidTransform]]:
-    """Returns label and X_LF of each link of the model.
+    """Returns the label and the pose X_LF of frame F for each link of the model.
 
     The label of a link without a dh frame is its name in the SDF without the suffix "_link".
     """
@@ -253,7 +256,7 @@ def _link_frames(
 
 
 def _regressor_at_random_states(model: DynamicRegressor) -> NDArray[np.float64]:
-    """Returns regressor rows (rows, p) at random states, about three times as many rows as columns."""
+    """Returns regressor rows (rows, p) at random states. There are about three times as many rows as columns."""
     generator = np.random.default_rng(0)
     shape = (3 * len(model.values) // model.arm.num_joints + 1, model.arm.num_joints)
     q, v, vd = generator.uniform(-2, 2, shape), generator.normal(0, 2, shape), generator.normal(0, 5, shape)
@@ -263,7 +266,7 @@ def _regressor_at_random_states(model: DynamicRegressor) -> NDArray[np.float64]:
 def _hinge_axes(
     plant: MultibodyPlant, model: DynamicRegressor, frames: list[tuple[str, RigidTransform]]
 ) -> dict[str, int]:
-    """Returns label -> index (0, 1, 2) of the axis of frame F parallel to the joint axis, for revolute joints."""
+    """Returns label -> index (0, 1, 2) of the axis of frame F that is parallel to the axis of a revolute joint."""
     axes = {}
     for link, (label, X_LF) in zip(model.links, frames, strict=True):
         joints = (plant.get_joint(i) for i in plant.GetJointIndices())
@@ -275,12 +278,13 @@ def _hinge_axes(
 
 
 def _preference_order(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
-    """Returns the columns in the order of preference as base parameters.
+    """Returns the column indices, with the columns that are preferred for base parameters first.
 
     Three parameters of a revolute link with axis u can be regrouped with the previous link. They are the mass, the
-    first moment along u and one moment of inertia about an axis perpendicular to u. These parameters come last, in the
-    order from base to tip. Numbered links precede the links of the linkage. Rotors follow the links, and masses are
-    last. Reference: Khalil and Dombre, "Modeling, Identification and Control of Robots", 9.4.2.
+    first moment along u and one moment of inertia about an axis perpendicular to u. The order is: link parameters that
+    cannot be regrouped, from tip to base; moments that can be regrouped, from base to tip; rotors; masses, from base to
+    tip. In each group, the links of the linkage follow the numbered links. Reference: Khalil and Dombre, "Modeling,
+    Identification and Control of Robots", 9.4.2.
     """
 
     def is_regrouped(p: StandardParameter) -> bool:
@@ -300,7 +304,7 @@ def _preference_order(parameters: list[StandardParameter], hinge_axes: dict[str,
 
 
 def _named_coefficients(lengths: dict[str, float]) -> dict[str, float]:
-    """Returns named coefficients of base parameters: numbers, lengths, and their products, squares and ratios."""
+    """Returns name -> coefficient of base parameters: numbers, lengths, and products, squares and ratios of lengths."""
     lengths = {name: length for name, length in lengths.items() if name != "1"}
     named = {**lengths, **{f"{name}^2": length**2 for name, length in lengths.items()}}
     for (a, x), (b, y) in itertools.permutations(lengths.items(), 2):

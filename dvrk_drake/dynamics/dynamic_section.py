@@ -1,6 +1,6 @@
 """Section of a model file with an arm's full dynamics."""
 
-# No postponed annotations here: yaml_load_typed reads the types at run time.
+# This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
 
 from dvrk_drake.models.arm_schema import GRAVITIES
@@ -24,9 +24,10 @@ class LinkEstimate:
         link: Name of the link.
         parameters: Estimated inertial parameters (10,).
         least_eigenvalue: Smallest eigenvalue of the pseudo-inertia. It is positive for a physically consistent link.
-        standard_errors: Standard errors (10,) of the individual parameters. Base parameters have smaller ones.
+        standard_errors: Standard errors (10,) of the individual parameters. The standard errors of base parameters are
+            smaller.
         mass_identifiability: Relative reduction of the prior variance of the mass by the motion, 0 to 1. Near 0, the
-            mass is that of the SDF.
+            estimate is close to the mass in the SDF.
         bounds: Descriptions of the bounds of `consistent_parameters` that the link has reached.
     """
 
@@ -40,7 +41,7 @@ class LinkEstimate:
 
 @dataclass
 class MotionParameterEstimate:
-    """A base parameter of the full dynamics, see `derive_base_parameters`.
+    """Estimate of a base parameter of the full dynamics, see `derive_base_parameters`.
 
     `identifiability` is the relative reduction of the prior variance by the motion, 0 to 1.
     """
@@ -72,11 +73,12 @@ class RotorEstimate:
 
 @dataclass
 class ActuatorStatistics:
-    """Statistics of the fit of one actuator's effort after low-pass filtering: RMS in N m (N if prismatic).
+    """RMS effort and RMS errors of one actuator after low-pass filtering [N m; N if prismatic].
 
-    `rms_cross_validation` is the prediction error on held-out phases of the motion, or on held-out segments if the
-    motion is not periodic. Effects and gravity direction are estimated anew without the held-out part.
-    `rms_repeatability` is the variation of the effort between periods, 0 if unknown.
+    `rms_cross_validation` is the RMS prediction error on held-out phases of the motion, or on held-out segments if the
+    motion is not periodic. Effects and gravity direction are estimated again without the held-out part.
+    `rms_repeatability` is the RMS difference of the effort between periods, divided by sqrt(2). This value is 0 if the
+    motion does not repeat.
     """
 
     name: str = ""
@@ -100,9 +102,10 @@ class SignalSettings:
 class DynamicSection:
     """Identified dynamics of an arm: tau_actuator = J'^-1 Y(q, v, vd) phi + effects.
 
-    `gravity` [m/s^2] is the gravity vector in the base frame as estimated from the motion. `gravity_expected` is the
-    vector assumed before identification; the two differ if the base was tilted. `base_parameters` are the identifiable
-    combinations of link and rotor parameters. `correlations` lists pairs that are not identifiable separately.
+    `gravity` is the gravity vector that was estimated from the motion, in the base frame [m/s^2]. `gravity_expected` is
+    the vector that was assumed before identification. The two vectors differ if the base was tilted. `base_parameters`
+    are the identifiable combinations of link and rotor parameters. `correlations` lists pairs of parameters that are
+    not identifiable separately.
     """
 
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)

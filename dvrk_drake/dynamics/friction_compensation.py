@@ -16,16 +16,17 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm import Arm
 
-#: Largest travel before sliding of a presliding element that counts as holding the arm at rest [rad, m].
+#: Largest travel before sliding [rad, m] of the presliding effects that are assumed to hold the arm at rest.
 HOLDING_TRAVEL = 0.015
-#: Largest width of the smoothed sign of a Coulomb effect that counts as holding the arm at rest [rad/s, m/s].
+#: Largest width of the smoothed sign [rad/s, m/s] of the Coulomb effects that are assumed to hold the arm at rest.
 HOLDING_SPEED = 0.25
 #: Largest share of the friction that may be compensated. On another day, an arm may have a third less friction than
 #: identified (docs/dynamics.md). The compensation must never exceed the actual friction.
 MAX_RATIO = 0.6
-#: Largest share of hysteresis (see `Friction.springs_back`) that may be compensated.
+#: Largest share of the hysteresis effects (see `Friction.springs_back`) that may be compensated.
 MAX_HYSTERESIS_RATIO = 0.9
-#: Assumed ratio of a model's largest holding error to its leave-one-out RMS error. Simulated arms rarely exceed it.
+#: Assumed ratio of the largest error of the holding torque to the leave-one-out RMS error of a model. The ratio is
+#: rarely larger on simulated arms.
 HOLDING_ERROR_FACTOR = 2.0
 
 
@@ -34,7 +35,7 @@ class Friction:
     """Friction in the drive of an arm, as a sum of dissipative effects.
 
     Attributes:
-        arm: Arm of the friction.
+        arm: Arm with this friction.
         effects: Dissipative effects, see `EFFECT_KINDS`.
         coefficients: Nonnegative coefficients (k,) of the effects, in the units of their kinds.
     """
@@ -45,7 +46,7 @@ class Friction:
 
     @classmethod
     def of(cls, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: ArrayLike) -> Friction:
-        """Returns the dissipative effects of an arm. Load-dependent friction and other effects are omitted.
+        """Selects the friction from the effects of an arm. Load-dependent friction is omitted.
 
         Args:
             arm: Arm of the effects.
@@ -74,7 +75,7 @@ class Friction:
 
     @classmethod
     def of_arm(cls, arm: Arm) -> Friction:
-        """Returns the friction of the arm's files, without effects that decrease with speed.
+        """Returns the friction that the arm's files define, without effects that decrease with speed.
 
         Compensation of such effects would accelerate a moving arm.
 
@@ -102,7 +103,7 @@ class Friction:
 
     @property
     def rows(self) -> NDArray[np.float64]:
-        """Matrix (k, n) from joint velocities to the velocities of the effects' coordinates. See `joint_row`."""
+        """Matrix (k, n) that maps joint velocities to the velocities of the effects' coordinates. See `joint_row`."""
         return np.array([joint_row(self.arm, e.coordinate) for e in self.effects]).reshape(-1, self.arm.num_joints)
 
     @property
@@ -113,7 +114,7 @@ class Friction:
 
     @property
     def springs_back(self) -> NDArray[np.bool_]:
-        """Mask (k,), True for hysteresis that moves a released arm back by more than `HOLDING_TRAVEL`."""
+        """Mask (k,), True for presliding effects that can move a released arm back by more than `HOLDING_TRAVEL`."""
         return np.array([e.kind == "presliding" and e.scale > HOLDING_TRAVEL for e in self.effects], bool)
 
 
@@ -121,7 +122,7 @@ def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
     """Checks the requested compensation ratios.
 
     Raises:
-        ControllerError: A ratio is below 0, or above `MAX_RATIO` or `MAX_HYSTERESIS_RATIO`.
+        ControllerError: A ratio is below 0 or above its limit, `MAX_RATIO` or `MAX_HYSTERESIS_RATIO`.
     """
     for name, share, largest in (
         ("friction ratio", ratio, MAX_RATIO),
@@ -134,22 +135,22 @@ def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
 def safe_ratios(
     friction: Friction, ratio: float, holding_error: ArrayLike, hysteresis_ratio: float = 0.0
 ) -> NDArray[np.float64]:
-    """Returns the largest share of each effect that can be compensated while the remaining friction holds the arm.
+    """Returns the largest compensation ratio of each effect for which the remaining friction holds the arm.
 
     The remaining friction must hold the arm at rest for every torque error e with |e_i| <= holding_error_i. This means
     that there are forces f_k along the coordinates with sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k.
-    The set of errors is convex, so it is sufficient to check its corners. A linear program computes the largest ratios
-    for each group of joints that share coordinates. If the friction of a group cannot hold the error even without
-    compensation, the ratios of this group are 0.
+    The set of errors is a box, so it is sufficient to check the corners of this box. A linear program computes the
+    largest ratios for each group of joints that share coordinates. If the friction of a group cannot balance the errors
+    even without compensation, the ratios of this group are 0.
 
     Args:
         friction: Friction of the arm.
         ratio: Requested ratio, 0 to `MAX_RATIO`.
         holding_error: Largest error (n,) of the gravity compensation [N m, N].
-        hysteresis_ratio: Requested ratio of effects with `Friction.springs_back`, 0 to `MAX_HYSTERESIS_RATIO`. It is
-            used if it exceeds `ratio`. These effects do not hold the arm where it was released, so all of them may be
-            compensated. The total compensation along a coordinate is at most `MAX_RATIO` of its friction without
-            viscous effects. Hysteresis has priority over other friction.
+        hysteresis_ratio: Requested ratio of effects with `Friction.springs_back`, 0 to `MAX_HYSTERESIS_RATIO`. Values
+            up to `ratio` are ignored. These effects do not hold a released arm at its pose, so compensating them does
+            not reduce the holding friction. The total compensation along a coordinate is at most `MAX_RATIO` times the
+            friction along this coordinate, excluding viscous friction. Hysteresis is compensated before other friction.
 
     Returns:
         Ratios (k,) of the effects.
@@ -190,10 +191,10 @@ def safe_ratios(
 def _largest_ratios(
     rows: NDArray[np.float64], holding: NDArray[np.float64], error: NDArray[np.float64], most: float
 ) -> NDArray[np.float64]:
-    """Returns the largest ratios (c,) of coordinates for which the remaining friction holds all errors.
+    """Returns the largest ratios (c,) of the coordinates for which the remaining friction balances all errors.
 
     Args:
-        rows: Matrix (c, j) from joint velocities to velocities of the coordinates.
+        rows: Matrix (c, j) that maps joint velocities to the velocities of the coordinates.
         holding: Friction (c,) that holds the arm at rest, along each coordinate.
         error: Largest errors (j,) of the gravity compensation [N m, N].
         most: Upper bound of the ratios.
@@ -217,7 +218,7 @@ def _largest_ratios(
 def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
     """Returns the assumed error (n,) of the model's gravity torque [N m, N].
 
-    It is `HOLDING_ERROR_FACTOR` times the leave-one-out RMS error. It is zero for a model that was not identified from
-    static poses.
+    The assumed error is `HOLDING_ERROR_FACTOR` times the leave-one-out RMS error. The assumed error is zero for a model
+    that was not identified from static poses.
     """
     return HOLDING_ERROR_FACTOR * np.array([joint.rms_leave_one_out_included for joint in model.joints])

@@ -27,9 +27,9 @@ class GravityParameters:
     Attributes:
         arm: Arm of the links.
         standard_parameters: Mass and first moments of every link, in the link frames of the SDF.
-        to_standard: Matrix (p, 10 l) from the ten parameters of each link, in the order of `link_inertias`, to the
-            standard parameters. A rotor without a frame dh_<name> is balanced about its axis and part of the link that
-            carries the motor.
+        to_standard: Matrix (p, 10 l) that maps the ten parameters of each of the l links, in the order of
+            `link_inertias`, to the standard parameters. A rotor without a frame dh_<name> is balanced about its axis.
+            Such a rotor is treated as a part of the link that carries the motor.
         lengths: Name -> distance between link frames [m]. The names of the base parameters contain these names.
         base: Base parameters beta = base.combination standard_values, in the units base.units.
     """
@@ -51,7 +51,7 @@ class GravityParameters:
         return self.base.combination @ self.standard_values
 
     def combination_of(self, links: Sequence[str]) -> NDArray[np.float64]:
-        """Returns the matrix (b, 10 l) from the ten parameters of each of the l `links` to the base parameters."""
+        """Returns the matrix (b, 10 l) that maps the ten parameters of each of the l `links` to the base parameters."""
         order = [link.link for link in link_inertias(self.arm)]
         columns = [10 * order.index(link) + k for link in links for k in range(10)]
         return np.asarray(self.base.combination @ self.to_standard[:, columns])
@@ -62,9 +62,9 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
     """Returns the base parameters of an arm's gravity torque.
 
     Args:
-        arm: Arm whose gravity vector specifies the mounting.
+        arm: Arm whose gravity vector specifies the orientation of the base.
         frames: Prefix of the SDF frames in which the parameters are expressed: "dh" (dVRK) or, for an MTM, "paper".
-        serial: True to omit the links of the linkage (crank, coupler), as the paper does.
+        serial: True to omit the links of the linkage (crank, coupler), as in the paper.
 
     Raises:
         ArmError: The SDF has no frames with this prefix, gravity is less than 1 m/s^2, or `serial` is True and a joint
@@ -99,7 +99,7 @@ def _regressor_at_random_poses(
 
     The potential energy of a link is linear in mass and first moments. The factor of the mass is the height of the
     origin of frame F. The factors of the first moments are the upward components of the axes of F. The regressor
-    contains the derivatives of these factors.
+    contains the derivatives of these factors with respect to the joint positions.
     """
     up = -arm.gravity / np.linalg.norm(arm.gravity)
     points = [X_BF.multiply(np.hstack([np.zeros((3, 1)), np.eye(3)])) for _, X_BF in bodies]
@@ -122,10 +122,10 @@ def _regressor_at_random_poses(
 def _to_standard(
     plant: MultibodyPlant, arm: Arm, bodies: Sequence[tuple[RigidBody, RigidTransform]]
 ) -> NDArray[np.float64]:
-    """Returns the matrix (4 bodies, 10 l) from the parameters of all links to the mass and first moments of each body.
+    """Returns the matrix (4 k, 10 l) that maps the parameters of all l links to mass and first moments of k bodies.
 
-    The first moments are in frame F of the body. The rotation of a balanced rotor does not change the gravity torque.
-    Therefore the rotor is part of the body that carries the motor.
+    The first moments are expressed in frame F of the body. The rotation of a balanced rotor does not change the gravity
+    torque. Therefore the rotor is treated as a part of the body that carries the motor.
     """
     order = [link.link for link in link_inertias(arm)]
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(arm_instance(plant))]
@@ -142,10 +142,10 @@ def _to_standard(
 
 
 def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
-    """Returns the matrix (4, 4) from mass and first moments of a rotor C in its frame to those in its parent frame B.
+    """Returns the matrix (4, 4) that maps mass and first moments of a rotor from its frame C to its parent frame B.
 
     Raises:
-        ArmError: The joint is not revolute, or the centre of mass of C is not on the joint axis.
+        ArmError: The joint is not revolute, or the centre of mass of the rotor is not on the joint axis.
     """
     child = joint.child_body()
     if joint.type_name() != "revolute":
@@ -163,9 +163,10 @@ def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
 
 
 def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
-    """Returns label -> (moving body B, pose X_BF of the frame F of its parameters). Numbered links come first.
+    """Returns label -> (moving body B, pose X_BF of its frame F). Numbered links come first.
 
-    The label is the number of the frame <frames>_<number>, or the name of the frame dh_<name> for links of a linkage.
+    The parameters of the body are expressed in frame F. This is the frame <frames>_<number>, or dh_<name> for a link of
+    a linkage. The label is <number> or <name>.
 
     Raises:
         ArmError: The SDF has no numbered frames with the prefix `frames`.
@@ -187,7 +188,7 @@ def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
 
 
 def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns R with elements within rounding error of 0 or +-1 replaced by the exact values."""
+    """Returns R, with exact values for elements that differ from 0 or +-1 only by rounding errors."""
     return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
 
 
@@ -196,7 +197,7 @@ def named_lengths(
 ) -> dict[str, float]:
     """Returns name -> distance between the frames of neighbouring links [m], such as "L2" and "L_crank".
 
-    The entry "1" is 1.0, for coefficients without a length.
+    The entry "1" is 1.0, the factor of terms that contain no length.
     """
     context = plant.CreateDefaultContext()
     lengths = {"1": 1.0}
@@ -219,11 +220,11 @@ def named_lengths(
 
 
 def _preference_order(parameters: Sequence[StandardParameter]) -> list[int]:
-    """Returns parameter indices in the order of preference as base parameters.
+    """Returns parameter indices, with the parameters that are preferred as base parameters first.
 
     The order is: first moments of numbered links from tip to base, first moments of the linkage, masses from base to
-    tip. With this order, a mass is part of the first moments of preceding links. Only masses that a prismatic joint
-    lifts have a base parameter, such as "(m3+...+m7)".
+    tip. With this order, masses are combined with the first moments of preceding links. Only masses that a prismatic
+    joint lifts form a separate base parameter, such as "(m3+...+m7)".
     """
 
     def key(index: int) -> tuple:

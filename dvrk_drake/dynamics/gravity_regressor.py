@@ -23,7 +23,7 @@ class SymbolicGravity(GravityParameters):
     Attributes:
         q: Joint positions as symbols q1, ..., qn [rad, m].
         regressor: Y (n, b) as a function of q and `GRAVITY`.
-        potential: Row (1, b); potential beta is the part of the potential energy that depends on q [J].
+        potential: Row (1, b). The product potential beta is the part of the potential energy that depends on q [J].
     """
 
     q: tuple[sympy.Symbol, ...]
@@ -40,15 +40,15 @@ class SymbolicGravity(GravityParameters):
 def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> SymbolicGravity:
     """Derives the gravity torque of `arm` from its symbolic plant.
 
-    The potential energy P is linear in the mass and the first moments of each link. It is derived for the parameters
-    that are columns of the base set, as a function of the independent joint positions q. The regressor is its
-    derivative with respect to q.
+    The potential energy P is linear in the mass and the first moments of each link. P is derived as a function of the
+    independent joint positions q, per unit of each parameter in `base.columns`. The regressor is the derivative of P
+    with respect to q.
 
     Args:
         arm, frames, serial: Arguments of `gravity_parameters`.
 
     Raises:
-        ArmError: `gravity_parameters` raises it.
+        ArmError: `gravity_parameters` raises this error for the arguments.
     """
     parameters = gravity_parameters(arm, frames, serial)
     plant = SymbolicPlant(arm, frames)

@@ -37,13 +37,13 @@ from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 if TYPE_CHECKING:
     from dvrk_drake.dynamics.static_model import StaticModel
 
-# No postponed annotations here: yaml_load_typed reads the types at run time.
+# This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
 #: Format of the files that `IdentifiedModel.save` writes.
 FORMAT = "dvrk_drake identified model 4"
 #: Formats of earlier versions that can be read. In format 2, `arm` is a name or an absolute path.
 _EARLIER_FORMATS = ("dvrk_drake identified model 3", "dvrk_drake identified model 2")
-#: Measured positions, which may be beyond the limits of a joint.
+#: Allowed range of measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
 
 
@@ -61,7 +61,7 @@ class BaseParameterEstimate:
 
 
 def _earlier(name: str) -> dict[str, object]:
-    """Returns the metadata of an RMS effort without excluded measurements, whose key ended in `_undoubted`."""
+    """Returns the metadata of an RMS effort whose earlier key ended in `_undoubted`."""
     return RMS_EFFORTS | formerly(f"{name}_undoubted")
 
 
@@ -78,12 +78,13 @@ class JointStatistics:
         rms_fit_included: `rms_fit` without excluded measurements.
         rms_leave_one_out_included: `rms_leave_one_out` without excluded measurements.
         rms_cross_validation_included: RMS error of 10-fold cross-validation without excluded measurements. The effects
-            are selected anew in each fold.
+            are selected again for each fold.
         num_excluded: Number of excluded measurements.
-        feedforward_scale: Factor of the joint's torque, 0 to 1; less than 1 if the data do not support the model.
-        position_lower: Lower end of the range covered by the poses.
-        position_upper: Upper end of the range covered by the poses.
-        coverage: Ratio of the covered range to the arm's range.
+        feedforward_scale: Factor of the joint's torque, 0 to 1. It is less than 1 if the recording does not fully
+            support a feedforward.
+        position_lower: Lower end of the position range that the recording covers.
+        position_upper: Upper end of the position range that the recording covers.
+        coverage: Ratio of this position range to the range of the joint limits.
     """
 
     name: str = ""
@@ -121,7 +122,7 @@ class Provenance:
     version: str = ""
 
 
-#: Verdicts on a joint of a model, from most to least favourable; `off` means that the model commands no torque.
+#: Verdicts on a joint of a model, from most to least favourable. For `off`, the model commands no torque.
 Verdict = Literal["off", "good", "usable", "not judged", "do not use"]
 
 
@@ -173,18 +174,19 @@ class ModelFile(_Identified, _Header):
 class IdentifiedModel(_Identified):
     """Identified parameters of an arm.
 
-    The holding torque is tau = feedforward_scale o (Y(q) beta + effects(q)) [N m; N for a prismatic joint].
+    The holding torque is tau = feedforward_scale * (Y(q) beta + effects(q)) [N m; N for a prismatic joint]. The factor
+    is applied to each joint.
 
     Attributes:
-        arm: Arm with the mounting for which its base parameters were identified.
+        arm: Arm with the gravity vector for which the base parameters were identified.
         base_parameters: Base parameters in the order of `gravity_parameters(arm).base`. For a model identified from a
-            motion, they are computed from the links in `dynamics`.
-        effects: Position-dependent effects of a model identified from poses. Empty if the model has `dynamics`, which
-            contains all effects.
+            motion, the base parameters are computed from the links in `dynamics`.
+        effects: Position-dependent effects of a model identified from poses. The list is empty if the model has
+            `dynamics`, because `dynamics` contains all effects.
         joints: Statistics of the fit of each joint.
         provenance: Origin of the model.
-        dynamics: Full dynamics of a model identified from a motion.
-        validation: Result stored by `validate --save`.
+        dynamics: Full dynamics of a model identified from a motion, or None if the model contains only holding torques.
+        validation: Result that `validate --save` stored, or None.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -231,12 +233,12 @@ class IdentifiedModel(_Identified):
 
         Args:
             path: Path of the model file.
-            arm: Expected arm. A model of an arm with another name is rejected. The loaded model keeps the arm of its
-                file.
+            arm: Expected arm. A model of an arm with another name is rejected. The returned model has the arm that the
+                model file names, not this object.
 
         Raises:
-            ModelError: The file does not exist, is not a model file, does not match its arm, or is a model of another
-                arm than `arm`.
+            ModelError: The file does not exist, is not a model file, does not match the arm that it names, or is not a
+                model of `arm`.
         """
         content = load_yaml(path, ModelError)
         # Reject an unknown version before its keys are checked.
@@ -251,7 +253,7 @@ class IdentifiedModel(_Identified):
         try:
             own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
             if arm is not None and own_arm.name != arm.name:
-                raise ModelError(f"the model is of {own_arm.name}, not of {arm.name}")
+                raise ModelError(f"the model is for {own_arm.name}, not for {arm.name}")
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
         except ArmError as error:
@@ -307,7 +309,7 @@ class IdentifiedModel(_Identified):
 
     @property
     def holding_effects(self) -> list[DriveEffect]:
-        """Effects that act at rest as they do in motion (see `DynamicModel.holding_effects`)."""
+        """Effects that have the same torque at rest and in motion (see `DynamicModel.holding_effects`)."""
         if self.dynamics is None:
             return self.effects
         return [self.dynamics.effects[i] for i in self.dynamic_model.holding_effects]
@@ -319,7 +321,7 @@ class IdentifiedModel(_Identified):
 
     @property
     def feedforward_scale(self) -> NDArray[np.float64]:
-        """Factor (n,) of each joint's torque."""
+        """Factors (n,) of the joint torques."""
         return np.array([joint.feedforward_scale for joint in self.joints])
 
     @cached_property
@@ -360,9 +362,10 @@ class ControlModel:
         """Compiles the gravity effort of `model` and reads its inertial parameters.
 
         Args:
-            model: Model of the arm with its actual mounting. A model identified from poses has no inertias, so those
-                of the arm's SDF are used.
+            model: Model of the arm with the actual orientation of its base. A model identified from poses has no
+                inertias, so the inertias of the arm's SDF are used.
             with_gravity: False for an arm whose own controller adds gravity compensation to all efforts.
+                `gravity_effort` then returns 0.
 
         Raises:
             ModelError: The model does not match its arm.
@@ -387,19 +390,19 @@ class ControlModel:
         return effort * self._scale
 
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], rotors included."""
+        """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], including the rotors."""
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
 
 
 def _arm_reference(path: str | Path, arm: Arm) -> str:
-    """Returns the name of the arm in the model file at `path`: a URL, or a path relative to that file."""
+    """Returns the reference to the arm in the model file at `path`: a URL, or a path relative to this file."""
     if not os.path.isabs(arm.source):
         return f"{PACKAGE_URL}arms/{arm.source}.yaml"
     return os.path.relpath(arm.source, os.path.dirname(os.path.realpath(path)))
 
 
 def _arm_argument(path: str | Path, name: str) -> str:
-    """Returns the argument of `load_arm` for the arm that the model file at `path` calls `name`."""
+    """Returns the argument of `load_arm` for the arm that has the reference `name` in the model file at `path`."""
     if not name.endswith((".yaml", ".yml")) or name.startswith(PACKAGE_URL):
         return name
     return os.path.join(os.path.dirname(os.path.realpath(path)), name)

@@ -1,4 +1,4 @@
-"""Inertial parameters of links and rotors, in which the equations of motion are linear."""
+"""Inertial parameters of links and rotors. The equations of motion are linear in these parameters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LinkInertia:
     def pseudo_inertia(self) -> NDArray[np.float64]:
         """Returns the pseudo-inertia (4, 4), the integral of (p, 1)(p, 1)' dm over points p of the link.
 
-        It is positive definite for every body with a volume.
+        The pseudo-inertia of every body with a volume is positive definite.
 
         Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
         identification" (2018), equation 10.
@@ -108,7 +108,7 @@ def parameters_from_pseudo_inertia(J: ArrayLike) -> NDArray[np.float64]:
 
 
 def change_of_frame(X_LF: RigidTransform) -> NDArray[np.float64]:
-    """Returns the matrix (10, 10) from a body's parameters about Fo in frame F to its parameters about Lo in frame L.
+    """Returns the matrix (10, 10) that maps a body's parameters about Fo in frame F to those about Lo in frame L.
 
     A point of the body is (p_L, 1) = X_LF (p_F, 1), so the pseudo-inertia is J_L = X_LF J_F X_LF'.
     """
@@ -123,8 +123,9 @@ class RotorInertia:
     The joint torque due to the rotors is tau = J' D J vd, where J is the matrix of `arm.transmission`.
 
     Attributes:
-        actuators: Names of the row and the column of D. An actuator has the name of the joint in the same row of the
-            transmission. Elements with different names are artefacts of the SDF format, see `rotor_inertias`.
+        actuators: Names of the actuators of the row and the column of D. An actuator has the name of the joint in the
+            same row of the transmission. Elements of D with two different names are artefacts of the SDF format, see
+            `rotor_inertias`.
         value: Value according to the SDF [kg m^2; kg for a prismatic actuator].
     """
 
@@ -142,9 +143,9 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
     """Returns the rotor inertias according to `drake:rotor_inertia` and `drake:gear_ratio` in the SDF.
 
     The diagonal elements of all actuators come first, then the nonzero elements that couple two actuators. Drake adds
-    gear^2 * inertia to the diagonal of the mass matrix in joint coordinates. If the transmission couples joints with
-    rotors, as in the PSM's wrist, the matrix is not diagonal in actuator coordinates. Real motors have no coupling
-    elements, so identification omits them. The value is 0 for a rotor that the SDF models as a link.
+    gear^2 * inertia to the diagonal of the mass matrix in joint coordinates. If the transmission couples joints that
+    have rotors, as in the PSM's wrist, D is not diagonal. Real motors do not cause such coupling elements, so
+    identification omits these elements. The value is 0 for a rotor that the SDF models as a link.
     """
     D_tree = np.zeros((len(arm.tree_joint_names),) * 2)
     for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
@@ -165,7 +166,7 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
 
 
 def rotor_links(arm: Arm) -> set[str]:
-    """Returns the links of the SDF without a frame dh_<name>, which are rotors balanced about their axes."""
+    """Returns the links without a frame dh_<name>. These links are rotors that are balanced about their axes."""
     plant = shared_plant(arm)
     frames = [plant.get_frame(i) for i in plant.GetFrameIndices(plant.GetBodyByName("base_link").model_instance())]
     framed = {frame.body().name() for frame in frames if frame.name().startswith("dh_")}

@@ -19,7 +19,7 @@ from dvrk_drake.models.arm import Arm
 class KinematicTree:
     """Moving links C of an arm with their parents P and inboard joints. Each parent precedes its children.
 
-    The same formulas represent revolute, prismatic and fixed joints. They use the joint coordinate x = G q + c:
+    With the joint coordinate x = G q + c, the same formulas represent revolute, prismatic and fixed joints:
 
         X_PC(x) = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3,    V_PC_C = H dx/dt.
 
@@ -27,8 +27,10 @@ class KinematicTree:
         links: Names of the l links.
         parents: Indices (l,) of the parents, -1 for the base.
         pose_terms: Matrices T0 to T3 (l, 4, 3, 4), each with a rotation part and a translation part [m].
-        hinges: Hinge vectors H (l, 6), angular then linear velocity of Co per unit of dx/dt, expressed in C.
-        G: Matrix (l, n) from the independent joint positions q to the joint coordinates; 0 for fixed joints.
+        hinges: Hinge vectors H (l, 6). They contain the angular velocity of C and the velocity of its origin Co,
+            relative to P, per unit of dx/dt, expressed in C.
+        G: Matrix (l, n) that maps the independent joint positions q to the joint coordinates. The rows of fixed joints
+            are zero.
         c: Offsets (l,) of the joint coordinates [rad, m].
         affects: Mask (l, n), True where an independent joint moves a link.
     """
@@ -77,7 +79,7 @@ def _joints(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ...]:
-    """Returns the links in their order, except that each link follows its parent."""
+    """Returns the links in the given order, but with every parent before its children."""
     ordered: list[str] = []
 
     def add(link: str) -> None:
@@ -93,7 +95,7 @@ def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ..
 
 
 def _axis(joint: Joint) -> NDArray[np.float64]:
-    """Returns the unit axis (3,) of a joint, which is equal in its frames F and M. It is zero for a fixed joint."""
+    """Returns the unit axis (3,) of a joint in the joint frames F and M, or zero for a fixed joint."""
     match joint.type_name():
         case "revolute":
             return joint.revolute_axis()
@@ -105,7 +107,7 @@ def _axis(joint: Joint) -> NDArray[np.float64]:
 
 
 def _pose_terms(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
-    """Returns T0 to T3 (4, 3, 4) of X_PC = X_PF X_FM(x) X_MC. If P is anchored to the world, P is the base frame."""
+    """Returns T0 to T3 (4, 3, 4) of X_PC = X_PF X_FM(x) X_MC. The world frame replaces P if the parent is anchored."""
     X_FM = joint.X_FM() if joint.type_name() == "weld" else RigidTransform()
     X_PF, X_MC = _pose_in_parent(plant, joint), joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     x, y, z = _axis(joint)

@@ -23,14 +23,14 @@ def handle_frame(arm: Arm) -> str:
     """
     numbered = [name for name in _frame_names(shared_plant(arm)) if re.fullmatch(r"dh_\d+", name)]
     if not numbered:
-        raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; give the name of the handle's frame")
+        raise ArmError(f"{arm.name}: the SDF has no frames dh_0, dh_1, ...; give the name of the handle's frame")
     return max(numbered, key=lambda name: int(name.removeprefix("dh_")))
 
 
 class ArmFrame:
     """Kinematics of a frame F of an arm with base frame B.
 
-    Joint positions q are (n,) [rad; m for a prismatic joint]. An object must not be shared between threads.
+    Joint positions q have shape (n,) [rad; m for a prismatic joint]. Threads must not share an `ArmFrame`.
     """
 
     def __init__(self, arm: Arm, frame_name: str) -> None:
@@ -43,7 +43,7 @@ class ArmFrame:
         self._plant = shared_plant(arm)
         if not self._plant.HasFrameNamed(frame_name):
             known = ", ".join(_frame_names(self._plant))
-            raise ArmError(f'{arm.name}: its SDF has no frame "{frame_name}"; it has {known}')
+            raise ArmError(f'{arm.name}: the SDF has no frame "{frame_name}"; available frames: {known}')
         self._frame = self._plant.GetFrameByName(frame_name)
         self._context = self._plant.CreateDefaultContext()
         # G maps velocities of the independent joints to velocities of the plant.
@@ -88,11 +88,11 @@ class PsmInverseKinematics:
     The solution is unique, except for full revolutions of the roll, if two conditions hold. The wrist centre is beyond
     the remote centre of motion (RCM), and |wrist_pitch| < 90 degrees.
 
-    The wrist link has the length L and connects the wrist pitch axis to the wrist yaw axis. It lies in a plane with the
-    shaft and is perpendicular to the yaw axis. Therefore the direction d of the wrist link is the direction of the tip
-    position without its component along the yaw axis. The wrist centre p_tip - L d lies on the shaft, which passes
-    through the RCM. It determines yaw, pitch and insertion. The remaining rotation consists of roll, wrist pitch and
-    wrist yaw about z, x and y.
+    The wrist link has the length L and connects the wrist pitch axis to the wrist yaw axis. The wrist link lies in a
+    plane with the shaft and is perpendicular to the yaw axis. Therefore the direction d of the wrist link is the
+    direction of the tip position without its component along the yaw axis. The wrist centre p_tip - L d lies on the
+    shaft, which passes through the RCM. The position of the wrist centre determines yaw, pitch and insertion. The
+    remaining rotation consists of roll, wrist pitch and wrist yaw about z, x and y.
 
     Lengths and the pose of the frame on its link are read from the arm's SDF.
     """
@@ -136,7 +136,7 @@ class PsmInverseKinematics:
         """Returns the joint positions (6,) [rad, m], or None if there is no solution.
 
         There is no solution if the wrist centre is closer to the RCM than `min_depth`, or if the wrist pitch is 90
-        degrees or more. |yaw| > 135 degrees, which corresponds to a tip above the RCM, is not a solution either. Joint
+        degrees or more. Solutions with |yaw| > 135 degrees, for which the tip is above the RCM, are rejected. Joint
         limits are not checked.
 
         Args:

@@ -21,21 +21,23 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to that of the SDF (see `nearest_links`).
+#: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to the pseudo-inertia in the SDF (see
+#: `nearest_links`).
 MIN_EIGENVALUE_RATIO = 0.01
-#: Change of Z below which a link counts as unchanged.
+#: Largest change of an element of Z that is considered a rounding error.
 _ROUNDING = 1e-7
 _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
 
 
 def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
-    """Returns the links nearest to the SDF that are physically consistent and have the gravity torque Y(q) beta.
+    """Returns the physically consistent links with gravity torque Y(q) beta that are nearest to the SDF.
 
-    Z = L^-1 J L^-T is the pseudo-inertia J of a link relative to the pseudo-inertia J0 = L L' in the SDF. It is the
-    identity for an unchanged link of any size. The distance to the SDF is the sum of |Z - 1|^2 (Frobenius norm) over
-    the links. It is minimized subject to Z > MIN_EIGENVALUE_RATIO and to the linear equations of the gravity torque.
-    Distance and constraints do not depend on frames or units. The distance is a second-order approximation at J0 of the
-    distance by Lee, Wensing and Park, "Geometric robot dynamic identification" (2020).
+    Z = L^-1 J L^-T is the pseudo-inertia J of a link relative to the pseudo-inertia J0 = L L' in the SDF. Z is the
+    identity matrix for an unchanged link of any size. The distance to the SDF is the sum of |Z - 1|^2 (Frobenius norm)
+    over the links. This distance is minimized subject to the linear equations of the gravity torque. All eigenvalues of
+    Z must be at least MIN_EIGENVALUE_RATIO. The distance and the constraints do not depend on frames or units. The
+    distance is a second-order approximation at J0 of the distance defined by Lee, Wensing and Park, "Geometric robot
+    dynamic identification" (2020).
 
     Args:
         arm: Arm of the links.
@@ -45,7 +47,7 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
         ModelError: No physically consistent links have these base parameters, or the solver did not converge.
     """
     regressor = DynamicRegressor(arm)
-    # phi of a link is a linear function of the ten elements z of its Z. Rotors are not changed.
+    # The parameters phi of a link are a linear function of the ten elements z of Z. Rotors are not changed.
     maps = {i: _parameter_map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
@@ -68,7 +70,8 @@ def _parameter_map(link: LinkInertia) -> NDArray[np.float64]:
 def _is_rotor(arm: Arm, link: str) -> bool:
     """Returns whether a link has no frame dh_<name>.
 
-    Such a link is a rotor. Its centre of mass is on its axis (see `gravity_parameters`) and must remain there.
+    Such a link is a rotor. The centre of mass of a rotor is on its axis (see `GravityParameters`) and must remain on
+    this axis.
     """
     plant = shared_plant(arm)
     frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
@@ -80,7 +83,7 @@ def _equations(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns A and b of the equations A z = b, with one independent row per base parameter.
 
-    The equations are derived from random poses, not restricted to the joint limits.
+    The equations are derived from random poses, which are not restricted to the joint limits.
     """
     arm = regressor.arm
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (60, arm.num_joints))
@@ -92,14 +95,14 @@ def _equations(
     A = np.hstack([Y[:, 10 * i : 10 * i + 10] @ T for i, T in maps.items()])
     U, s, Vt = np.linalg.svd(A, full_matrices=False)
     rank = int(np.sum(s > 1e-9 * s[0]))
-    # Rows of unit norm, so that the solver's tolerance applies equally to all torques.
+    # The rows have unit norm, so that the tolerance of the solver has the same effect on all torques.
     return Vt[:rank], (U[:, :rank].T @ tau) / s[:rank]
 
 
 def _weights(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the weights of the squares in |Z - 1|^2 and the elements of the identity.
+    """Returns the weights of the squared elements of z in |Z - 1|^2, and the elements of the identity matrix.
 
-    Off-diagonal elements have weight 2.
+    Off-diagonal elements have weight 2, because z contains only the upper triangle of Z.
     """
     diagonal = np.array([i == k for i, k in _UPPER])
     return np.tile(np.where(diagonal, 1.0, 2.0), count), np.tile(diagonal.astype(float), count)
@@ -130,9 +133,10 @@ def _nearest_consistent(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArr
 
 
 def _refine(A: NDArray[np.float64], b: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Resets links that changed only by rounding, and satisfies the equations to machine precision with the others.
+    """Resets links that changed only by rounding errors, and corrects the other links to satisfy A z = b.
 
-    Clarabel satisfies the equations to 1e-8. This correction is much smaller than the distance to the cone boundary.
+    Clarabel satisfies the equations to 1e-8, and the correction satisfies them to machine precision. The correction is
+    much smaller than the distance of Z to the boundary of the positive semidefinite cone.
     """
     _, target = _weights(A.shape[1] // 10)
     changed = np.repeat(np.abs(z - target).reshape(-1, 10).max(axis=1) > _ROUNDING, 10)
@@ -159,7 +163,8 @@ class ModelBodies:
 
     Attributes:
         links: All moving links. A rotor that rotates with a link is part of this link, as in the SDF.
-        rotors: Joint -> reflected rotor inertia [kg m^2; kg for a prismatic joint]. If empty, those of the SDF apply.
+        rotors: Joint -> reflected rotor inertia [kg m^2; kg for a prismatic joint]. If it is empty, the rotor inertias
+            of the SDF apply.
         left_out: Descriptions of the terms of the model's torque that are not represented.
     """
 
@@ -171,8 +176,8 @@ class ModelBodies:
 def model_bodies(model: IdentifiedModel) -> ModelBodies:
     """Returns the links and rotors of a model.
 
-    A static model contains only base parameters of gravity. For such a model, the result is the links nearest to those
-    of the SDF that have exactly these base parameters.
+    A static model contains only base parameters of gravity. For a static model, the links are the result of
+    `nearest_links` for these base parameters.
 
     Raises:
         ModelError: No physically consistent links have these base parameters.
@@ -210,12 +215,13 @@ def _static_effects(model: IdentifiedModel) -> list[str]:
 def _assign_rotors(
     arm: Arm, links: dict[str, NDArray[np.float64]], inertias: list[float]
 ) -> tuple[dict[str, float], list[str]]:
-    """Assigns rotor inertias to joints, or adds them to `links` that rotate with the rotor.
+    """Assigns the inertia of each rotor to joints, or adds it to a link in `links` that rotates with the rotor.
 
-    A rotor adds I J_k' J_k to the mass matrix, where J_k is its row of the transmission. In SDF, a joint can represent
-    only the diagonal of this matrix. This is sufficient if a single joint moves the motor. If several joints move the
-    motor, the inertia is added to a link that rotates by J_k q, such as crank_link or motor_4_link. Half of the inertia
-    is added about each perpendicular axis, so that the link remains physically consistent.
+    A rotor adds I J_k' J_k to the mass matrix, where I is the rotor inertia and J_k is the row of the motor in the
+    transmission matrix. In SDF, a joint can represent only the diagonal of this matrix. This is sufficient if a single
+    joint moves the motor. If several joints move the motor, the inertia is added to a link that rotates by J_k q, such
+    as crank_link or motor_4_link. Half of the inertia is added about each perpendicular axis, so that the link remains
+    physically consistent.
 
     Returns:
         Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are not represented.
@@ -251,8 +257,8 @@ def _unit_rotor_inertia(axis: NDArray[np.float64]) -> NDArray[np.float64]:
 def _rotation_rates(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Returns link -> (rate, axis) for links with a revolute joint.
 
-    rate (n,) is the angular velocity about the joint axis per joint velocity. It includes parents with parallel axes.
-    axis (3,) is the joint axis in the link's frame.
+    rate (n,) is the angular velocity about the joint axis per joint velocity. The rate includes the rotation of parents
+    with parallel joint axes. axis (3,) is the joint axis in the link's frame.
     """
     context = plant.CreateDefaultContext()
     rotations: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}

@@ -64,7 +64,7 @@ def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
 
 
 def _shapes_of_links(arm: Arm) -> dict[str, BoundingShapes]:
-    """Returns link -> settings that belong to the first SDF file with this link."""
+    """Returns link -> bounding-box settings for the first SDF file that contains this link."""
     settings: dict[str, BoundingShapes] = {}
     for url, shapes in zip(arm.sdf, arm.identification.bounding_shapes, strict=True):
         names = [link.get("name", "") for link in compose_sdf([url]).iterfind("model/link")]
@@ -86,7 +86,7 @@ def _box_around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, li
         upper = np.maximum(upper, X_LB.translation() + half_width)
     if not np.all(np.isfinite(lower)):
         raise ArmError(
-            f"{link} has no <collision> in its SDF, so the bounds of its mass are unknown. Give it a box in "
+            f"{link} has no <collision> in its SDF, so its bounding box is unknown. Define a box for this link in "
             "bounding_shapes.boxes of the arm's mechanism or instrument file"
         )
     return BoundingBox(lower - margin, upper + margin)
@@ -95,19 +95,19 @@ def _box_around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, li
 def _box_from_corners(link: str, corners: BoxCorners) -> BoundingBox:
     lower, upper = np.array(corners.lower, float), np.array(corners.upper, float)
     if lower.shape != (3,) or upper.shape != (3,) or not np.all(lower < upper) or not np.isfinite(upper - lower).all():
-        raise ArmError(f"bounding_shapes: lower and upper of {link} must be three numbers each, lower below upper [m]")
+        raise ArmError(f"bounding_shapes: lower and upper of {link} must be three numbers each [m], with lower < upper")
     return BoundingBox(lower, upper)
 
 
-#: Lower bound on the eigenvalues of a pseudo-inertia [kg, kg m, kg m^2]. It is lower for a link whose smallest
+#: Lower bound on the eigenvalues of a pseudo-inertia [kg, kg m, kg m^2]. The bound is lower for a link whose smallest
 #: eigenvalue in the SDF is less than four times this value (see `least_eigenvalue_bound`).
 MIN_EIGENVALUE = 1e-9
-#: Lower and upper bound of a link's mass, as multiples of its mass in the SDF.
+#: Lower and upper bounds of the mass of a link, as multiples of its mass in the SDF.
 MASS_RANGE = 0.1, 5.0
-#: Tolerance of the sum of all link masses, relative to the sum in the SDF.
+#: Largest change of the total mass of all links, as a share of the total mass in the SDF.
 TOTAL_MASS_TOLERANCE = 0.2
-#: Weight of the log-det prior, in units of one squared standard deviation. It is the largest weight that increases the
-#: cross-validated error of no actuator by more than 0.1 % on the public motions.
+#: Weight of the log-det prior, in units of one squared standard deviation. On the public motions, it is the largest
+#: weight that increases the cross-validated error of each actuator by at most 0.1 %.
 LOG_DET_WEIGHT = 0.03
 #: Required relative accuracy of the solver. On the public motions and simulated arms, the cost is then within 0.0003 of
 #: the minimum, in units of one squared standard deviation.
@@ -115,18 +115,18 @@ _TOLERANCE = 1e-8
 #: Relative distance to a bound below which a parameter is considered to be at the bound.
 _AT_BOUND = 1e-3
 _UNITS = np.eye(10)
-#: Maximum step, as a fraction of the distance to the cone boundary. The values are tried in this order; the first is
-#: the default of Clarabel.
+#: Maximum steps of the solver, as fractions of the distance to the cone boundary. The values are tried in this order.
+#: The first is the default of Clarabel.
 _STEP_FRACTIONS = (0.99, 0.95, 0.9)
 
 
 @dataclass(frozen=True)
 class LinkScale:
-    """Characteristic mass and length of one link in the SDF, which scale its inertial parameters.
+    """Mass and length of one link in the SDF that define the scale of its inertial parameters.
 
     Attributes:
         mass: Mass [kg].
-        length: Distance of the centre of mass from the origin plus the radius of gyration [m].
+        length: Distance of the centre of mass from the origin of the link, plus the radius of gyration [m].
     """
 
     mass: float
@@ -142,7 +142,7 @@ class LinkScale:
 
     @property
     def deviations(self) -> NDArray[np.float64]:
-        """Prior standard deviations (10,) of the parameters about the values of the SDF, equal to their scale."""
+        """Scales (10,) of the inertial parameters, which are proportional to the prior standard deviations."""
         return self.mass * np.concatenate([[1.0], np.full(3, self.length), np.full(6, self.length**2)])
 
 
@@ -159,9 +159,9 @@ def consistent_parameters(
 
         trace(S0^-1 S) - log det S,    S = J - eps I,
 
-    where J is the pseudo-inertia of the link and S0 is S for the link of the SDF. The prior has its minimum at the
-    parameters of the SDF. It is infinite on the boundary of the consistent parameters, so J - eps I is positive
-    definite. Parameters that R does not determine keep the values of the SDF.
+    where J is the pseudo-inertia of the link, S0 is S for the link of the SDF, and eps is `least_eigenvalue_bound`. The
+    prior has its minimum at the parameters of the SDF. The prior is infinite on the boundary of the consistent
+    parameters, so J - eps I is positive definite. Parameters that R does not determine have the values of the SDF.
 
     The mass of each link and the total mass are bounded relative to the SDF (`MASS_RANGE`, `TOTAL_MASS_TOLERANCE`).
     The mass of a link must fit into its bounding box (`BoundingBox`). This means that along each axis, the mean square
@@ -169,13 +169,13 @@ def consistent_parameters(
     and implies that the centre of mass is inside the box.
 
     Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter identification"
-    (2018) describe the pseudo-inertia and the constraint trace(J Q) >= 0 of a bounding ellipsoid. Here, each axis has
-    one degenerate ellipsoid. Lee, Wensing and Park, "Geometric robot dynamic identification" (2020) describe the
+    (2018) describe the pseudo-inertia and the constraint trace(J Q) >= 0 of a bounding ellipsoid. Here, one degenerate
+    ellipsoid is used for each axis. Lee, Wensing and Park, "Geometric robot dynamic identification" (2020) describe the
     log-det prior.
 
     Args:
-        R, b: Compressed regressor (p, p) and efforts (p,), e.g. from a QR decomposition, in units of their standard
-            deviation. They include the rows of the Gaussian prior.
+        R, b: Compressed regressor (p, p) and efforts (p,), e.g. from a QR decomposition, in units of the standard
+            deviation of the efforts. Both include the rows of the Gaussian prior.
         links: Links of the SDF.
         boxes: Link -> bounding box of its mass.
         lower: Lower bounds (p,), -inf for unbounded parameters.
@@ -184,9 +184,10 @@ def consistent_parameters(
         IdentificationError: The solver did not converge.
     """
     program = MathematicalProgram()
-    # With z = R x, the cost is isotropic. With x, its curvature would vary by many orders of magnitude, even if scaled.
+    # As a function of z = R x, the cost is isotropic. As a function of x, the curvature of the cost would vary by many
+    # orders of magnitude, even after scaling.
     z = program.NewContinuousVariables(len(b), "z")
-    # With the links last, each of their parameters depends on few elements of z, and Clarabel's matrices are sparse.
+    # If the links are last, each link parameter depends on few elements of z, so Clarabel's matrices are sparse.
     order = np.roll(np.arange(len(b)), -10 * len(links))
     Q, triangle = np.linalg.qr(R[:, order])
     to_x = np.empty_like(R)
@@ -213,7 +214,10 @@ def consistent_parameters(
 
 
 def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
-    """Solves to full accuracy, with shorter steps if rounding errors prevent convergence with the default steps."""
+    """Solves the program to full accuracy.
+
+    If rounding errors prevent convergence, the program is solved again with shorter steps.
+    """
     for fraction in _STEP_FRACTIONS:
         options = SolverOptions()
         options.SetOption(ClarabelSolver.id(), "max_step_fraction", fraction)
@@ -244,7 +248,7 @@ def log_det_curvature(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> N
 def least_eigenvalue_bound(link: LinkInertia) -> float:
     """Returns the lower bound on the eigenvalues of a link's pseudo-inertia.
 
-    It is the smaller of `MIN_EIGENVALUE` and a quarter of the smallest eigenvalue in the SDF.
+    The bound is the smaller of `MIN_EIGENVALUE` and a quarter of the smallest eigenvalue in the SDF.
     """
     return min(MIN_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
@@ -260,7 +264,7 @@ def box_margins(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np
 def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: BoundingBox) -> list[str]:
     """Returns a description of each bound that the parameters (10,) of a link have reached."""
     bounds = [
-        f"mass at {limit:g} x the SDF's"
+        f"mass is {limit:g} x the mass in the SDF"
         for limit in MASS_RANGE
         if abs(parameters[0] / link.parameters[0] - limit) < _AT_BOUND * limit
     ]
@@ -268,7 +272,7 @@ def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: Boun
         axis for axis, margin in zip("xyz", box_margins(parameters, box), strict=True) if margin < _AT_BOUND
     )
     if sides:
-        bounds.append(f"mass fills its box along {sides}")
+        bounds.append(f"mass reaches its bounding box along {sides}")
     return bounds
 
 
@@ -279,7 +283,8 @@ def total_mass_reached(total: float, nominal: float) -> bool:
 
 def _add_prior(program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia) -> None:
     floor = least_eigenvalue_bound(link) * np.eye(4)
-    # With S0 = L L', Z = L^-1 S L^-T is the identity for the SDF's link of any size; log det S differs by a constant.
+    # With S0 = L L', Z = L^-1 S L^-T is the identity matrix for an unchanged link of any size. log det Z differs from
+    # log det S only by a constant.
     L_inverse = np.linalg.inv(np.linalg.cholesky(link.pseudo_inertia() - floor))
     units = np.array([L_inverse @ pseudo_inertia(unit) @ L_inverse.T for unit in _UNITS])
     Z = program.NewSymmetricContinuousVariables(4, "Z")
@@ -304,9 +309,9 @@ def _constrain_link(
 
 
 def _margin_matrix(box: BoundingBox) -> NDArray[np.float64]:
-    """Returns a matrix (3, 10) that maps parameters to the integral of 1 - (x - c)^2 / w^2 over the mass, per axis.
+    """Returns a matrix (3, 10) that maps parameters to the integrals of 1 - (x - c)^2 / w^2 over the mass.
 
-    c and w are center and half width of the box.
+    There is one integral for each axis x of the box. c is the center and w the half width of the box.
     """
     units = np.array([pseudo_inertia(unit) for unit in _UNITS])
     m, h, squares = units[:, 3, 3], units[:, :3, 3].T, units[:, [0, 1, 2], [0, 1, 2]].T

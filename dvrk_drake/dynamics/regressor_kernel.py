@@ -1,8 +1,9 @@
-"""Compiled recursion over the links of an arm that computes the dynamic regressor. One compilation serves all arms.
+"""Compiled recursion over the links of an arm, for the dynamic regressor. All arms use the same compiled code.
 
-The recursion processes blocks of `BLOCK` samples. Each quantity of the recursion is a row of that many samples, so that
-the compiler vectorises the loops over a block. The compiler does so only if it can prove that rows do not overlap and
-indices are not negative. Therefore each loop writes rows of one array, with sample s of row k at [k * BLOCK + s].
+The recursion processes blocks of `BLOCK` samples. Each quantity of the recursion is a row of `BLOCK` samples, so that
+the compiler can vectorise the loops over a block. The compiler vectorises a loop only if it can prove that rows do not
+overlap and indices are not negative. Therefore each loop writes rows of one array. Sample s of row k is at index
+k * BLOCK + s.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import numpy as np
 
 from dvrk_drake.dynamics.trigonometry import sin_cos
 
-#: Samples per block: enough for vector instructions, and few enough that the rows of a block fit into fast caches.
+#: Number of samples per block. It is large enough for vector instructions, and small enough that the rows of a block
+#: fit into fast caches.
 BLOCK = 64
 
 # "contract" allows fused multiply-add instructions, which round once instead of twice.
@@ -34,7 +36,8 @@ def fill_regressor(
         q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
         gravity: Gravity vector (3,) in the base frame [m/s^2].
         parents, pose_terms, hinges, G, c, affects: Attributes of `KinematicTree`.
-        rotors: Rows a and b (r, 2, n) of the rotor parameters. The torque is a (b . vd) + b (a . vd) per unit.
+        rotors: Rows a and b (r, 2, n) of the rotor parameters. Per unit of a parameter, the torque is
+            a (b . vd) + b (a . vd).
         out: Array that receives the regressor. Previous values are overwritten.
     """
     num_links, n = G.shape
@@ -44,7 +47,7 @@ def fill_regressor(
     links = np.empty((num_links, 21 * BLOCK))
     J = np.empty((num_links, n, 6 * BLOCK))
     torques = np.empty(10 * BLOCK)
-    # Gravity is represented by an upward acceleration of the base, which no joint moves.
+    # Gravity is represented by an upward acceleration of the base. No joint moves the base.
     base, fixed = np.zeros(21 * BLOCK), np.zeros(6 * BLOCK)
     for k in range(3):
         base[(9 + k) * BLOCK : (10 + k) * BLOCK] = -gravity[k]
@@ -166,10 +169,10 @@ def _move_link(X, H, joint, P, C):  # pragma: no cover - compiled
 
 @_compiled
 def _torques(X, H, factor, J_P, C, J_C, torques):  # pragma: no cover - compiled
-    """Fills J_C, and `torques` with ten rows: the joint torque J_C' f per unit of each parameter of link C.
+    """Fills J_C and `torques`. The ten rows of `torques` are J_C' f per unit of each parameter of link C.
 
-    J_C is J_P, shifted to Co, plus factor H. The wrench f has the force m a + [dw] h + [w]^2 h and the moment
-    h x a + I dw + w x I w.
+    J_C' f is the joint torque. J_C is J_P, transformed to C, plus factor * H. The wrench f has the force
+    m a + [dw] h + [w]^2 h and the moment h x a + I dw + w x I w.
     """
     h0, h1, h2, h3, h4, h5 = H[0] * factor, H[1] * factor, H[2] * factor, H[3] * factor, H[4] * factor, H[5] * factor
     for s in range(BLOCK):

@@ -1,4 +1,4 @@
-"""Compiled holding torque of an arm with any choice of effects, before scaling: tau = Y(q) beta + effects(q)."""
+"""Compiled holding torque tau = Y(q) beta + effects(q) of an arm with given effects, without the feedforward scale."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from dvrk_drake.models.arm import Arm
 
 @dataclass(frozen=True, eq=False)
 class StaticModel:
-    """Regressor and torque of one model structure (arm and effects), as functions of the parameters.
+    """Compiled regressor and holding torque of one model structure, which consists of an arm and effects.
 
     The parameters theta are the b base parameters [kg m, kg], then one coefficient per effect in the unit of its kind.
-    Each function is compiled at its first use, because a controller needs no regressor and identification no torque.
+    Each function is compiled at its first use, because a controller does not need the regressor and identification does
+    not need the torque.
 
     Attributes:
         gravity: Symbolic gravity torque.
@@ -97,13 +98,13 @@ def _number(x: float) -> sympy.Expr:
 
 @cache
 def compile_static_model(arm: Arm, effects: tuple[ActuatorEffect, ...] = ()) -> StaticModel:
-    """Returns the cached model of this structure. It is derived at the first call and compiled at its first use."""
+    """Returns the static model of an arm with effects. The model is cached, and compiled at its first use."""
     return StaticModel(derive_gravity(arm), effects)
 
 
 @cache
 def compile_effect_torque(arm: Arm, effects: tuple[ActuatorEffect, ...]) -> Callable[..., None]:
-    """Compiles f(q, coefficients, out), the joint torque that compensates the effects at rest.
+    """Compiles a function f(q, coefficients, out) for the joint torque that compensates the effects at rest.
 
     The arguments are C-contiguous float64 arrays (n,) [rad, m], (e,) [units of the kinds] and (n,) [N m, N]. The kinds
     of the effects must be in `POSITION_KINDS`.

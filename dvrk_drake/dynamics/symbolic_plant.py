@@ -23,7 +23,8 @@ class SymbolicPlant:
     Attributes:
         arm: Arm of the plant.
         numeric: Numeric plant of the arm.
-        bodies: Label ("1" to "7", "crank", ...) -> moving body B and the pose X_BF of the frame F of its parameters.
+        bodies: Label ("1" to "7", "crank", ...) -> moving body B and the pose X_BF of its frame F, see
+            `labelled_bodies`.
         q: Joint positions as sympy symbols q1, ..., qn [rad, m].
         ring: Ring of polynomials in q and in sines and cosines of sums of q.
     """
@@ -73,8 +74,8 @@ class SymbolicPlant:
         """Returns the potential energy per unit of a parameter of a link, for gravity of 1 m/s^2.
 
         The potential energy is linear in mass and first moments. A unit mass at the origin of F contributes
-        -g_W . p_WFo, and a unit first moment along an axis of F contributes -g_W . axis. This is much faster than
-        the symbolic `CalcPotentialEnergy` of an arm with a closed linkage.
+        -g_W . p_WFo, and a unit first moment along an axis of F contributes -g_W . axis. This computation is much
+        faster than the symbolic `CalcPotentialEnergy` of an arm with a closed linkage.
 
         Args:
             label: Label of the link.
@@ -85,7 +86,7 @@ class SymbolicPlant:
             X_WB = self._plant.EvalBodyPoseInWorld(
                 self._context, self._plant.get_body(self.bodies[label][0].index())
             ).GetAsMatrix4()
-            # Row -g_W' (R_WB, p_WBo). `_dot` omits zeros, so that they add no terms.
+            # The row is -g_W' (R_WB, p_WBo). `_dot` omits zeros, so the expressions contain no terms with factor 0.
             self._heights[label] = [_dot(-g_W, X_WB[:3, j]) for j in range(4)]
         column = _exact_matrix(self.bodies[label][1])[:, "xyz".index(axis) if axis else 3]
         return self.ring.shortest(self.ring.from_drake(_dot(column, self._heights[label])))
@@ -113,8 +114,9 @@ def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expre
 def _parallel_sums(plant: MultibodyPlant, arm: Arm, q: Sequence[sympy.Symbol]) -> list[tuple[sympy.Expr, sympy.Expr]]:
     """Returns pairs of angles whose sums occur in link poses, from the base to the tip.
 
-    A pair consists of the rotation angle of a body and the angle of a revolute joint on the body with the same axis.
-    Both are linear combinations of q according to the linkage, so opposite rotations cancel in their sum.
+    A pair consists of the rotation angle of a body and the angle of a revolute joint on this body. Both angles are
+    about the same axis. They are linear combinations of q according to the linkage, so opposite rotations cancel in
+    their sum.
     """
     context = plant.CreateDefaultContext()
     rotations: dict[str, tuple[NDArray[np.float64], sympy.Expr]] = {}  # Body -> axis and rotation angle.

@@ -10,9 +10,10 @@ from operator import and_
 import pydrake.symbolic as symbolic
 import sympy
 
-#: Coefficients below this value are rounding errors. Other coefficients are 1 or lengths [m].
+#: Coefficients with an absolute value up to this limit are rounding errors. Other coefficients are 1 or lengths [m].
 ROUNDING = 1e-14
-#: Monomial -> coefficient. A monomial is the sorted tuple of the indices of its variables, repeated for powers.
+#: Monomial -> coefficient. A monomial is the sorted tuple of the indices of its variables. An index occurs n times for
+#: the nth power of a variable.
 Polynomial = dict[tuple[int, ...], float]
 _Kind = symbolic.ExpressionKind
 
@@ -29,7 +30,8 @@ class TrigonometricRing:
 
         Args:
             q: Joint positions as symbols q1, ..., qn [rad, m].
-            sums: Pairs of angles that `shortest` replaces by their sum, in this order.
+            sums: Pairs of angles that `shortest` combines into the sum of both angles. The pairs are processed in this
+                order.
         """
         self.q = tuple(q)
         self._sums = sums
@@ -74,8 +76,8 @@ class TrigonometricRing:
         """Returns an equal polynomial with the angles of parallel joints combined.
 
         For each pair (a, b) of `sums`, terms such as sin a cos b + cos a sin b become sin(a + b) if this shortens the
-        polynomial. Squared cosines are eliminated, so that an identically zero polynomial becomes 0.
-        Coefficients below `ROUNDING` are removed. sympy's trigsimp gives the same result, but its search takes seconds.
+        polynomial. Squared cosines are eliminated, so that an identically zero polynomial becomes 0. Terms with
+        coefficients up to `ROUNDING` are removed. sympy's trigsimp gives the same result, but its search takes seconds.
         """
         result, shortest = polynomial, self._replace_squared_cosines(polynomial)
         for a, b in self._sums:
@@ -98,7 +100,7 @@ class TrigonometricRing:
         return sympy.Mul(*(self._symbols[index] ** power for index, power in powers.items()))
 
     def _variable(self, expression: symbolic.Expression) -> tuple[float, int]:
-        """Returns sign and variable index of an expression q, sin(angle) or cos(angle)."""
+        """Returns the sign and the variable index of an expression q, sin(angle) or cos(angle)."""
         key = expression.to_string()
         if key not in self._variables:
             function = symbolic.to_sympy(expression, memo=self._memo)
@@ -116,7 +118,10 @@ class TrigonometricRing:
         return self._indices[function]
 
     def _slope(self, function: sympy.Expr, q: sympy.Symbol) -> tuple[list[int], float]:
-        """Returns the derivative of a variable's function as variable indices and a factor, which are multiplied."""
+        """Returns the derivative of a variable's function, as the indices of variables and a factor.
+
+        The derivative is the product of these variables, multiplied by the factor.
+        """
         if not function.args:
             return [], float(function == q)
         slope = float(function.args[0].coeff(q))
@@ -133,7 +138,7 @@ class TrigonometricRing:
         return _eliminate_product(p, (ca, cb), {(C,): 1.0, (sa, sb): sign_a * sign_b})
 
     def _sine_and_cosine(self, angle: sympy.Expr) -> tuple[float, int, int]:
-        """Returns sign and the variable indices s and c, with sin(angle) = sign * s and cos(angle) = c.
+        """Returns the sign and the variable indices s and c, with sin(angle) = sign * s and cos(angle) = c.
 
         sympy writes sin(-x) as -sin(x), so the sign can be negative.
         """
@@ -175,7 +180,7 @@ def _add(polynomial: Polynomial, monomial: tuple[int, ...], coefficient: float) 
 
 
 def _remove_rounding_errors(p: Polynomial) -> Polynomial:
-    """Removes terms whose coefficients are rounding errors, such as -0.4318 + 0.4162 + 0.0156."""
+    """Removes terms with coefficients that are 0 except for rounding errors, e.g. the sum -0.4318 + 0.4162 + 0.0156."""
     return {monomial: coefficient for monomial, coefficient in p.items() if abs(coefficient) > ROUNDING}
 
 
@@ -197,7 +202,7 @@ def _eliminate_product(p: Polynomial, product: tuple[int, int], replacement: Pol
 
 
 def _operations(p: Polynomial) -> int:
-    """Returns the number of additions, multiplications, powers and a leading sign."""
+    """Returns the number of additions, multiplications and powers. A leading minus sign counts as one operation."""
     count = max(len(p) - 1, 0) + bool(p and all(coefficient < 0 for coefficient in p.values()))
     for monomial, coefficient in p.items():
         powers = Counter(monomial).values()

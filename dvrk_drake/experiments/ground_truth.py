@@ -48,9 +48,10 @@ SAMPLE_SPACING = 0.01
 
 
 def pose_visit_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
-    """Makes a trajectory through all poses that stays at each pose for the settling and sampling time.
+    """Makes a trajectory through all poses, which stops at each pose for settling and sampling.
 
-    The trajectory is straight in joint space. Therefore it satisfies all linear limits that the poses satisfy.
+    Between two poses, the trajectory is a straight line in joint space. Therefore it satisfies all linear limits that
+    the poses satisfy.
 
     Args:
         arm: Arm whose joint types determine the maximum speeds.
@@ -84,12 +85,14 @@ def collect_static_poses(
     generator: np.random.Generator,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
-    """Moves an arm to poses under position control and records the holding effort at each (steps 4 to 6).
+    """Moves an arm to poses under position control and records the holding effort at each pose.
+
+    These are steps 4 to 6 of section III.G of the paper.
 
     Args:
         station: Simulated arm. It becomes part of a Diagram and cannot be used in another one.
-        model: Model used by the controller. The integrator compensates its errors.
-        poses: Poses (m, n) [rad, m] inside the limits (steps 1 to 3).
+        model: Model used by the controller. The integrator of the controller compensates the errors of this model.
+        poses: Poses (m, n) [rad, m] inside the limits (steps 1 to 3 of the section).
         effort_noise: Standard deviation of the noise of one effort sample, as a share of the effort limit.
         generator: Random generator of the noise.
         progress: Function called with the finished share, 0..1.
@@ -145,7 +148,7 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
 
     The links are physically consistent and have the identified gravity torque. They are as close as possible to the
     links of our SDF. Cables and springs are those of the identified model. Static poses do not determine friction,
-    stops, encoders, motors and delays. These are those of `mechanisms/mtm.yaml`. Friction that is larger in one
+    stops, encoders, motors and delays. These effects are those of `mechanisms/mtm.yaml`. Friction that is larger in one
     direction causes a constant torque in static poses. Therefore the identified offset of joints with such friction is
     omitted.
 
@@ -181,7 +184,7 @@ def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
     """Makes a ground-truth arm by random changes of the SDF's link masses by up to `SPREAD`; writes its SDF.
 
     The perturbed MTM has no wrist spring. The spring of the arm's file balances a heavier wrist than that of the SDF.
-    With the wrist of the SDF, it would exceed the motor torque at many poses.
+    With the wrist of the SDF, the torque of the spring would exceed the motor torque at many poses.
     """
     arm = load_arm(name)
     links = perturbed_links(arm, np.random.default_rng(seed))
@@ -215,7 +218,7 @@ def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0
 
 
 def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) -> Arm:
-    """Returns the arm with the given links; writes its SDF to `path`. A comment of the SDF contains their `origin`."""
+    """Returns the arm with the given links; writes its SDF to `path`. A comment in the SDF states `origin`."""
     with atomic_write(path) as stream:
         stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
     return dataclasses.replace(arm, sdf=(str(path.resolve()),))
@@ -235,7 +238,8 @@ def damped_station(
     )
 
 
-#: Distance between a pose and the starts of its two opposite approaches, in which dry friction cancels [rad], [m].
+#: Distance between a pose and the start of an approach to it [rad], [m]. In the mean over two opposite approaches, dry
+#: friction cancels.
 APPROACH = 0.2, 0.02
 #: Margin at both ends of each joint range, as a share of the range; maximum angle of multi-turn joints [rad].
 MARGIN, MAX_MULTI_TURN_ANGLE = 0.05, 1.6
@@ -251,10 +255,11 @@ def collect(
     executor: Executor,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
-    """Collects poses of a ground-truth arm with all its effects, averaged over both approach directions.
+    """Collects static poses of a ground-truth arm with all its effects.
 
-    The controller uses the model of the SDF. The workers of the executor collect chunks of poses in parallel. Each
-    chunk has a separate start pose and separate noise, so the result does not depend on the number of workers.
+    Each pose is the mean over both approach directions. The controller uses the nominal model. The workers of the
+    executor collect chunks of poses in parallel. Each chunk has a separate start pose and separate noise, so the result
+    does not depend on the number of workers.
     """
     arm = load_arm(name)
     poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)

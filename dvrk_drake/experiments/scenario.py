@@ -1,6 +1,6 @@
 """Schema, validation and reader of scenario files.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ class ControllerScenario:
         gains: Gains kp, kd, ki, one number per joint, instead of those of the arm. In a scenario file, this can be the
             path of a gains file.
         friction_ratio: Share of the arm's friction that is compensated, in mode "gravity" only; see `check_ratios`.
-        hysteresis_ratio: Share of the elastic part of the friction that is compensated, in mode "gravity" only.
+        hysteresis_ratio: Share of the wide hysteresis that is compensated, in mode "gravity" only; see `safe_ratios`.
         parameter_error: Relative error of the model. Each base parameter is multiplied by a random factor between
             1 - `parameter_error` and 1 + `parameter_error`, drawn with the seed of the scenario.
     """
@@ -60,7 +60,7 @@ class ControllerScenario:
 
 @dataclass
 class Target:
-    """Pose of the arm at a given time, at which it is at rest.
+    """Desired pose at a given time. The desired velocity at this time is zero.
 
     Attributes:
         time: Time [s].
@@ -73,10 +73,10 @@ class Target:
 
 @dataclass
 class HandScenario:
-    """Hand that grasps the arm at a frame and moves it along a path; see `systems.hand`.
+    """Hand that grasps the arm at a frame and moves the arm along a path; see `systems.hand`.
 
-    The hand moves `frame` along the poses that the frame has for the joint positions of `path`. The hand holds the arm
-    from the first to the last time of the path. With an empty path there is no hand.
+    The desired poses of `frame` are computed from the joint positions of `path`. The hand holds the arm from the first
+    to the last time of the path. With an empty path there is no hand.
 
     Attributes:
         path: Joint positions and times.
@@ -114,7 +114,8 @@ class Scenario(ArmConfig):
         sample_period: Sample period of the recording [s].
         controller: Controller of the arm.
         start: Start pose (n,) [rad, m], at rest. Default: zero, or the nearest pose inside the limits.
-        targets: Desired poses at which the arm is at rest, with their times. Only in mode "hold".
+        targets: Desired poses with their times. The desired velocities are zero at these times. Targets are allowed
+            only in mode "hold".
         hand: Hand that moves the arm.
         effort_noise: Standard deviation of the noise of recorded efforts, as a share of the effort limits.
 
@@ -150,7 +151,7 @@ class Scenario(ArmConfig):
         )
         if error == 0.0:
             return model
-        # Use another random stream than that of the noise, which uses only the seed.
+        # This random stream differs from that of the noise, which uses only the seed.
         generator = np.random.default_rng([self.seed, 1])
         return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
 
@@ -213,7 +214,8 @@ class Scenario(ArmConfig):
         ArmFrame(self.mounted_arm, self.hand.frame)
         if len(self.hand.path) < 2:
             raise ScenarioError(
-                "hand.path must have 2 or more poses. The hand grasps the arm at the first and releases it at the last."
+                "hand.path must have 2 or more poses. The hand grasps the arm at the first pose and releases the arm "
+                "at the last pose."
             )
 
 

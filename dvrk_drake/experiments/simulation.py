@@ -1,4 +1,4 @@
-"""Simulates a controlled arm and records it; functions for sampling simulations."""
+"""Simulation and recording of a controlled arm, and functions that sample simulations."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Simulation:
         recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects` the measurements are exact, except
             for the noise of tau.
         state_true: True state (m, 2n): positions [rad, m], then velocities [rad/s, m/s].
-        hand: Torque [N m], then force [N] (m, 6) of the hand on the arm at the grasped frame, expressed in the base
+        hand: Torque [N m], then force [N] of the hand on the arm (m, 6) at the grasped frame, expressed in the base
             frame. Zero without a hand.
         desired: Desired positions (m, n) [rad, m]. None in modes other than "hold".
     """
@@ -74,20 +74,20 @@ def simulate(
     inside linear limits.
 
     Args:
-        what: Arm that is regulated at a pose or moves to `targets`, or a scenario. A scenario contains all settings
-            from `controller` to `seed`.
-        controller: Model for a `GravityPidController`, by default that of the arm's SDF. Or a System with an input port
-            `state_estimated` (2n) and an output port `effort` (n), e.g. a `GravityPidController`. `targets` have an
-            effect only if the System has an input port `desired_state` (2n). A System can be used only once.
+        what: Arm that is regulated at a pose or moves to `targets`, or a scenario. With a scenario, the arguments from
+            `controller` to `seed` are not allowed, because the scenario contains these settings.
+        controller: Model for a `GravityPidController`, or a System with an input port `state_estimated` (2n) and an
+            output port `effort` (n), e.g. a `GravityPidController`. Default: the model of the arm's SDF. `targets` have
+            an effect only if the System has an input port `desired_state` (2n). A System can be used only once.
         effects: Whether to simulate the effects of a real arm (friction, cables, stops, encoders, motors), or the names
             of the effects to simulate. Default: True.
         duration: Duration of the simulation [s]. Default: 5.
         start: Start pose (n,), at rest [rad, m]. Default: zero, or the nearest pose inside the limits.
-        targets: Times [s] and poses (n,) [rad, m] at which the arm is at rest.
+        targets: Pairs of a time [s] and the desired pose (n,) [rad, m] at this time, with zero desired velocity.
         sample_period: Sample period of the recording [s]. Default: 0.01.
         seed: Seed of the effects' noise. Default: 0.
-        meshcat: Meshcat that shows the arm in real time, and the recorded animation at the end.
-        progress: Function called with the step, "simulating", and its finished share, 0..1.
+        meshcat: Meshcat that shows the arm in real time, and the recorded animation at the end. None: no animation.
+        progress: Function called with the name of the step ("simulating") and its finished share, 0..1.
 
     Returns:
         Recording of the measurements, true states, forces of the hand, and desired positions.
@@ -139,7 +139,7 @@ def simulate(
 def _simulate(
     scenario: Scenario, system: System | None, meshcat: Meshcat | None, progress: Progress | None
 ) -> Simulation:
-    """Simulates a scenario. `system` replaces the scenario's controller unless it is None."""
+    """Simulates a scenario. If `system` is not None, it replaces the controller of the scenario."""
     report = step_progress(progress, "simulating")
     scenario.check()
     arm = scenario.mounted_arm
@@ -211,7 +211,7 @@ def samples(log: VectorLogSink, simulator: Simulator) -> NDArray[np.float64]:
 
 @contextmanager
 def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
-    """Records an animation of the simulation in the block with `options` of StartRecording, unless Meshcat is None."""
+    """Records an animation of the `with` block with `options` of StartRecording; does nothing if `meshcat` is None."""
     if meshcat is not None:
         meshcat.StartRecording(**options)
     yield
@@ -236,7 +236,7 @@ def scenario_of_arm(
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:
-    """Returns a trajectory that is at rest at each pose at its time, and stays at the last pose."""
+    """Returns a trajectory that is at rest in `poses[i]` at `times[i]`, and stays at the last pose."""
     times, poses = np.append(times, max(duration, times[-1]) + 1.0), np.vstack([poses, poses[-1:]])
     return PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
 

@@ -41,8 +41,8 @@ class Compensation:
     Attributes:
         name: Name in tables and plots.
         model: Model of the gravity torque. None for unpowered motors.
-        friction_ratio: Compensated share of the friction, within `safe_ratios`.
-        friction: Friction model. None for that of the arm's file.
+        friction_ratio: Requested share of the friction to compensate. `safe_ratios` limits it.
+        friction: Friction model. None for the friction of the arm file.
     """
 
     name: str
@@ -79,7 +79,7 @@ class OperatorForces:
         return _rms(self.torque[self.time >= GRASP_TIME])
 
     def peak(self) -> tuple[float, float]:
-        """Returns the 95th percentiles of force [N] and torque [N m]."""
+        """Returns the 95th percentiles of force [N] and torque [N m] after the initial transient of the grasp."""
         evaluated = self.time >= GRASP_TIME
         norms = (np.linalg.norm(x[evaluated], axis=1) for x in (self.force, self.torque))
         force, torque = (float(np.percentile(norm, 95)) for norm in norms)
@@ -87,7 +87,7 @@ class OperatorForces:
 
 
 def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
-    """Makes a smooth joint motion through random poses, at the speed of a hand.
+    """Makes a smooth joint motion through random poses.
 
     Args:
         arm: Arm whose limits apply.
@@ -103,7 +103,7 @@ def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int =
 
 
 def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> PiecewisePolynomial:
-    """Returns the motion of a recording, clipped to the arm's limits and played at `speed` times its original speed.
+    """Returns the motion of a recording at `speed` times its original speed. Positions are clipped to the arm's limits.
 
     Raises:
         ScenarioError: The recording has no times, the speed is out of range, or the motion exceeds the limits by more
@@ -146,11 +146,12 @@ def simulate_operator(
 
     Args:
         arm: Arm to simulate.
-        path: Joint positions [rad, m] over time from 0 [s]. The hand follows the handle pose of these positions.
+        path: Joint positions [rad, m] as a function of time [s], from time 0. The hand follows the pose that the handle
+            has at these joint positions.
         compensation: Compensation by the motors.
         effects: Simulated effects of the real arm, e.g. `arm.effects`. None for no effects.
         grip: Grip of the hand. None for the default grip.
-        frame_name: Frame of the handle. If empty, that of `handle_frame`.
+        frame_name: Name of the handle's frame. If it is empty, `handle_frame` selects the frame.
         seed: Seed of the effects' noise.
         progress: Function called with the finished share, 0..1.
     """

@@ -1,1 +1,1 @@
-"""Export of identified models to SDF, URDF, the dVRK's gravity compensation, C, Python and LaTeX."""
+"""Export of identified models to SDF, URDF, gravity-compensation files of the dVRK, C, Python and LaTeX."""

@@ -1,4 +1,4 @@
-"""Implements the gravity compensation of the dVRK's controller for an MTM, and computes its file from a model."""
+"""Implements the dVRK controller's gravity compensation of an MTM, and computes the controller's file from a model."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from dvrk_drake.models.arm import Arm
 
 #: Kinds of effects that model dry friction.
 DRY_KINDS = ("coulomb", "presliding")
-#: Factor of the controller's gravity columns [m/s^2].
+#: Gravitational acceleration in the gravity columns of the controller's regressor [m/s^2].
 CONTROLLER_GRAVITY = 9.81
-#: Number of gravity columns.
+#: Number of gravity columns of the controller's regressor.
 NUM_GRAVITY = 10
-#: Order of the polynomials.
+#: Order of the polynomials in a joint position.
 ORDER = 4
-#: Effects that the first two columns represent at the shoulder.
+#: Kinds of effects on shoulder_pitch that the first two columns of the regressor represent.
 _FIRST_EFFECTS = ("cable sine", "cable cosine")
 MTM_JOINTS = (
     "outer_yaw",
@@ -37,13 +37,14 @@ MTM_JOINTS = (
 
 @dataclass(frozen=True)
 class CompensationOptions:
-    """Entries of the controller's file that a model does not contain, and the accepted error.
+    """Entries of the controller's file that a model does not contain, and the accepted torque error.
 
     Attributes:
         coulomb: Coulomb friction (7,) of the joints [N m].
-        friction_ratio: Compensated shares (7,) of the Coulomb friction in motion, 0 to 1.
-        dead_band, saturation: Speeds (7,) [rad/s], see `GravityCompensationFile`. The defaults are from dVRK files.
-        tolerance: Accepted torque error of the file [N m].
+        friction_ratio: Share of each joint's Coulomb friction (7,) that is compensated during a motion, 0 to 1.
+        dead_band, saturation: Speeds (7,) [rad/s], see `GravityCompensationFile`. The default values come from files of
+            the dVRK.
+        tolerance: Largest accepted difference between the torques of the file and of the model [N m].
     """
 
     coulomb: tuple[float, ...] = (0.0,) * NUM_JOINTS
@@ -56,7 +57,7 @@ class CompensationOptions:
 def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
     """Returns the regressor R (m, 7, 40) at poses q (m, 7) [rad]. R times the parameters (40,) is the torque [N m].
 
-    Source: sawIntuitiveResearchKit, robGravityCompensationMTM.
+    The formula is from the class robGravityCompensationMTM of sawIntuitiveResearchKit.
     """
     q = np.atleast_2d(np.asarray(q, dtype=np.float64))
     s4, s5, s6 = np.sin(q[:, 3:6]).T
@@ -100,18 +101,18 @@ def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
 
 
 def polynomial_columns(joint: int) -> slice:
-    """Returns the columns of 1, q, ..., q^4 for a joint index 0 to 5."""
+    """Returns the slice of the regressor columns 1, q, ..., q^4 of a joint with index 0 to 5."""
     first = NUM_GRAVITY + (ORDER + 1) * joint
     return slice(first, first + ORDER + 1)
 
 
 def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Returns the torque (m, 7) [N m] of the file before clipping.
+    """Returns the torque (m, 7) of the file before it is clipped to the torque limits [N m].
 
     Args:
         file: Content of the file.
         q: Poses (m, 7) [rad].
-        v: Velocities (m, 7) [rad/s]. None means at rest.
+        v: Velocities (m, 7) [rad/s]. None: all velocities are zero.
     """
     R = controller_regressor(q)
     v = np.zeros(R.shape[:2]) if v is None else np.atleast_2d(np.asarray(v, dtype=np.float64))
@@ -121,29 +122,31 @@ def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike |
 
 
 def controller_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Returns the torque (m, 7) [N m] that the controller applies: `unclipped_torque` within the limits of the file."""
+    """Returns the torque (m, 7) that the controller applies: `unclipped_torque`, clipped to the torque limits [N m]."""
     return np.clip(unclipped_torque(file, q, v), file.torque_lower, file.torque_upper)
 
 
 def compensation_from_model(
     model: IdentifiedModel, options: CompensationOptions | None = None
 ) -> GravityCompensationFile:
-    """Converts a model to the file of the controller.
+    """Converts a model to a gravity-compensation file of the controller.
 
-    The ten gravity columns represent exactly an upright MTM whose last link is balanced about its axis. Polynomials in
-    the joint positions approximate the additional gravity torque of a tilted base. The constant of a polynomial
-    represents the offset of a joint. The first two columns represent the cable torque of the shoulder, and polynomials
-    approximate other effects. The torque limits are the torque range within the joint limits plus 10 % at both ends.
-    They do not exceed the effort limits of the arm. Joint 7 has no torque.
+    The ten gravity columns represent the gravity torque exactly if the MTM is upright and its last link is balanced
+    about the roll axis. Polynomials in the joint positions approximate the additional gravity torque of a tilted base.
+    The constant term of a polynomial represents the offset torque of its joint. The first two columns represent the
+    cable torque of shoulder_pitch. Polynomials approximate all other effects that depend on one joint position.
+
+    The torque limits are the range of the torque within the joint limits, including Coulomb friction. This range is
+    extended by 10 % of its width at both ends, up to the effort limits of the arm. The torque of joint 7 is zero.
 
     Raises:
-        ModelError: The model is not of an MTM, options have the wrong length, or the error exceeds `options.tolerance`.
+        ModelError: The model is not of an MTM, an option is invalid, or the torque error exceeds `options.tolerance`.
     """
     options = options or CompensationOptions()
     arm = model.arm
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(
-            f"{arm.name} is not an MTM, so the format dvrk-gc is not possible. A PSM needs dvrk-kinematic-gc"
+            f"{arm.name} is not an MTM. The format dvrk-gc supports only an MTM; for a PSM, use dvrk-kinematic-gc"
         )
     check_tolerance(options.tolerance)
     poses = arm.sample_poses(20000, np.random.default_rng(0))
@@ -169,10 +172,10 @@ def compensation_from_model(
 
 
 def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
-    """Returns the Coulomb friction (7,) [N m] of each joint if only this joint moves.
+    """Returns the dry friction (7,) of the joints [N m]. Each value is valid if no other joint moves.
 
-    The friction is the sum of the Coulomb and presliding effects of the model's dynamics. An effect along a coordinate
-    that several joints move contributes to each of these joints.
+    The dry friction is the sum of the Coulomb and presliding effects in the model's dynamics. An effect along a
+    coordinate that several joints move contributes to the dry friction of each of these joints.
 
     Raises:
         ModelError: The model has no dynamics.
@@ -188,13 +191,13 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
 
 
 def largest_differences(file: GravityCompensationFile, model: IdentifiedModel) -> NDArray[np.float64]:
-    """Returns the largest torque differences (7,) [N m] of file and model at rest, within the joint limits."""
+    """Returns the largest torque difference (7,) between file and model at rest, within the joint limits [N m]."""
     poses = model.arm.sample_poses(4000, np.random.default_rng(1))
     return np.asarray(np.abs(controller_torque(file, poses) - model.holding_torque(poses)).max(axis=0))
 
 
 def _gravity_torque(model: IdentifiedModel, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the gravity torque (m, 7) of the base parameters, including the feedforward scale."""
+    """Returns the gravity torque (m, 7) of the base parameters, multiplied by the feedforward scale [N m]."""
     beta = np.array([p.value for p in model.base_parameters])
     return np.asarray(model.feedforward_scale * (model.static_model.regressor(q)[:, :, : len(beta)] @ beta))
 
@@ -203,7 +206,7 @@ def _gravity_parameters(model: IdentifiedModel, poses: NDArray[np.float64]) -> N
     """Returns parameters (40,) that approximate the gravity torque of the model.
 
     The ten gravity parameters are fitted at random poses without joint limits. The polynomials approximate the residual
-    at `poses` (m, 7), which is small unless the base is tilted.
+    torque at `poses` (m, 7). This residual torque is small if the base is not tilted.
     """
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (400, NUM_JOINTS))
     R = controller_regressor(q)[:, :, :NUM_GRAVITY]
@@ -221,7 +224,8 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
     parameters = np.zeros(NUM_PARAMETERS)
     for estimate in model.holding_effects:
         row = joint_row(arm, estimate.coordinate)
-        # The file has no torque at the last joint and no functions of two joints. _check_errors includes that error.
+        # The file has no torque at the last joint and no functions of two joint positions. `_check_errors` includes the
+        # resulting error.
         for joint in map(int, np.flatnonzero(row[:-1])):
             value = float(model.feedforward_scale[joint] * estimate.coefficient * row[joint])
             if estimate.kind == "offset":
@@ -238,7 +242,7 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
 
 
 def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np.float64]:
-    """Returns coefficients (5,) of 1, q, ..., q^4 that approximate an effect over a joint's range.
+    """Returns the coefficients (5,) of 1, q, ..., q^4 in a polynomial that approximates an effect over a joint's range.
 
     Interpolation at Chebyshev nodes makes the largest error nearly minimal.
     """
@@ -258,7 +262,10 @@ def _check_errors(
     poses: NDArray[np.float64],
     tolerance: float,
 ) -> None:
-    """Raises ModelError if the error of gravity and effect parameters (40,) at `poses` (m, 7) exceeds `tolerance`."""
+    """Raises ModelError if the torque error of the file's parameters at `poses` (m, 7) exceeds `tolerance` [N m].
+
+    The file's parameters are the sum of `gravity` (40,) and `effects` (40,).
+    """
     R, tau = controller_regressor(poses), _gravity_torque(model, poses)
     gravity_error = np.abs(R @ gravity - tau).max(axis=0)
     effects_error = np.abs(R @ effects - (model.holding_torque(poses) - tau)).max(axis=0)
@@ -271,16 +278,16 @@ def _check_errors(
     tilt = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
     limits = ["a last link balanced about its roll axis"]
     if tilt > 0.05:
-        limits.append(f"an upright base instead of one tilted by {tilt:.1f} deg")
+        limits.append(f"an upright base without the tilt of {tilt:.1f} deg")
     if np.any((model.feedforward_scale != 0) & (model.feedforward_scale != 1)):
         limits.append("feedforward scales of 0 or 1")
     reasons = {
         f"gravity {gravity_error.max():.2g} N m (the file requires {', '.join(limits)})": gravity_error.max(),
-        f"effects {effects_error.max():.2g} N m (the file supports polynomials of order 4 in a joint's own position, "
-        "and no torque at joint 7)": effects_error.max(),
+        f"effects {effects_error.max():.2g} N m (the file supports only polynomials of order 4 in the joint's own "
+        "position, and no torque at joint 7)": effects_error.max(),
     }
     raise ModelError(
-        f"the controller's file cannot represent this model: the largest errors are {errors} N m. "
+        f"the controller's file cannot represent this model: the largest torque errors are {errors} N m. "
         f"Errors by cause: {', '.join(reason for reason, size in reasons.items() if size > least)}. "
         f"{_estimates_note(model)}To accept the errors, repeat the command with "
         f"--gc-tolerance {round_up(error.max()):g}"
@@ -304,7 +311,7 @@ def check_tolerance(tolerance: float) -> None:
 
 
 def round_up(x: float) -> float:
-    """Returns x rounded up to two significant digits."""
+    """Returns x, rounded up to two significant digits."""
     unit = 10.0 ** (np.floor(np.log10(x)) - 1)
     return float(np.ceil(x / unit) * unit)
 

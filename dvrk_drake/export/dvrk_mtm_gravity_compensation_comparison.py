@@ -1,4 +1,4 @@
-"""Compares a gravity-compensation file of the dVRK's controller for an MTM with an identified model."""
+"""Compares a gravity-compensation file of the dVRK's controller for an MTM with a model."""
 
 from __future__ import annotations
 
@@ -19,38 +19,43 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
 from dvrk_drake.models.arm import known_arms
 
-#: Signs of joint positions and torques in the mirror image of an arm. MTML and MTMR have mirrored wrists.
+#: Factors (7,) that convert joint positions and torques of an arm to those of its mirror image. The wrists of MTML and
+#: MTMR are mirror images.
 _MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
 #: Joints with different torques on MTML and MTMR: shoulder_pitch, elbow_pitch and wrist_platform.
 _SIDE_JOINTS = slice(1, 4)
-#: Largest ratio of errors at which the mirror image fits clearly better. For the four public files, the error of a
-#: model of the wrong side is 1.8 to 2.1 times the error of a model of the correct side.
+#: Ratio below which the mirror image of the model fits clearly better: error of the mirror image / error of the model.
+#: For the four public files of MTMs, the error of a model of the wrong side is 1.8 to 2.1 times the error of a model of
+#: the correct side.
 _MAX_ERROR_RATIO = 0.8
-#: Number of poses inside the sweep of the file that are required to compare the sides only there.
+#: Smallest number of poses inside the file's sweep. With fewer poses, the sides are compared at all poses.
 _MIN_POSES = 200
-#: Smallest torque whose sign is compared, as a share of the model's largest torque on that joint.
+#: Smallest torque whose sign is compared, divided by the model's largest torque on this joint.
 SIGN_SHARE = 0.1
-#: Number of random poses.
+#: Number of random poses at which file and model are compared.
 POSES = 20000
 
 
 @dataclass(frozen=True)
 class JointComparison:
-    """Comparison of one joint at rest, within the joint limits. Torques are in N m. Shares of the poses are 0 to 1.
+    """Comparison of the torques of file and model on one joint, at rest and within the joint limits.
+
+    Torques are in N m. Shares are numbers of poses, divided by the number of all poses.
 
     Attributes:
         name: Name of the joint.
         model_lower, model_upper: Range of the model's torque.
         file_lower, file_upper: Range of the file's torque before clipping.
         clip_lower, clip_upper: Torque limits of the file.
-        clipped: Share of poses at which the torque of the file is at a limit and therefore constant.
-        opposed: Share of poses at which the torques of the file after clipping and of the model have opposite signs.
-            Both must exceed `SIGN_SHARE` of the model's largest torque.
-        runaway: Share of poses at which the torque of the file before clipping is far outside the model's range. The
-            range is widened by half of its width at both ends. 0 for the last joint, which has no torque in the file.
-        polynomial: Largest |torque| of the file's polynomial in the joint position, without the constant.
-        rms_inside, rms_outside: RMS difference between file (clipped) and model at poses inside and outside the file's
-            sweep. Without a sweep, all poses are outside. NaN if there are no such poses.
+        clipped: Share of poses at which the torque of the file is clipped to a torque limit.
+        opposed: Share of poses at which the clipped torque of the file and the torque of the model have opposite signs.
+            Only poses at which both torques exceed `SIGN_SHARE` times the model's largest torque are counted.
+        runaway: Share of poses at which the unclipped torque of the file is outside the model's torque range by more
+            than half of the width of this range. 0 for the last joint, which has no torque in the file.
+        polynomial: Largest magnitude of the file's polynomial in the joint position, without its constant term.
+        rms_inside, rms_outside: RMS difference between the clipped torque of the file and the torque of the model, at
+            poses inside and outside the file's sweep. Without a sweep, all poses are outside. NaN if no pose is inside
+            or outside, respectively.
     """
 
     name: str
@@ -76,11 +81,11 @@ class CompensationComparison:
         file, model: File and model that are compared.
         joints: One comparison per joint.
         q: Poses (m, 7) [rad], inside the joint box and the coupled limits.
-        model_torque, file_torque, clipped_torque: Torques (m, 7) [N m] at rest. `file_torque` is before clipping.
-        clipped, opposed, runaway: Masks (m, 7), True for poses that are counted in `JointComparison`.
-        in_sweep: Mask (m,), True where all of the first six joints are inside the file's sweep.
-        other_side: True if the mirror image of the model fits the file clearly better. The file is then of an arm of
-            the other side.
+        model_torque, file_torque, clipped_torque: Torques (m, 7) at rest [N m]. `file_torque` is not clipped.
+        clipped, opposed, runaway: Masks (m, 7), True for poses that the same attribute of `JointComparison` counts.
+        in_sweep: Mask (m,), True for poses at which the first six joints are inside the file's sweep.
+        other_side: True if the mirror image of the model fits the file clearly better than the model. The file then
+            probably belongs to an arm of the other side (left or right).
     """
 
     file: GravityCompensationFile
@@ -102,8 +107,8 @@ class CompensationComparison:
         if not self.other_side:
             return ()
         return (
-            "the mirror image of the model fits better. The file is probably of an arm of the other side (left or "
-            f"right), not of {self.model.arm.name}. Check ARM_NAME and the serial number",
+            "the mirror image of the model fits better than the model. The file probably belongs to an arm of the "
+            f"other side (left or right), not to {self.model.arm.name}. Check ARM_NAME and the serial number",
         )
 
     def as_dict(self) -> dict:
@@ -118,10 +123,10 @@ class CompensationComparison:
 
 
 def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) -> CompensationComparison:
-    """Compares the torques of file and model at random poses, uniformly distributed within the joint limits.
+    """Compares the torques of file and model at random poses, which are uniformly distributed within the joint limits.
 
     Raises:
-        ModelError: The model is not of an MTM, or the file is of another arm.
+        ModelError: The model is not of an MTM, or the file belongs to another arm.
     """
     arm = model.arm
     if arm.joint_names != MTM_JOINTS:
@@ -129,7 +134,7 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
     known = [name.upper() for name in known_arms()]
     if file.arm_name.upper() != arm.name.upper() and {file.arm_name.upper(), arm.name.upper()} <= set(known):
         raise ModelError(
-            f"the file is of {file.arm_name} (ARM_NAME or file name), but the model is of {arm.name}. "
+            f"the file belongs to {file.arm_name} (ARM_NAME or file name), but the model belongs to {arm.name}. "
             f"Use a model of {file.arm_name}, or correct ARM_NAME in the file"
         )
     q = arm.sample_poses(POSES, np.random.default_rng(0))
@@ -139,7 +144,7 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
     clipped = tau_raw != tau_clipped
     opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > threshold) & (np.abs(tau_clipped) > threshold)
     runaway = (tau_raw < tau_model.min(axis=0) - half_range) | (tau_raw > tau_model.max(axis=0) + half_range)
-    # A joint without gravity torque has no range, and the file does not compensate the last joint.
+    # A joint without gravity torque has no torque range, and the file does not compensate the last joint.
     compared = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
     runaway, opposed = runaway & compared, opposed & compared
     in_sweep = np.zeros(len(q), dtype=bool)
@@ -189,7 +194,7 @@ def _is_of_other_side(
 ) -> bool:
     """Returns whether the mirror image of the model fits the torque of a file clearly better than the model.
 
-    Only poses inside the file's sweep are compared, if there are at least `_MIN_POSES` of them.
+    If at least `_MIN_POSES` poses are inside the file's sweep, only these poses are compared.
     """
     if np.count_nonzero(in_sweep) >= _MIN_POSES:
         q, tau_file = q[in_sweep], tau_file[in_sweep]
@@ -198,13 +203,13 @@ def _is_of_other_side(
 
 
 def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:
-    """Returns the RMS error over `_SIDE_JOINTS`, relative to the RMS torque of the file."""
+    """Returns the RMS torque error of `_SIDE_JOINTS`. Each joint's error is divided by its RMS torque in the file."""
     size = np.sqrt(np.mean(tau_file[:, _SIDE_JOINTS] ** 2, axis=0)) + 1e-12
     return _rms((tau_file - tau_model)[:, _SIDE_JOINTS] / size)
 
 
 def _polynomial_torque(file: GravityCompensationFile, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the torque (m, 7) of the file's polynomials at rest, without their constants [N m]."""
+    """Returns the torque (m, 7) of the file's polynomials at rest, without their constant terms [N m]."""
     parameters = (file.positive + file.negative) / 2
     parameters[:NUM_GRAVITY] = 0.0
     parameters[NUM_GRAVITY::5] = 0.0

@@ -16,10 +16,10 @@ from dvrk_drake.models.schema_fault import number_fault, within
 
 VERSION = "2.0"
 NUM_JOINTS = 7
-#: Number of parameters: ten of gravity, then five polynomial coefficients of each of the first six joints.
+#: Number of parameters: ten for gravity, then five polynomial coefficients for each of the first six joints.
 NUM_PARAMETERS = 40
 _CONTROLLER = "GC_controller"
-#: Key of the arm's name. The controller does not read it.
+#: Key of the arm's name. The controller does not read this key.
 _ARM_NAME = "ARM_NAME"
 #: Field of `GravityCompensationFile` -> key in the file. "sat_vec_vec" is spelled as in the controller's source.
 _KEYS = {
@@ -32,7 +32,8 @@ _KEYS = {
     "friction_ratio": "fric_comp_ratio_vec",
 }
 _LENGTHS = {"positive": NUM_PARAMETERS, "negative": NUM_PARAMETERS}
-#: Keys of the joint ranges of the recording [deg]. The controller does not read them.
+#: Keys of the lower and upper joint positions [deg] in the recording from which the file was computed. The controller
+#: does not read these keys.
 _SWEEP_KEYS = ("joint_position_lower_limit", "joint_position_upper_limit")
 
 #: Allowed range of the parameters. Polynomial coefficients in public files are up to 24 N m.
@@ -41,16 +42,17 @@ _PARAMETERS = within(-1e4, 1e4, "N m")
 
 @dataclass(frozen=True, eq=False)
 class GravityCompensationFile:
-    """Content of the file. `unclipped_torque` and `controller_torque` implement the controller's formula.
+    """Content of a gravity-compensation file of the controller.
 
     Attributes:
         positive, negative: Parameters (40,) for positive and negative joint velocities.
         torque_lower, torque_upper: Torque limits (7,) [N m].
         dead_band: Speeds (7,) [rad/s] below which both parameter vectors have equal weight.
         saturation: Speeds (7,) [rad/s] above which the weights differ by `friction_ratio`.
-        friction_ratio: Compensated shares (7,) of the friction in motion, 0 to 1.
-        sweep: Lower and upper joint positions (2, 7) [rad] of the recording. None if the file does not contain them.
-        arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if both are missing.
+        friction_ratio: Share of each joint's friction (7,) that is compensated during a motion, 0 to 1.
+        sweep: Lower and upper joint positions (2, 7) [rad] in the recording from which the file was computed. None if
+            the file does not contain these positions.
+        arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if neither contains a name.
     """
 
     positive: NDArray[np.float64] = field(metadata=_PARAMETERS)
@@ -64,7 +66,9 @@ class GravityCompensationFile:
     arm_name: str = ""
 
     def check(self) -> None:
-        """Checks lengths, ranges and order of all fields. The controller commands motors without these checks.
+        """Checks the length and the range of each field, and that lower values are below upper values.
+
+        The controller does not make these checks before it commands the motors.
 
         Raises:
             ModelError: A field is invalid. The message contains the key and the allowed values.
@@ -95,7 +99,7 @@ class GravityCompensationFile:
         """Reads a file of the controller.
 
         Raises:
-            ModelError: The file is missing, is not JSON, has another version, or a field is missing or invalid.
+            ModelError: The file is missing, is not JSON or has an unknown version, or a field is missing or invalid.
         """
         content = read_json_input(path, ModelError)
         controller = content.get(_CONTROLLER) if isinstance(content, dict) else None
@@ -125,7 +129,7 @@ class GravityCompensationFile:
             origin: Source of the parameters. The controller does not read it.
 
         Raises:
-            ModelError: `check` failed.
+            ModelError: `check` rejects a field.
         """
         self.check()
         lines = [f'    "{key}": {json.dumps(getattr(self, name).tolist())}' for name, key in _KEYS.items()]
@@ -140,11 +144,11 @@ def _numbers(value: object) -> NDArray[np.float64]:
     try:
         return np.atleast_1d(np.array(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
-        return np.empty(0)  # check() rejects this length with the key in the message
+        return np.empty(0)  # check() rejects this length. Its message contains the key.
 
 
 def _arm_name(value: object, file_name: str) -> str:
-    """Returns the value of ARM_NAME, or else the name of an arm of this package in the file name, or ""."""
+    """Returns the value of ARM_NAME. Without ARM_NAME, returns the name of a known arm in the file name, or ""."""
     if isinstance(value, str) and value:
         return value
     return next((name.upper() for name in known_arms() if name in file_name.lower()), "")

@@ -1,12 +1,13 @@
-"""Gravity-compensation file of the dVRK's controller for a PSM, which models the linkage as a serial chain.
+"""Gravity-compensation file of the dVRK's controller for a PSM.
 
-The chain has seven links. The controller sets its joint positions to [q1, 0, q2, -q2, q2, q3/2, q3/2], where q1..q3 are
-yaw, pitch and insertion. From the holding torques t1..t7 of the chain, it uses [t1, t3 - t4 + t5, t7] for these joints.
+The file models the linkage as a serial chain with seven links. The controller sets the joint positions of the chain to
+[q1, 0, q2, -q2, q2, q3/2, q3/2], where q1, q2 and q3 are yaw, pitch and insertion. The controller computes the holding
+torques t1..t7 of the chain, and applies [t1, t3 - t4 + t5, t7] to yaw, pitch and insertion.
 
-Link 3 is the back crank, link 4 the bottom bar and link 5 the end link. The chain has no links for the other bars of
-the parallelograms and for the counterweight. The first moments of the other links therefore include these parts. The
-mass of link 7 is the mass that the insertion joint carries minus the counterweight. Link 6 has no mass: it moves at
-half of the insertion speed, and t7 does not include its weight.
+Link 3 is the back crank, link 4 is the bottom bar and link 5 is the end link. The chain has no links for the other bars
+of the parallelograms and for the counterweight. The first moments of links 1, 3, 4 and 5 therefore include these parts.
+The mass of link 7 is the mass that moves with the insertion joint, minus the mass that the counterweight balances.
+Link 6 has no mass, because it moves at half of the insertion speed and t7 does not include its weight.
 """
 
 from __future__ import annotations
@@ -42,25 +43,26 @@ _BODIES = {
     3: ("bottom_bar_link", "top_bar_link"),
     4: ("end_link",),
 }
-#: Links of the chain whose first moments are fitted. The last link has those of the bodies on the insertion joint.
+#: Indices of the links whose first moments are fitted. The first moments of the last link are computed from the bodies
+#: that move with the insertion joint.
 _FITTED = tuple(_BODIES)
 _LAST = 6
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicCompensation:
-    """Chain of seven links for the dVRK's controller, in modified DH convention.
+    """Chain of seven links for the dVRK's controller, in the modified Denavit-Hartenberg (DH) convention.
 
-    The pose of link i in link i - 1 is Rx(alpha) Tx(A) Rz(theta) Tz(D).
+    The pose of the frame of link i in the frame of link i - 1 is Rx(alpha) Tx(A) Rz(theta) Tz(D).
 
     Attributes:
         alpha, A, theta, D: DH parameters (7,) at zero joint positions [rad, m].
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
         error: Largest torque errors (3,) of yaw, pitch and insertion within the joint limits, with a straight
-            instrument [N m, N m, N].
-        wrist: Largest torques (3,) on yaw, pitch and insertion due to the positions of the instrument joints, which the
-            file does not represent [N m, N m, N].
+            instrument (all instrument joints at zero) [N m, N m, N].
+        wrist: Largest change (3,) of the torques of yaw, pitch and insertion due to the positions of the instrument
+            joints [N m, N m, N]. The file does not represent this change.
     """
 
     alpha: NDArray[np.float64]
@@ -98,17 +100,17 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
 
     Args:
         model: Model of a PSM.
-        tolerance: Accepted torque error [N m, N], e.g. due to joint effects or a feedforward scale below 1.
+        tolerance: Largest accepted torque error [N m, N]. Joint effects and feedforward scales below 1 cause errors.
 
     Raises:
-        ModelError: The model is not of a PSM, the net mass on the insertion joint is not positive, or the error exceeds
-            `tolerance`.
+        ModelError: The model is not of a PSM, the net mass on the insertion joint is not positive, or the torque
+            error exceeds `tolerance`.
     """
     arm = model.arm
     plant = shared_plant(arm)
     if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
         raise ModelError(
-            f"{arm.name} is not a PSM, so the format dvrk-kinematic-gc is not possible. An MTM needs dvrk-gc"
+            f"{arm.name} is not a PSM. The format dvrk-kinematic-gc supports only a PSM; for an MTM, use dvrk-gc"
         )
     check_tolerance(tolerance)
     alpha, A, theta, D = _chain(plant)
@@ -116,7 +118,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     straight = np.where(np.arange(arm.num_joints) < 3, q, 0.0)
     beta = np.array([p.value for p in model.base_parameters])
     tau = (model.feedforward_scale * (model.static_model.regressor(straight)[:, :, : len(beta)] @ beta))[:, :3]
-    # (m, 3, 7, 4): torque on yaw, pitch and insertion per unit of mass and first moments of each link of the chain.
+    # (m, 3, 7, 4): torque of yaw, pitch and insertion per unit of the mass and of the first moments of each link.
     frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
     Y = np.array([_regressor(X, arm.gravity) for X in frames])
     mass, moment = _initial_links(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
@@ -138,7 +140,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     if error.max() > tolerance:
         errors = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
         raise ModelError(
-            f"the controller's file cannot represent this model: the largest errors are {errors} [N m, N]. "
+            f"the controller's file cannot represent this model: the largest torque errors are {errors} [N m, N]. "
             "The file supports only gravity with a feedforward scale of 1. Effects that are not represented: "
             f"{_omitted_effects(model, straight)}. To accept the errors, repeat the command with "
             f"--gc-tolerance {round_up(error.max()):g}"
@@ -149,7 +151,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
 
 
 def _omitted_effects(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
-    """Returns the effects on yaw, pitch and insertion as text, with their largest torques at poses q (m, n)."""
+    """Returns text that names each effect on yaw, pitch and insertion, and its largest torque at the poses q (m, n)."""
     gravity = len(model.base_parameters)
     tau = np.abs(model.static_model.regressor(q)[:, :3, gravity:] * model.theta[gravity:]).max(axis=(0, 1))
     described = [f"{ActuatorEffect.of(e)} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
@@ -204,9 +206,10 @@ def _frames(
 
 
 def _regressor(X: NDArray[np.float64], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns holding torques (3, 7, 4) of yaw, pitch and insertion per unit of mass and first moments of each link.
+    """Returns the holding torques (3, 7, 4) of yaw, pitch and insertion for unit masses and unit first moments.
 
-    X (7, 4, 4) are the poses of the link frames, and `gravity` (3,) is in the base frame [m/s^2].
+    The second index is the link. The third index is the mass or one of three first moments. X (7, 4, 4) are the poses
+    of the link frames, and `gravity` (3,) is in the base frame [m/s^2].
     """
     chain = np.zeros((len(NAMES), len(NAMES), 4))
     for joint in range(len(NAMES)):
@@ -227,8 +230,9 @@ def _initial_links(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns masses (7,) [kg] and first moments (7, 3) [kg m] of the links of the chain, before the fit.
 
-    Each link has the mass of the bodies that it represents. First moments are at zero positions, in the DH frames with
-    the poses `home` (7, 4, 4).
+    Each link has the mass of the bodies that it represents. The last link represents all bodies that move with the
+    insertion joint. First moments are computed at zero joint positions and expressed in the DH frames, whose poses are
+    `home` (7, 4, 4).
     """
     context = plant.CreateDefaultContext()
     by_name = {link.link: link.parameters for link in links}

@@ -28,7 +28,7 @@ class ModelExport:
         model: Model that is exported.
         format: Format of the file.
         origin: Source of the model, written to the file.
-        bodies: Links, rotors and omitted effects of an SDF or URDF. None for other formats.
+        bodies: Inertias of links and rotors, and omitted effects, of an SDF or URDF. None for other formats.
         compensation: Content of a file for the dVRK's controller. None for SDF and URDF.
     """
 
@@ -103,7 +103,7 @@ def export_model(
     saturation: Sequence[float] | None = None,
     overwrite: bool = False,
 ) -> ModelExport:
-    """Writes a model for other programs, like `dvrk-drake export`.
+    """Writes a model to a file for another program, as `dvrk-drake export` does.
 
     Args:
         model: Model from `identify`, `IdentifiedModel.load`, or `IdentifiedModel.from_arm`.
@@ -111,15 +111,15 @@ def export_model(
         format: "sdf", "urdf", "dvrk-gc" or "dvrk-kinematic-gc". The last two are the gravity-compensation files of the
             dVRK's controller for an MTM and for a PSM. None selects SDF or URDF by the file name extension.
         origin: Source of the model, written to the file.
-        tolerance: Accepted torque error [N m, N] of a dVRK file that does not represent the model exactly. None means
-            1e-6.
+        tolerance: Largest accepted torque error [N m, N] of a file for the dVRK's controller. None: 1e-6.
         friction: Coulomb friction (7,) [N m] to compensate, for "dvrk-gc". True uses the dry friction of the model's
-            dynamics, False no friction.
-        friction_ratio: Compensated share (7,) of the friction, 0 to 1, for "dvrk-gc". None uses typical values.
+            dynamics. False compensates no friction.
+        friction_ratio: Share of each joint's friction (7,) that is compensated, 0 to 1, for "dvrk-gc". None uses
+            typical values.
         dead_band: Speeds (7,) [rad/s] below which no friction is compensated, for "dvrk-gc". None uses typical values.
-        saturation: Speeds (7,) [rad/s] above which the full share is compensated, for "dvrk-gc". None uses typical
-            values.
-        overwrite: Replaces an existing file.
+        saturation: Speeds (7,) [rad/s] above which `friction_ratio` is fully compensated, for "dvrk-gc". None uses
+            typical values.
+        overwrite: Whether to replace existing files.
 
     Returns:
         Content of the written file. `bodies.left_out` describes effects that an SDF or URDF does not represent.
@@ -132,7 +132,7 @@ def export_model(
         >>> import dvrk_drake as dvrk
         >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm"))
         >>> exported = dvrk.export_model(model, "psm.json", "dvrk-kinematic-gc", tolerance=0.5)
-        >>> exported.compensation.mass.shape  # [kg] of the links of the controller's chain
+        >>> exported.compensation.mass.shape  # masses [kg] of the links of the controller's chain
         (7,)
     """
     if format is None:

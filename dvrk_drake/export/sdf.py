@@ -38,7 +38,7 @@ class LinkChange:
 
 
 def changed_links(arm: Arm, links: Sequence[LinkInertia]) -> list[LinkChange]:
-    """Returns the links whose parameters differ from those of the arm's SDF.
+    """Returns the links whose inertial parameters differ from the arm's SDF.
 
     Raises:
         ModelError: A link does not belong to the arm or is given twice.
@@ -89,15 +89,15 @@ def write_sdf(
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
 ) -> None:
-    """Writes the SDF of `with_inertias` atomically, and copies its meshes into the folder <name>_meshes beside it.
+    """Writes the SDF of `with_inertias` atomically, and copies the meshes into the folder <name>_meshes beside it.
 
     Args:
         arm, links, rotor_inertias: Arguments of `with_inertias`.
         path: Path of the SDF.
-        origin: Source of the inertias, written as a comment into the first lines.
+        origin: Source of the inertias, written into a comment at the start of the file.
 
     Raises:
-        ModelError: `with_inertias` raises it.
+        ModelError: An argument is invalid, see `with_inertias`.
         DvrkDrakeError: A file cannot be written.
     """
     target = Path(path)
@@ -166,7 +166,7 @@ def _add(parent: ElementTree.Element, tag: str, text: str) -> None:
 
 
 def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
-    """Formats numbers in full precision. Numbers below 1e-15 of the largest one are rounding errors and become 0."""
+    """Formats numbers in full precision. Numbers below 1e-15 times the largest number become 0."""
     threshold = 1e-15 * max(abs(x) for x in values)
     return [repr(float(x)) if abs(x) > threshold else "0" for x in values]
 
@@ -190,12 +190,13 @@ def refuse_existing_meshes(model_path: str | Path, overwrite: bool) -> None:
     folder = Path(model_path).with_name(mesh_folder(Path(model_path)))
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise DvrkDrakeError(
-            f"{folder}: the folder contains files already; give another model file, or replace them with --overwrite"
+            f"{folder}: the folder contains files already; choose another name for the model file, or replace the "
+            "files with --overwrite"
         )
 
 
 def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, Path]:
-    """Replaces every mesh `<uri>` in a composed model by a path in `mesh_folder`, relative to the model.
+    """Replaces every mesh `<uri>` in a composed model by a path in `mesh_folder`, relative to the model file.
 
     URIs of other packages are not changed.
 
@@ -204,7 +205,7 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
         model_path: Path of the file to which the model will be written.
 
     Returns:
-        Source -> target of each file to copy, including the files to which glTF files refer.
+        Mapping from the source to the target of each file to copy, including the files to which glTF files refer.
 
     Raises:
         ArmError: A mesh does not exist, or two meshes would have the same target.
@@ -219,7 +220,10 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
         relative = Path(mesh_folder(model_path)) / source.parent.name / source.name
         target = model_path.parent / relative
         if copies.setdefault(source, target) != target or list(copies.values()).count(target) > 1:
-            raise ArmError(f"{source}: another mesh of the model has the same name and folder name; rename one of them")
+            raise ArmError(
+                f"{source}: another mesh file of the model has the same file name, in a folder with the same name. "
+                "Rename one of the files"
+            )
         for file in _referenced_files(source):
             copies[source.parent / file] = target.parent / file
         uri.text = relative.as_posix()
@@ -230,7 +234,7 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
     """Copies each file atomically.
 
     Args:
-        copies: Source -> target.
+        copies: Mapping from source to target.
 
     Raises:
         DvrkDrakeError: A file cannot be written.
@@ -253,7 +257,7 @@ def _local_path(uri: str) -> Path | None:
 
 
 def _referenced_files(mesh: Path) -> list[str]:
-    """Returns paths of the buffers and images of a glTF file, relative to its folder. Other meshes have none."""
+    """Returns the paths of the buffers and images of a glTF file, relative to its folder. Other meshes have none."""
     if mesh.suffix != ".gltf":
         return []
     content = read_json_input(mesh, ArmError, MAX_BINARY)
@@ -263,5 +267,8 @@ def _referenced_files(mesh: Path) -> list[str]:
     except (AttributeError, TypeError) as error:
         raise ArmError(f"{mesh}: not a valid glTF file; its buffers and images must be objects with a uri") from error
     if outside := [name for name in names if Path(name).is_absolute() or ".." in Path(name).parts]:
-        raise ArmError(f"{mesh}: refers to {outside[0]}, which is outside the folder of the mesh; move that file there")
+        raise ArmError(
+            f"{mesh}: refers to {outside[0]}, which is outside the folder of the mesh; move {outside[0]} into "
+            "this folder and correct its path in the mesh file"
+        )
     return names

@@ -16,7 +16,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, read_sdf_facts
 
-#: Speed limit of joints without one in the SDF, because URDF requires a limit [rad/s, m/s].
+#: Speed limit of joints for which the SDF has no speed limit [rad/s, m/s]. URDF requires a speed limit.
 NO_SPEED_LIMIT = "1000"
 
 
@@ -27,11 +27,11 @@ def write_urdf(
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
 ) -> None:
-    """Writes the URDF atomically, and copies its meshes into the folder <name>_meshes beside it.
+    """Writes the URDF atomically, and copies the meshes into the folder <name>_meshes beside the file.
 
     Dependent joints of the linkage become mimic joints, because URDF does not support closed loops. A capsule becomes a
     cylinder and two spheres, because URDF does not support capsules. Rotor inertias, gear ratios, named frames and
-    collision filters are written as Drake's extensions, which other readers ignore.
+    collision filters are written in Drake's extensions of URDF. Other programs ignore these extensions.
 
     Args:
         arm, links, path, origin, rotor_inertias: Arguments of `write_sdf`.
@@ -53,7 +53,8 @@ def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
     """Converts a composed SDF model to the element `<robot>`.
 
     Raises:
-        ModelError: URDF does not support a part of the SDF, such as a `<pose>` in a joint, a spring or a shape.
+        ModelError: URDF does not support a part of the SDF, such as a `<pose>` in a joint, a joint spring or an
+            unsupported shape.
     """
     (model,) = root.findall("model")
     facts = read_sdf_facts(root)

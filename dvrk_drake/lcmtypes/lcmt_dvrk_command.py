@@ -4,14 +4,15 @@ DO NOT MODIFY BY HAND!!!!
 """
 
 """
-What a controller asks of one arm of a da Vinci Research Kit. Channel: DVRK_COMMAND_<ARM>, e.g. DVRK_COMMAND_MTML.
+Command from a controller to one arm of a da Vinci Research Kit. Channel: DVRK_COMMAND_<ARM>, e.g. DVRK_COMMAND_MTML.
 
-One command answers one status: read a DVRK_STATUS_<ARM> message, compute, echo its session_id and utime, send.
-The arm obeys a command until 50 ms after status_utime, whenever it came, and then holds its pose by itself until an
-operator resumes; what it refuses and why is in lcmt_dvrk_status. The rules are those of dvrk_drake/systems/guard/command_guard.py.
+A controller sends one command for each DVRK_STATUS_<ARM> message, and copies session_id and utime of this status. A
+command expires 50 ms after status_utime, independent of its time of arrival. The arm then regulates its pose until
+an operator resumes. Commands can be refused for the reasons in lcmt_dvrk_status. The rules are documented and
+implemented in dvrk_drake/systems/guard/command_guard.py.
 
-Units are SI: rad, rad/s, N m; m, m/s, N on a prismatic joint. Joints are in the dVRK's order; the jaw of a patient
-side manipulator is its last joint, also where ROS gives it a topic of its own.
+Units are SI: rad, rad/s and N m, or m, m/s and N for a prismatic joint. Joints are in the order of the dVRK. The jaw
+of a patient-side manipulator is its last joint, although it has separate ROS topics.
 """
 
 from io import BytesIO
@@ -26,54 +27,54 @@ class lcmt_dvrk_command(object):
     __dimensions__ = [None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"], None, ["mac_size"]]
 
     INVALID = 0
-    """ control_mode: none, what a command has that was never filled in; always refused """
+    """ control_mode: value of a command that was not filled in; always refused """
     HOLD = 1
-    """ the arm holds its present pose by itself; always safe to send """
+    """ the arm regulates its current pose with its own controller; always safe to send """
     POSITION = 2
-    """ the arm follows `position`, and `velocity` as feed-forward """
+    """ the arm tracks `position`, with `velocity` as feedforward """
     EFFORT = 3
     """ the motors apply `effort` """
     OFF = 4
     """
-    motors without power; an arm without brakes falls, so it is accepted only if the driver is configured to, from an arm
-    that holds, after a HOLD of the same sender, and never in a fault. It is no emergency stop: that is a button
+    motor power off; an arm without brakes falls. OFF is accepted only if the driver is configured to accept it, if the
+    arm is in HOLD without a fault, and after a HOLD command of the same sender. It does not replace the emergency stop
+    button
     """
 
     def __init__(self):
         self.utime = 0
         """
-        sender's clock when it sent this [us], any epoch; increases with every command
+        time of sending on the sender's clock [us], with any epoch; increases with every command
         LCM Type: int64_t
         """
 
         self.sequence = 0
         """
-        increases with every command of this sender, by one if none is left out; while it commands, by at most 1000
+        sequence number of this sender's commands; increases by 1 per command, and by at most 1000 if commands are lost
         LCM Type: int64_t
         """
 
         self.sender_id = 0
         """
-        not 0; random, drawn when the sender starts: identifies the sender
+        random number other than 0, drawn when the sender starts; identifies the sender
         LCM Type: int64_t
         """
 
         self.session_id = 0
         """
-        session_id of the status that this answers: the arm refuses commands meant for its past
+        session_id of the answered status; the arm ignores commands for its earlier sessions
         LCM Type: int64_t
         """
 
         self.status_utime = 0
         """
-        utime of the status that this answers: gives the arm, on its own clock, the age of the measurement is that this
-        was computed from
+        utime of the answered status; the arm computes from it the age of the measurement on its own clock
         LCM Type: int64_t
         """
 
         self.arm_name = ""
         """
-        as in the status, e.g. "MTML"
+        name of the arm as in the status, e.g. "MTML"
         LCM Type: string
         """
 
@@ -85,44 +86,43 @@ class lcmt_dvrk_command(object):
 
         self.reset_fault = False
         """
-        changes from false to true: clear a latched fault, or resume after the watchdog took over; only with control_mode
-        HOLD
+        a change from false to true clears a latched fault or ends a watchdog hold; only with control_mode HOLD
         LCM Type: boolean
         """
 
         self.num_joints = 0
         """
-        of the arm, in every mode
+        number of joints of the arm, required in every mode
         LCM Type: int32_t
         """
 
         self.position = []
         """
-        POSITION: desired positions [rad, m]; else ignored, but finite
+        desired positions [rad, m] for POSITION; finite but not used in other modes
         LCM Type: double[num_joints]
         """
 
         self.velocity = []
         """
-        POSITION: desired velocities [rad/s, m/s], 0 where the position stands; else ignored, but finite
+        desired velocities [rad/s, m/s] for POSITION, 0 for a constant position; finite but not used in other modes
         LCM Type: double[num_joints]
         """
 
         self.effort = []
         """
-        EFFORT: what the motors shall apply [N m, N]; else ignored, but finite
+        desired efforts [N m, N] for EFFORT; finite but not used in other modes
         LCM Type: double[num_joints]
         """
 
         self.mac_size = 0
         """
-        16 if the message is authenticated, else 0
+        16 if the message is authenticated, otherwise 0
         LCM Type: int8_t
         """
 
         self.mac = b""
         """
-        message authentication code: BLAKE2b with the key of both sides and a digest of 16 bytes, over all bytes of the
+        message authentication code: BLAKE2b with the shared key and a digest of 16 bytes, computed over all bytes of the
         encoded message before mac_size
         LCM Type: byte[mac_size]
         """

@@ -4,8 +4,8 @@ DO NOT MODIFY BY HAND!!!!
 """
 
 """
-What one arm of a da Vinci Research Kit measures and does. Channel: DVRK_STATUS_<ARM>, every millisecond, also while
-nobody commands it. Units and order of joints: as in lcmt_dvrk_command.
+Measurements and guard state of one arm of a da Vinci Research Kit. Channel: DVRK_STATUS_<ARM>. The arm sends it
+every millisecond, also without commands. Units and order of the joints are those of lcmt_dvrk_command.
 """
 
 from io import BytesIO
@@ -20,125 +20,126 @@ class lcmt_dvrk_status(object):
     __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], None, ["num_grippers"], None, ["mac_size"]]
 
     STATE_OFF = 0
-    """ guard_state, what decides over the motors: motors without power """
+    """ guard_state: motor power is off """
     STATE_HOLD = 1
-    """ the arm holds a pose by itself """
+    """ the arm regulates a pose with its own controller """
     STATE_STARTING = 2
-    """ as HOLD; a sender's commands are good so far, and are watched before they act """
+    """ as HOLD, while a sender's commands are checked before they act """
     STATE_POSITION = 3
     """ position commands act """
     STATE_EFFORT = 4
     """ effort commands act """
     STATE_FAULT = 5
     """
-    as HOLD, until a command resets it. After a fault of a measurement, efforts hold the other joints, and joints with
-    FLAG_IMPLAUSIBLE get the gravity effort of their last valid pose. Motors that were without power stay so
+    as HOLD, until a command with reset_fault. After a measurement fault, joints with FLAG_IMPLAUSIBLE get the gravity
+    effort of their last valid pose, and the guard regulates the positions of the other joints with efforts. If the
+    motor power was off, it stays off
     """
     FAULT_NONE = 0
-    """ fault_code; a fault is latched, only a command with reset_fault clears it: none """
+    """ fault_code: no fault. All faults are latched until a command with reset_fault """
     FAULT_POSITION_LIMIT = 2
-    """ pushed beyond a position limit while effort commands acted """
+    """ a joint was beyond a position limit while effort commands acted """
     FAULT_MEASUREMENT = 3
-    """ measured positions, velocities or efforts were not finite, or too old; or the first pose was far beyond a limit """
+    """ measurements were not finite or too old, or the first pose was far beyond a limit """
     FAULT_CLOCK = 4
-    """ the arm's own clock went backwards or stood still """
+    """ the clock of the arm went backwards or stopped """
     FAULT_DRIVER = 5
-    """ for bridges: fault of the arm itself, described in fault_text """
+    """ the bridge reported a fault of the arm, which fault_text describes """
     FAULT_FOLLOWING = 6
-    """ a joint was too far from where position commands led it: something is in its way """
+    """ the tracking error of a joint was too large, for example because of an obstacle """
     FAULT_IMPLAUSIBLE = 7
-    """ a measurement is not plausible: it jumps, is frozen, or contradicts another one """
+    """ a measurement is not plausible: it jumps, does not change, or contradicts another measurement """
     FAULT_OSCILLATION = 8
     """ the commanded efforts oscillate """
     FAULT_NOT_FINITE = 9
-    """ the guard computed a number that is not finite, e.g. since its model did """
+    """ the guard computed a number that is not finite """
     REFUSAL_NONE = 0
     """
-    refusal_code and ignored_code, why a command was not accepted: all were so far. A command that is not accepted does
-    not act and does not keep an older one in force. It changes nothing, except that a sender that is STARTING starts
-    anew if its command was refused for its content
+    refusal_code and ignored_code: no command was refused or ignored. A command that is not accepted does not act, and
+    does not extend the validity of an earlier one. If it is refused for its content during STARTING, STARTING begins
+    again
     """
     REFUSAL_UNREADABLE = 1
-    """ not an lcmt_dvrk_command: garbage, or another version of this file """
+    """ the data are not an lcmt_dvrk_command of this version """
     REFUSAL_WRONG_ARM = 2
-    """ arm_name is not this arm's """
+    """ arm_name is the name of another arm """
     REFUSAL_WRONG_SIZE = 3
-    """ num_joints is not this arm's """
+    """ num_joints is not the number of joints of this arm """
     REFUSAL_NOT_FINITE = 4
-    """ a number is NaN, infinite or absurd (beyond 1e6) """
+    """ a number is NaN, infinite, or larger than 1e6 """
     REFUSAL_BAD_MODE = 5
     """ control_mode is unknown or not in accepted_modes """
     REFUSAL_NO_SENDER = 6
     """ sender_id is 0 """
     REFUSAL_WRONG_SESSION = 7
-    """ session_id is not this arm's: the arm was restarted, or a log is replayed """
+    """ session_id is not the current one, because the arm was restarted or a log is replayed """
     REFUSAL_STALE = 8
-    """ status_utime is older than 50 ms, or from the future; or HOLD for motors without power, of an unknown pose """
+    """ status_utime is older than 50 ms or in the future; or HOLD while the motor power is off and the pose is not known """
     REFUSAL_OUT_OF_ORDER = 9
-    """ sequence is not above that of the last command of this sender """
+    """ sequence is not larger than that of the last command of this sender """
     REFUSAL_CLOCK_JUMP = 10
-    """ the sender's utime and the arm's clock advanced differently since its last accepted command """
+    """ since the last accepted command, the sender's utime and the arm's clock have advanced by different amounts """
     REFUSAL_FAULT = 11
-    """ a fault is latched and this is not HOLD """
+    """ a fault is latched, and control_mode is not HOLD """
     REFUSAL_BAD_RESET = 12
-    """ reset_fault with another mode than HOLD """
+    """ reset_fault with a control_mode other than HOLD """
     REFUSAL_START_FAR = 13
     """
-    starting: the command is too far from the present effort or pose, also where its velocity leads, or the present
-    effort is more than commands may use
+    at the start: the command, or the position that its velocity leads to, is too far from the measured effort or pose;
+    or the measured effort exceeds the limit of commands
     """
     REFUSAL_START_OUTSIDE = 14
-    """ starting with efforts while the pose is beyond a position limit by more than half of the margin """
+    """ at the start of efforts: the pose is beyond a position limit by more than half of the margin """
     REFUSAL_OTHER_SENDER = 15
-    """ another sender came first and is still sending; it stays in command """
+    """ another sender is in command and still sends """
     REFUSAL_SUDDEN_OFF = 16
-    """ OFF that does not follow a HOLD of the same sender """
+    """ OFF without a preceding HOLD of the same sender """
     REFUSAL_RESUME = 17
-    """ POSITION or EFFORT after the watchdog took over, before an operator resumed; fault_text is why it did """
+    """ POSITION or EFFORT during a watchdog hold, before an operator resumed; fault_text states the cause of the hold """
     REFUSAL_START_GRAVITY = 18
-    """ starting with efforts while the measured effort is not the gravity effort of the pose """
+    """ at the start of efforts: the measured effort is not close to the gravity effort of the pose """
     REFUSAL_NOT_AUTHENTIC = 19
-    """ the arm has a key, and the command has no valid message authentication code """
+    """ the arm has a key, and the command does not have a valid message authentication code """
     REFUSAL_SEQUENCE_JUMP = 20
-    """ sequence is too far above that of the last accepted command of this sender """
+    """ sequence exceeds that of the last accepted command of this sender by more than 1000 """
     REFUSAL_FLOOD = 21
-    """ more commands came within one period than are examined """
+    """ more commands arrived in one period than the guard examines """
     FLAG_EFFORT_CLAMPED = 1
-    """ joint_flags, bits: the commanded effort was beyond the motor's limit """
+    """ bits of joint_flags: the commanded effort exceeded the effort limit and was clamped """
     FLAG_RATE_LIMITED = 2
-    """ the command changed faster than allowed and is followed with a delay """
+    """ the command changed faster than allowed and was rate-limited """
     FLAG_POSITION_LIMIT = 4
-    """ near or beyond a limit of this joint, and kept from it """
+    """ the joint is near or beyond its position limit, and a soft wall acts """
     FLAG_COUPLED_LIMIT = 8
-    """ the same for a limit of a sum of joints that this one is in """
+    """ the same for a coupled limit, which limits a sum of joint positions """
     FLAG_SPEED_LIMIT = 16
-    """ faster than allowed while efforts act, and braked """
+    """ the joint is faster than allowed under effort commands, and is braked """
     FLAG_IMPLAUSIBLE = 32
-    """ its position is not plausible: it has no feedback, but the gravity effort of its last valid pose """
+    """ the position is not plausible; the joint gets no feedback, but the gravity effort of its last valid pose """
 
     def __init__(self):
         self.utime = 0
         """
-        arm's clock when the state was measured [us since 1970]; the clock never jumps or goes backwards. Two statuses of one
-        measurement have the same
+        time of the measurement on the arm's clock [us since 1970]; this clock does not jump or go backwards. Statuses of
+        the same measurement have the same utime
         LCM Type: int64_t
         """
 
         self.sequence = 0
         """
-        increases by one with every status; a gap is a lost message
+        increases by 1 with every status; a gap indicates lost messages
         LCM Type: int64_t
         """
 
         self.session_id = 0
         """
-        not 0; random, drawn when the arm starts: another number means that it was restarted
+        random number other than 0, drawn when the arm starts; it changes if the arm is restarted
         LCM Type: int64_t
         """
 
         self.arm_name = ""
         """
-        as the dVRK names it, e.g. "MTML"
+        name of the arm in the dVRK, e.g. "MTML"
         LCM Type: string
         """
 
@@ -150,15 +151,14 @@ class lcmt_dvrk_status(object):
 
         self.accepted_modes = 0
         """
-        bit 1 << control_mode for each mode that a command may have now: in a fault only HOLD; OFF only in HOLD and OFF, and
-        if the driver is configured to accept it. Not POSITION and EFFORT after the watchdog took over, until an operator
-        resumes
+        bit 1 << control_mode for each control_mode that is accepted now. In a fault: only HOLD. OFF: only in the states
+        HOLD and OFF, if the driver is configured to accept it. During a watchdog hold: neither POSITION nor EFFORT
         LCM Type: int8_t
         """
 
         self.gravity_compensation = False
         """
-        the arm adds its own gravity compensation to commanded efforts: do not add yours
+        true if the arm adds its own gravity compensation to commanded efforts; the controller must not add gravity then
         LCM Type: boolean
         """
 
@@ -170,14 +170,14 @@ class lcmt_dvrk_status(object):
 
         self.fault_text = ""
         """
-        the fault in words with its numbers. If fault_code is FAULT_NONE: why the watchdog took over, until an operator
-        resumes. Else empty
+        description of the fault with its numbers, or, during a watchdog hold without a fault, the cause of the hold;
+        otherwise empty
         LCM Type: string
         """
 
         self.command_sender_id = 0
         """
-        who is in command; 0: nobody
+        sender_id of the sender in command, 0 if there is none
         LCM Type: int64_t
         """
 
@@ -189,116 +189,117 @@ class lcmt_dvrk_status(object):
 
         self.command_utime = 0
         """
-        its utime, on its sender's clock: that clock's time of arrival minus this is the round trip
+        utime of that command, on its sender's clock; the sender can compute the round-trip time from it
         LCM Type: int64_t
         """
 
         self.num_accepted = 0
         """
-        commands accepted since the arm started
+        number of accepted commands since the start of the arm
         LCM Type: int64_t
         """
 
         self.num_lost = 0
         """
-        commands missing in the sequence of the sender in command since the arm started
+        number of commands missing in the sequence of the sender in command since the start of the arm
         LCM Type: int64_t
         """
 
         self.num_refused = 0
         """
-        commands of the sender in command, or of one that may become it, that were refused since the arm started
+        number of refused commands since the start of the arm, from the sender in command or from a sender that may take
+        over
         LCM Type: int64_t
         """
 
         self.num_ignored = 0
         """
-        messages ignored since the arm started because they do not belong to its session and sender: unreadable, for another
-        arm, size or session, without a valid authentication code, from another sender, or too many
+        number of ignored messages since the start of the arm: not readable, for another arm, size or session, without a
+        valid authentication code, from another sender, or more than the guard examines in one period
         LCM Type: int64_t
         """
 
         self.num_expired = 0
         """
-        times that a command in force expired and the arm took over since it started
+        number of times since the start of the arm that the command in force expired, which starts a watchdog hold
         LCM Type: int64_t
         """
 
         self.refusal_code = 0
         """
-        of the last refused command: one of REFUSAL_*
+        reason for the last refused command, one of REFUSAL_*
         LCM Type: int8_t
         """
 
         self.ignored_code = 0
         """
-        of the last ignored message: one of REFUSAL_*
+        reason for the last ignored message, one of REFUSAL_*
         LCM Type: int8_t
         """
 
         self.num_joints = 0
         """
-        of the arm, also before anything was measured
+        number of joints of the arm, also before the first measurement
         LCM Type: int32_t
         """
 
         self.position = []
         """
-        measured [rad, m]
+        measured positions [rad, m]
         LCM Type: double[num_joints]
         """
 
         self.velocity = []
         """
-        estimated [rad/s, m/s]
+        estimated velocities [rad/s, m/s]
         LCM Type: double[num_joints]
         """
 
         self.effort_measured = []
         """
-        what the motors apply [N m, N]
+        efforts that the motors apply, measured [N m, N]
         LCM Type: double[num_joints]
         """
 
         self.position_commanded = []
         """
-        where the arm is regulated to; while efforts act or it is off: measured
+        target of the position control [rad, m]; the measured position under effort commands or with motor power off
         LCM Type: double[num_joints]
         """
 
         self.effort_commanded = []
         """
-        effort commanded to the motors, after all limits [N m, N]
+        efforts commanded to the motors after all limits [N m, N]
         LCM Type: double[num_joints]
         """
 
         self.joint_flags = []
         """
-        bits FLAG_*
+        sum of bits FLAG_* for each joint
         LCM Type: int8_t[num_joints]
         """
 
         self.num_grippers = 0
         """
-        1 on a master arm that has its gripper connected, else 0
+        1 for a master arm with a connected gripper, otherwise 0
         LCM Type: int8_t
         """
 
         self.gripper_position = []
         """
-        opening angle, measured only: no motor drives it [rad]
+        measured opening angle [rad]; the gripper has no motor
         LCM Type: double[num_grippers]
         """
 
         self.mac_size = 0
         """
-        16 if the message is authenticated, else 0
+        16 if the message is authenticated, otherwise 0
         LCM Type: int8_t
         """
 
         self.mac = b""
         """
-        as in lcmt_dvrk_command
+        message authentication code, as in lcmt_dvrk_command
         LCM Type: byte[mac_size]
         """
 

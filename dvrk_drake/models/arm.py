@@ -1,4 +1,4 @@
-"""Defines `Arm`: joints, limits, linkage and transmission of an arm, read from its YAML and SDF files."""
+"""Defines `Arm`: joints, limits, linkage and transmission of an arm. `load_arm` reads them from YAML and SDF files."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, co
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 _ARMS = MODELS_FOLDER / "arms"
-#: Maximum length of the gravity vector [m/s^2].
+#: Maximum norm of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0
 #: Position errors [rad, m] that define the maximum gains. A gain is too large if this error causes the maximum effort
-#: of the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
+#: of the joint. For kd, the error arises within 0.1 s. For ki, the error lasts for 0.1 s.
 _MIN_ERROR = (1e-4, 1e-5)
-#: Shares of the effort limit that define the minimum gains. A gain is too small if an error as large as the range of
-#: the joint causes less than this share: for kp immediately, for kd if the error arises within 1 s, for ki if it lasts
-#: for 1 s.
+#: Shares of the effort limit that define the minimum gains. A gain is too small if a position error as large as the
+#: range of the joint causes less than this share. For kd, the error arises within 1 s. For ki, the error lasts for 1 s.
 _MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
 Part = TypeVar("Part", Mechanism, Instrument)
@@ -65,14 +64,15 @@ class Arm:
         position_lower, position_upper: Position limits (n,) of this arm.
         effort_limits: Limits (n,) of the joint torques, from the SDF.
         prismatic: Array (n,), True for prismatic joints [m, N], False for revolute joints [rad, N m].
-        coupled_limits: Limits of sums of joint positions.
-        linkage: Map q_tree = G q + c, from the `drake:mimic` tags of the SDF.
+        coupled_limits: Limits on weighted sums of joint positions.
+        linkage: Map q_tree = G q + c from the independent joint positions q to the positions of `tree_joint_names`. It
+            is read from the `drake:mimic` tags of the SDF.
         transmission: Map a = J q from joint positions q to actuator positions a.
         loop_closures: Pairs of frames whose origins coincide at every pose of the linkage.
         gravity: Gravity vector (3,) in the base frame [m/s^2].
         gains: Default gains of the controller.
-        friction_coordinates: Mapping from a name to the joint coefficients (n,) of an additional friction coordinate,
-            for friction that acts neither at a joint nor at an actuator.
+        friction_coordinates: Additional coordinates along which friction acts, besides joints and actuators: mapping
+            from the name of a coordinate to a vector (n,), whose product with q is the coordinate.
         identification: Settings for recordings of the arm, and bounds of the mass distribution of the links.
         effects: Friction, cable and sensor effects of the real arm. A simulation includes them only on request.
 
@@ -114,21 +114,22 @@ class Arm:
         return f"<Arm {self.name}: {self.source}>"
 
     def check(self) -> None:
-        """Checks that all numbers are finite, within the range of their field, in order, and one per joint.
+        """Checks the range of all numbers, the order of the limits and the number of elements of each vector.
 
         Arrays and gains can be modified after loading, so the command guard and the controller repeat this check.
 
         Raises:
-            ArmError: A number is not accepted. The message names the first such number and the accepted values.
+            ArmError: A number or the length of a vector is not accepted. The message names the first fault and the
+                accepted values.
         """
         if fault := next(filter(None, self._faults()), ""):
             raise ArmError(fault)
 
     def gains_fault(self, gains: Gains) -> str:
-        """Returns a message on the first gain that is not accepted for this arm and the accepted values, or "".
+        """Returns a message that names the first invalid gain and its accepted values, or "" if all gains are accepted.
 
         A gain must be large enough to move its joint. It must be small enough that a position error of the size of
-        the sensor resolution does not cause the maximum effort. See `_MIN_SHARE` and `_MIN_ERROR`.
+        the sensor resolution does not cause the maximum effort. `_MIN_SHARE` and `_MIN_ERROR` define both limits.
         """
         if fault := _count_fault("gains.", vars(gains), self.joint_names):
             return fault
@@ -169,15 +170,15 @@ class Arm:
         return len(self.joint_names)
 
     def per_joint(self, revolute: float, prismatic: float) -> NDArray[np.float64]:
-        """Returns an array (n,) with `revolute` [rad, rad/s, ...] or `prismatic` [m, m/s, ...] for each joint."""
+        """Returns an array (n,) with the value `revolute` for revolute joints and `prismatic` for prismatic joints."""
         return np.where(self.prismatic, prismatic, revolute)
 
     @cached_property
     def effect_coordinates(self) -> dict[str, NDArray[np.float64]]:
         """Coordinates along which effects can act: mapping from a name to a row h (n,).
 
-        The coordinate is x = h a for actuator positions a. An effort f along x acts on the actuators as h' f. Names are
-        "actuator.<name>", "joint.<name>" and those of the arm's own `friction_coordinates`.
+        The coordinate is x = h a for actuator positions a. An effort f along x acts on the actuators as h' f. The names
+        are "actuator.<name>", "joint.<name>" and the names in `friction_coordinates`.
         """
         J_inverse = self.transmission.inverse.matrix
         rows = {f"actuator.{name}": unit for name, unit in zip(self.joint_names, np.eye(self.num_joints), strict=True)}
@@ -185,12 +186,14 @@ class Arm:
         return rows | {name: row @ J_inverse for name, row in self.friction_coordinates.items()}
 
     def encoder_counts(self) -> NDArray[np.float64]:
-        """Size (n,) of one encoder count at each joint [rad, m]; 0 if the arm's effects specify no encoder."""
+        """Returns the size (n,) of one encoder count at each joint [rad, m]. It is 0 for an arm without
+        `effects.encoder`.
+        """
         resolution = self.effects.encoder.resolution if self.effects.encoder is not None else {}
         return np.abs(self.transmission.inverse.matrix) @ per_actuator(resolution, self.joint_names, 0.0)
 
     def dry_friction(self) -> NDArray[np.float64]:
-        """Largest dry friction (n,) on each joint, from the arm's effects [N m, N]; 0 where none is specified."""
+        """Returns the maximum dry friction (n,) on each joint [N m, N], computed from the arm's effects."""
         dry = np.zeros(self.num_joints)
         for effect in self.effects.friction:
             if effect.kind != "viscous":
@@ -199,7 +202,7 @@ class Arm:
         return dry
 
     def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Returns all limits as lower <= A q <= upper: joint limits first, then coupled limits."""
+        """Returns A, lower and upper for lower <= A q <= upper. The coupled limits are the last rows."""
         rows = [[limit.coefficients.get(j, 0.0) for j in self.joint_names] for limit in self.coupled_limits]
         A = np.vstack([np.eye(self.num_joints), np.array(rows).reshape(-1, self.num_joints)])
         lower = np.concatenate([self.position_lower, [limit.lower for limit in self.coupled_limits]])
@@ -218,12 +221,12 @@ class Arm:
         return [f"{names[i]} = {value[i]:.4g} is outside {lower[i]:.4g}..{upper[i]:.4g}" for i in bad]
 
     def sample_poses(self, count: int, generator: np.random.Generator, margin: float = 0.0) -> NDArray[np.float64]:
-        """Returns `count` random poses (count, n), uniform within the joint limits and inside the coupled limits.
+        """Returns random poses (count, n), uniformly distributed within the joint limits and the coupled limits.
 
         Args:
             count: Number of poses.
             generator: Random number generator.
-            margin: Fraction of each joint range that is excluded at both ends, 0..0.5.
+            margin: Fraction (0 to 0.5) of the range of each limit that is excluded at each end.
 
         Raises:
             ArmError: Almost no pose within the joint limits meets the coupled limits.
@@ -250,14 +253,14 @@ class Arm:
         """Returns the same arm with the gravity vector `gravity` (3,) in the base frame [m/s^2].
 
         Raises:
-            ArmError: `gravity` is not three numbers, or its length exceeds 30 m/s^2.
+            ArmError: `gravity` does not have three elements, or its norm exceeds 30 m/s^2.
         """
         return _mounted(self, tuple(_checked_gravity(gravity).tolist()))
 
 
 @cache
 def _mounted(arm: Arm, gravity: tuple[float, ...]) -> Arm:
-    """Returns one shared Arm object per mounting, so that derived and compiled data are created only once."""
+    """Returns the arm with another gravity vector. Calls with equal arguments return the same Arm object."""
     if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
         return arm
     return dataclasses.replace(arm, gravity=np.array(gravity))
@@ -279,11 +282,11 @@ def known_arms() -> list[str]:
 def load_arm(name: str | Path) -> Arm:
     """Loads an arm. Repeated calls return the same Arm object until the file changes.
 
-    Changes of other files of the arm (mechanism, instrument, SDF) take effect in a new process.
+    Changes of the other files of the arm (mechanism, instrument, SDF) take effect only in a new process.
 
     Args:
-        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive), or path or package URL of the YAML file
-            of an arm.
+        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive). For any other arm, the path or package
+            URL of its YAML file.
 
     Raises:
         ArmError: The arm does not exist, or its files are invalid or inconsistent.
@@ -301,7 +304,7 @@ def load_arm(name: str | Path) -> Arm:
     if not name.endswith((".yaml", ".yml")):
         return _load_arm(name.lower())
     path = Path(os.path.realpath(local_path(name)))
-    # Names and paths of the same arm give the same Arm object.
+    # The name and the path of an arm of this package give the same Arm object.
     if path.parent == _ARMS.resolve():
         return _load_arm(path.stem)
     with suppress(OSError):  # _load_arm reports a missing file
@@ -312,7 +315,7 @@ def load_arm(name: str | Path) -> Arm:
 
 @cache
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
-    """Loads an arm by name or absolute path. `state` identifies the version of the YAML file in the cache."""
+    """Loads an arm by name or absolute path. `state` (time of change, size) is the version of the YAML file."""
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():
@@ -363,7 +366,7 @@ def _build_arm(
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     if not joints or len({*joints}) < len(joints):
-        raise ArmError(f"{path}: the mechanism and instrument must have at least one joint, and no joint name twice")
+        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and each joint its own name")
     if not mechanism.sdf:
         raise ArmError(f"{path}: the mechanism file has no sdf")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
@@ -381,7 +384,7 @@ def _build_arm(
     for row, name in enumerate(facts.joint_names):
         leader, multiplier, offset = facts.mimics.get(name, (name, 1.0, 0.0))
         if leader not in joints:
-            raise ArmError(f"{path}: joint {name} of the SDF must be in the list joints, or a mimic of a joint in it")
+            raise ArmError(f"{path}: joint {name} of the SDF must be in the list joints, or mimic a joint of that list")
         G[row, joints.index(leader)], c[row] = multiplier, offset
     return Arm(
         name=description.name,
@@ -410,7 +413,7 @@ def _build_arm(
 
 
 def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:
-    """Returns the settings of the mechanism and the instrument. The defaults are 20 Hz and no delay."""
+    """Returns the settings of mechanism and instrument. The default is a cut-off frequency of 20 Hz and no delay."""
     both: dict[str, list[float]] = {}
     for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
         both[which] = []
@@ -459,9 +462,7 @@ def _checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
     vector = np.asarray(gravity, float)
     if vector.shape != (3,) or not np.linalg.norm(vector) <= MAX_GRAVITY:
         numbers = ", ".join(f"{x:g}" for x in vector.ravel())
-        raise ArmError(
-            f"gravity ({numbers}) must be a vector of three numbers with a length up to {MAX_GRAVITY:g} m/s^2"
-        )
+        raise ArmError(f"gravity ({numbers}) must be a vector of three numbers with a norm up to {MAX_GRAVITY:g} m/s^2")
     return vector
 
 
@@ -472,7 +473,7 @@ def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np
 
 
 def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:
-    """Returns J with a = J q from the rows of the mechanism and the inverse of the instrument's coupling."""
+    """Returns J of a = J q: the rows of the mechanism, and the inverse of the instrument's coupling for its joints."""
     J: NDArray[np.float64] = np.eye(len(joints))
     for joint, terms in instrument.joint_from_actuator.items():
         J[_index(path, "joint_from_actuator", joint, joints)] = _row(

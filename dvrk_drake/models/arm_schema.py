@@ -12,20 +12,23 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
-#: Accepted position limits of a joint. The roll joint of an MTM reaches -8.4 rad, the joints of a UR10e 6.3 rad.
+#: Accepted position limits of a joint. The roll joint of an MTM reaches -8.4 rad, and the joints of a UR10e reach 6.3
+#: rad.
 ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-2.0, 2.0, "m")
-#: Accepted differences between the upper and the lower limit.
+#: Accepted differences between the upper and the lower position limit of a joint.
 ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 2.0, "m")
-#: Accepted efforts of a joint: 0.023 N m at the roll joint of an MTM, 330 N m at the shoulder of a UR10e.
+#: Accepted effort limits of a joint. Examples: 0.023 N m for the roll joint of an MTM, 330 N m for the shoulder of a
+#: UR10e.
 EFFORTS = Range(0.001, 2000.0, "N m or N")
-#: Accepted positions in files, for any joint type. `Arm` checks the narrower range `ANGLES` or `TRAVELS`.
+#: Accepted position limits in files, for both joint types. `Arm` checks the narrower range `ANGLES` or `TRAVELS`.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
-#: Accepted coefficients that relate joint and actuator positions: 0.6..1.6 on a dVRK, 32..48 with the gears of a TX40.
+#: Accepted coefficients between joint and actuator positions. Examples: 0.6 to 1.6 for a dVRK, 32 to 48 for the gears
+#: of a TX40.
 COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
-#: Largest accepted position, velocity and effort in inputs and recordings [rad, m, rad/s, m/s, N m, N]. No arm reaches
-#: this value in any unit. Products of smaller numbers with gains remain finite.
+#: Largest accepted absolute value of positions, velocities and efforts in inputs and recordings [rad, m, rad/s, m/s, N
+#: m, N]. No arm reaches this value in any of these units. Products of smaller numbers with gains remain finite.
 IMPLAUSIBLE = 1e6
-#: Accepted components of the gravity vector, for 9.81 m/s^2 in any direction. `Arm` checks the length of the vector.
+#: Accepted components of the gravity vector. `Arm` additionally checks the norm of the vector.
 GRAVITIES = within(-30.0, 30.0, "m/s^2")
 _CUT_OFFS = within(0.1, 1000.0, "Hz")
 
@@ -50,9 +53,9 @@ class LoopClosure:
 
 @dataclass
 class Gains:
-    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N and m for a prismatic joint.
+    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)], with N and m for a prismatic joint.
 
-    The ranges here apply to all arms. `Arm.gains_fault` checks the ranges of one arm.
+    The ranges in this class apply to all arms. `Arm.gains_fault` checks the narrower ranges of one arm.
     """
 
     kp: list[float] = field(default_factory=list, metadata=within(1e-5, 1e7, "N m/rad or N/m"))
@@ -62,15 +65,15 @@ class Gains:
 
 @dataclass
 class MotionSettings:
-    """Settings for processing a recorded motion; lists are in the order of the joints of the file.
+    """Settings for processing a recorded motion. Lists have one element per joint of the mechanism or instrument.
 
     `acceleration_cut_off` is the cut-off frequency of the low-pass filter for accelerations [Hz]. `effort_delay` is the
-    delay of recorded efforts relative to the positions [s]; it is negative if efforts are early. `known_effects` maps
-    a drive coordinate (`Arm.effect_coordinates`) to its known effects besides friction: "spring", "cable 1" (sine and
-    cosine with one period per revolution), "cable 2" (two periods) and "asymmetric friction". A mechanism additionally
-    has two settings. `base_may_tilt` selects whether the direction of gravity is estimated from a motion.
-    `presliding_travels` are the breakaway displacements of elasto-plastic friction elements, as multiples of the
-    standard deviation of the coordinate's position.
+    delay of recorded efforts relative to the positions [s]. It is negative if the efforts are recorded earlier than the
+    positions. `known_effects` maps a drive coordinate (`Arm.effect_coordinates`) to its known effects besides friction:
+    "spring", "cable 1" (sine and cosine with one period per revolution), "cable 2" (two periods) and "asymmetric
+    friction". Two settings are used only in a mechanism file. `base_may_tilt` selects whether the direction of gravity
+    is estimated from a motion. `presliding_travels` are the breakaway displacements of elasto-plastic friction
+    elements, as multiples of the standard deviation of the position of the drive coordinate.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
@@ -95,8 +98,8 @@ class BoundingShapes:
     """Bounds of the mass distribution of the links of one SDF file.
 
     The bound of a link is the box around its collision shapes, enlarged by `margin` [m] on all sides. The margin is for
-    parts without a collision shape, such as covers, screws and cables. `boxes` define the bounds of links without
-    collision shapes, or whose shapes do not represent their mass. No margin is added to `boxes`.
+    parts without a collision shape, such as covers, screws and cables. `boxes` defines the bounds of links that have no
+    collision shapes, or whose collision shapes do not represent their mass distribution. No margin is added to `boxes`.
     """
 
     margin: float = field(default=0.04, metadata=within(0.0, 1.0, "m"))
@@ -109,7 +112,8 @@ class IdentificationSettings(MotionSettings):
 
     Attributes:
         effort_cut_off: Cut-off frequency of the low-pass filter for measured and modelled efforts [Hz].
-        bounding_shapes: Bounds of the mass distribution of the links, per SDF file of the arm; see `bounding_boxes`.
+        bounding_shapes: Bounds of the mass distribution of the links, one object per SDF file of the arm; see
+            `bounding_boxes`.
     """
 
     effort_cut_off: float = field(metadata=_CUT_OFFS)
@@ -121,7 +125,7 @@ class Mechanism:
     """Schema of `mechanisms/*.yaml`: properties that all arms of one type share.
 
     `effort_cut_off` is the cut-off frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects`
-    are the friction, cable and sensor effects of the real arm, for its simulation.
+    are the friction, cable and sensor effects of the real arm. A simulation includes them only on request.
     """
 
     sdf: str = ""
@@ -140,9 +144,9 @@ class Mechanism:
 class Instrument:
     """Schema of `instruments/*.yaml`: an exchangeable instrument. Its joints follow the joints of the arm.
 
-    `joint_from_actuator` is the disc coupling as defined by the dVRK: joint = sum of coefficient * actuator.
-    `friction_coordinates` are additional coordinates of friction besides joints and actuators: name -> sum of
-    coefficient * joint.
+    `joint_from_actuator` is the disc coupling as defined by the dVRK: joint position = sum of coefficient * actuator
+    position. `friction_coordinates` are additional coordinates along which friction acts, besides joints and actuators.
+    Each name is mapped to the joint coefficients of its coordinate: coordinate = sum of coefficient * joint position.
     """
 
     sdf: str = ""
@@ -160,11 +164,12 @@ class Instrument:
 class ArmDescription:
     """Schema of `arms/*.yaml`.
 
-    `mechanism` and `instrument` are names of files in their folders, or paths of YAML files relative to the arm's own
-    folder. `sdf` in such a file is a path relative to the folder of that file. `gravity` is the gravity vector in the
-    arm's base frame [m/s^2]. `mirrored_links` lists, per SDF file, the links that are mirrored for this arm (x to -x in
-    the link's frame). Any other SDF, such as one exported from this arm, is used unchanged. `coupled_limits` replaces
-    [lower, upper] of the mechanism's coupled limits by name, for an arm with calibrated joint stops.
+    `mechanism` and `instrument` are names of files in the folders `mechanisms` and `instruments`, or paths of YAML
+    files relative to the folder of the arm file. `sdf` in a mechanism or instrument file is a path relative to the
+    folder of that file. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `mirrored_links` lists, per
+    SDF file, the links that are mirrored for this arm (x to -x in the link's frame). All other SDF files, such as one
+    exported from this arm, are used unchanged. `coupled_limits` maps the name of a coupled limit to its [lower, upper]
+    for this arm, e.g. after the calibration of a joint stop. These values replace the values of the mechanism.
     """
 
     name: str = ""
@@ -177,7 +182,7 @@ class ArmDescription:
 
 
 def load_gains(path: str | Path) -> Gains:
-    """Reads a gains file with kp, kd and ki, one number per joint. The controller checks the range of each gain.
+    """Reads a gains file with kp, kd and ki, one number per joint. The controller checks the gains for its arm.
 
     Raises:
         ControllerError: The file does not exist, is not a gains file, or has a gain outside the range of `Gains`.

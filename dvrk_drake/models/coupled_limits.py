@@ -1,4 +1,4 @@
-"""Checks coupled limits, lower <= sum of coefficient * joint position <= upper, and finds poses within them."""
+"""Checks coupled limits (lower <= sum of coefficient * joint position <= upper), and limits pose offsets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def coupled_limit_fault(arm: Arm, limit: CoupledLimit) -> str:
-    """Returns a message on the first fault of a coupled limit and the accepted values, or ""."""
+    """Returns a message on the first fault of a coupled limit, with the accepted values, or "" if there is none."""
     key = f"coupled_limits.{limit.name}"
     row = np.array([limit.coefficients.get(name, 0.0) for name in arm.joint_names])
     coupled = row != 0
@@ -36,7 +36,7 @@ def coupled_limit_fault(arm: Arm, limit: CoupledLimit) -> str:
 
 
 def can_meet_coupled_limits(arm: Arm) -> bool:
-    """Returns whether any pose within the position limits meets all coupled limits."""
+    """Returns whether at least one pose within the position limits meets all coupled limits."""
     from scipy.optimize import linprog  # slow import; few arms have two coupled limits
 
     A, lower, upper = arm.limit_matrix()
@@ -47,7 +47,7 @@ def can_meet_coupled_limits(arm: Arm) -> bool:
 
 
 def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
-    """Returns a message on the first fault of a pair of position limits and the accepted values, or ""."""
+    """Returns a message on the first fault of two position limits, with the accepted values, or "" if there is none."""
     positions, widths = (TRAVELS, TRAVEL_WIDTHS) if slides else (ANGLES, ANGLE_WIDTHS)
     if fault := positions.fault(f"{key}[0]", lower) or positions.fault(f"{key}[1]", upper):
         return fault
@@ -57,12 +57,12 @@ def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
 
 
 def offset_pose(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns pose + offset (n,), with the offset of each joint shortened so that no limit of `arm` is violated."""
+    """Returns pose + offset (n,), with the offset of each joint reduced so that no limit of `arm` is violated."""
     A, lower, upper = arm.limit_matrix()
     change = A @ offset
     room = np.where(change > 0, upper - A @ pose, A @ pose - lower)
     share = np.clip(np.divide(room, np.abs(change), out=np.ones_like(room), where=change != 0), 0.0, 1.0)
     joint_share = np.array([share[A[:, j] != 0].min() for j in range(arm.num_joints)])
     point = pose + joint_share * offset
-    # If coefficients have both signs, shortening the offset of one joint may violate a coupled limit.
+    # If coefficients have both signs, reducing the offset of one joint may violate a coupled limit.
     return pose if arm.limit_violations(point, 1e-9) else point

@@ -20,14 +20,15 @@ _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
 
 @dataclass
 class DriveEffect:
-    """One effect along a coordinate of the drive, read from an arm file or identified.
+    """One effect along a coordinate of the drive. It is defined in an arm file or identified from a recording.
 
     Attributes:
         coordinate: "actuator.<name>", "joint.<name>", or one of the arm's `friction_coordinates`.
         kind: Kind of effect, see `dvrk_drake.dynamics.actuator_effects.EFFECT_KINDS`.
-        scale: Shape parameter of the kind: width of the smoothed sign function [rad/s, m/s], breakaway displacement
-            [rad, m], or periods per revolution.
-        coefficient: Size of the effect [N m; N m s/rad, ...; N and m for a prismatic coordinate].
+        scale: Shape parameter, which depends on the kind: width of the smoothed sign function [rad/s, m/s], breakaway
+            displacement [rad, m], or periods per revolution.
+        coefficient: Coefficient of the effect. The unit depends on the kind: N m, N m s/rad or N m/rad, with N and m
+            for a prismatic coordinate.
         standard_error: Standard error of the coefficient, in the same unit; 0 if the effect was not identified.
     """
 
@@ -48,8 +49,8 @@ class FrictionEffect(DriveEffect):
     """One friction effect, see `dvrk_drake.systems.arm_effects.dry_friction.add_friction`.
 
     Attributes:
-        fall_speed: Stribeck velocity of "presliding" [rad/s, m/s], at which the friction is 1/e of its static value.
-            With 0, friction does not depend on the speed.
+        fall_speed: Stribeck velocity of the kind "presliding" [rad/s, m/s]. At this speed, the friction is 1/e of its
+            static value. If `fall_speed` is 0, friction does not depend on the speed.
     """
 
     fall_speed: float = field(default=0.0, metadata=within(1e-6, 100.0, "rad/s or m/s", also=(0.0,)))
@@ -59,7 +60,7 @@ class FrictionEffect(DriveEffect):
 class Cable:
     """Elastic cable between the motor and the joint of an actuator that drives only this joint.
 
-    The stiffness is in N m/rad, the damping in N m s/rad.
+    The units are N m/rad and N m s/rad, or N/m and N s/m for a prismatic actuator.
     """
 
     stiffness: float = field(default=0.0, metadata=within(1e-3, 1e6, "N m/rad or N/m"))
@@ -68,11 +69,11 @@ class Cable:
 
 @dataclass
 class EncoderEffect:
-    """Quantization of positions and filtering of velocities.
+    """Quantization of positions, and low-pass filter of velocities.
 
-    `resolution` maps an actuator to the size of one count [rad, m]; actuators without an entry are exact.
-    `velocity_cut_off` [Hz] is the cut-off frequency of the first-order low-pass filter for the difference of two
-    readings.
+    `resolution` maps an actuator to the size of one count [rad, m]. The positions of actuators without an entry are
+    exact. `velocity_cut_off` [Hz] is the cut-off frequency of the first-order low-pass filter for velocities, which are
+    computed from the difference of two positions.
     """
 
     resolution: dict[str, float] = field(default_factory=dict, metadata=within(1e-9, 0.1, "rad or m"))
@@ -83,9 +84,9 @@ class EncoderEffect:
 class EffortEffect:
     """Quantization and noise of the motor currents, as efforts of the actuators [N m, N].
 
-    Each table maps an actuator to a value; actuators without an entry are exact. `command_resolution` is the
-    quantization step of commanded efforts, `measured_resolution` that of measured efforts. `noise` is the standard
-    deviation of measured efforts.
+    Each attribute maps an actuator to a value. The efforts of actuators without an entry are exact.
+    `command_resolution` is the quantization step of commanded efforts, `measured_resolution` that of measured efforts.
+    `noise` is the standard deviation of measured efforts.
     """
 
     command_resolution: dict[str, float] = field(default_factory=dict, metadata=_EFFORT_STEPS)
@@ -106,12 +107,12 @@ class ArmEffects:
     """Effects of a real arm. Each field is an effect group that a simulation can include by name.
 
     Attributes:
-        friction: Dry and viscous friction, as elements of the plant's own solver.
+        friction: Dry and viscous friction, computed by the solver of the plant.
         cables: Torques of cables that depend on the position.
         springs: Torques of springs that depend on the position.
         stops: Whether the arm's coupled limits are hard stops.
-        stretch: Mapping from an actuator to its elastic cable. Motor, encoder and the actuator's own friction are on
-            the motor side of the cable. Actuators without an entry are stiff.
+        stretch: Mapping from an actuator to its elastic cable. Motor, encoder and actuator friction are on the motor
+            side of the cable. All other cables are rigid.
         saturation: Mapping from an actuator to the largest effort of its motor [N m, N]. Actuators without an entry do
             not saturate.
         encoder: Quantization of positions, and estimation of velocities from the quantized positions.
@@ -130,7 +131,7 @@ class ArmEffects:
     delay: DelayEffect | None = None
 
     def only(self, names: Sequence[str]) -> "ArmEffects":
-        """Returns the effects with only the named groups; "all" selects all groups.
+        """Returns these effects with only the named groups. The name "all" selects all groups.
 
         Raises:
             ArmError: A name is not an effect group.
@@ -142,7 +143,7 @@ class ArmEffects:
         return ArmEffects(**{name: getattr(self, name) for name in names})
 
     def without(self, name: str) -> "ArmEffects":
-        """Returns the effects without the named group.
+        """Returns these effects without the named group.
 
         Raises:
             ArmError: The name is not an effect group.
@@ -151,7 +152,7 @@ class ArmEffects:
         return self.only([other for other in EFFECT_NAMES if other != name])
 
     def joined(self, other: "ArmEffects") -> "ArmEffects":
-        """Returns the effects, extended by the lists and mappings in the effects of an instrument."""
+        """Returns these effects, extended by the effects `other` of an instrument."""
         return ArmEffects(**{name: _joined(getattr(self, name), getattr(other, name)) for name in EFFECT_NAMES})
 
     def check(self, joint_names: Sequence[str]) -> None:
@@ -190,14 +191,14 @@ class ArmEffects:
 
 #: Kinds that `friction` accepts: dissipative effects that a solver can apply at the end of a step.
 FRICTION_KINDS = ("presliding", "presliding forward", "coulomb", "viscous")
-#: Kinds that `cables` and `springs` accept: effects that have a potential.
+#: Kinds that `cables` and `springs` accept: effects that have a potential energy.
 POSITION_KINDS = ("offset", "spring", "cable sine", "cable cosine")
 #: Names of all effect groups.
 EFFECT_NAMES = tuple(f.name for f in dataclasses.fields(ArmEffects))
 
 
 def per_actuator(values: dict[str, float], joint_names: Sequence[str], otherwise: float) -> NDArray[np.float64]:
-    """Returns an array (n,) from a table actuator -> value, with `otherwise` for actuators without an entry."""
+    """Returns an array (n,) with the value of each actuator in `values`, or `otherwise` if it has no entry."""
     return np.array([values.get(name, otherwise) for name in joint_names])
 
 

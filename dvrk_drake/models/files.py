@@ -17,7 +17,7 @@ from dvrk_drake.errors import DvrkDrakeError
 
 #: Maximum size of a settings or model file [bytes]. A PSM model with dynamics has 60 kB.
 MAX_TEXT = 4_000_000
-#: Maximum size of a file in any other format that is read as a whole [bytes].
+#: Maximum size of a file of any other format, if it is read completely into memory [bytes].
 MAX_BINARY = 256_000_000
 
 _KINDS = {
@@ -40,8 +40,8 @@ def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | Non
         largest: Maximum accepted size [bytes]; None for any size.
 
     Raises:
-        DvrkDrakeError: Error of type `error`: the file does not exist, is not a regular file, is too large, or cannot
-            be read.
+        DvrkDrakeError: The file does not exist, is not a regular file, is too large, or cannot be read. The exception
+            has the type `error`.
     """
     try:
         # Without O_NONBLOCK, opening a FIFO would block until a writer opens it.
@@ -108,7 +108,7 @@ def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
         raise error(f"{path}: invalid JSON: {cause}") from cause
 
 
-#: Error codes of write operations that are caused by the disk and not by the caller's code.
+#: Error codes of write operations for which the disk is the cause, not the code of the caller.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
@@ -120,7 +120,7 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
-    """Opens a temporary file that replaces `path` if the block succeeds, and is deleted otherwise.
+    """Opens a temporary file. It replaces `path` if the `with` block succeeds, and is deleted otherwise.
 
     If `path` is a link, its target is replaced. An existing file keeps its permissions.
 
@@ -129,7 +129,8 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
         mode: "w" for text in UTF-8 without newline translation, or "wb".
 
     Raises:
-        DvrkDrakeError: The folder does not exist, the file cannot be written, or it is not a regular file (/dev/null).
+        DvrkDrakeError: The folder does not exist, the file cannot be written, or `path` is not a regular file (e.g.
+            /dev/null).
     """
     target = Path(os.path.realpath(path))
     exists = os.path.exists(target)

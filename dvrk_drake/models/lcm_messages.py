@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 _MIN_LENGTH, _MAX_LENGTH, _NEW_LENGTH = 16, 64, 32
 #: Length of a message authentication code [bytes].
 MAC_SIZE = 16
-#: Byte before the authentication code of a message: size of the code. In an unsigned message it is 0, and no code
-#: follows.
+#: Byte that precedes the authentication code of a message. It contains the size of the code, or 0 if the message has no
+#: code.
 _NO_MAC, _MAC_FOLLOWS = b"\0", bytes([MAC_SIZE])
 
 
 class MessageKey:
     """Key that signs and verifies encoded messages: keyed BLAKE2b with a digest of 16 bytes.
 
-    The last two fields of a message are `mac_size` and `mac`. The code covers all bytes before them: the type's
-    fingerprint, session, sequence, time and content.
+    The last two fields of a message are `mac_size` and `mac`. The authentication code `mac` covers all bytes before
+    these fields: fingerprint of the message type, session, sequence, time and content.
     """
 
     def __init__(self, key: bytes) -> None:
@@ -123,7 +123,7 @@ _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_BAD_MODE: "mode not accepted in the present state",
     lcmt_dvrk_status.REFUSAL_NO_SENDER: "no sender_id",
     lcmt_dvrk_status.REFUSAL_WRONG_SESSION: "session from before a restart of the arm",
-    lcmt_dvrk_status.REFUSAL_STALE: "answer to a measurement that is too old",
+    lcmt_dvrk_status.REFUSAL_STALE: "based on a measurement that is too old",
     lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER: "command sent twice or out of order",
     lcmt_dvrk_status.REFUSAL_CLOCK_JUMP: "jump of the sender's clock",
     lcmt_dvrk_status.REFUSAL_FAULT: "guard in a fault",
@@ -175,13 +175,13 @@ class StatusFilter:
     """Selects the statuses of one session of one arm from the messages of its status channel.
 
     The filter keeps the first session that it receives. It ignores a status, and counts the reason, if the status is
-    not authentic, belongs to another session, or was sent before the last one. It also ignores a status whose sequence
-    number or time is too far ahead. The limit is an increase of 2000 statuses (of 1 ms each) per second since the last
-    status, plus 100. Without this limit, one spoofed status with a large sequence number would make all authentic
-    statuses appear old.
+    not authentic, belongs to another session, or was not sent after the last accepted status. It also ignores a status
+    whose sequence number or time is too far ahead: the sequence number may increase by 2000 per second plus 100, and
+    the time by 1 ms for each of these statuses. Without this limit, one spoofed status with a large sequence number
+    would make all authentic statuses appear old.
 
     Attributes:
-        last: Last accepted status, None before the first one.
+        last: Last accepted status, or None if no status has been accepted.
         ignored: Mapping from a reason (OTHER_SESSION, JUMP, OLD, NOT_AUTHENTIC, UNREADABLE) to the number of messages
             ignored since the last accepted status.
     """
@@ -207,9 +207,10 @@ class StatusFilter:
             arm_name: Name of the arm.
             num_joints: Number of joints of the arm.
             key: Key that must have signed the statuses; None to skip verification.
-            session_id: Session to keep; 0 for the first received session.
+            session_id: Session to accept; 0 for the first received session.
             follow_after: Duration without a status of the session [s] after which another session, or the same session
-                after a jump, is accepted. Intended for recordings: a controller must not continue with a restarted arm.
+                after a jump, is accepted. Use it only for recordings, because a controller must not continue with a
+                restarted arm.
         """
         self.last: lcmt_dvrk_status | None = None
         self.ignored: Counter[str] = Counter()
@@ -220,7 +221,7 @@ class StatusFilter:
         self._reference = (0, 0, 0.0)
 
     def accept(self, data: bytes, now: float, *, settle: bool = True) -> lcmt_dvrk_status | None:
-        """Returns the status in a message, or None if the message is ignored; arguments as for `examine`."""
+        """Returns the status in a message, or None if the message is ignored. The arguments are those of `examine`."""
         return None if self.examine(data, now, settle=settle) else self.last
 
     def examine(self, data: bytes, now: float, *, settle: bool = True) -> str:
@@ -233,7 +234,7 @@ class StatusFilter:
                 the same time, so they are compared with the last status before the batch.
 
         Returns:
-            The reason why the message is ignored, or "".
+            The reason why the message is ignored, or "" if the status is accepted.
         """
         reason = self._reason(data, now)
         status = None if reason else decode(lcmt_dvrk_status, data)

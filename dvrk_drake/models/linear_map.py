@@ -1,4 +1,4 @@
-"""Constant affine maps between joint coordinates, for linkages and transmissions."""
+"""Constant affine maps between coordinates, for linkages and transmissions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dvrk_drake.models.schema_fault import within
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """Affine map y = matrix x + offset, with velocities and efforts mapped by the principle of virtual work.
+    """Affine map y = matrix x + offset of positions, with the corresponding maps of velocities and efforts.
 
     Attributes:
         matrix: Constant matrix (m, n).
@@ -28,13 +28,13 @@ class LinearMap:
         return np.asarray(x, float) @ self.matrix.T + self.offset
 
     def velocity(self, x_dot: ArrayLike) -> NDArray[np.float64]:
-        """Returns the rate of y for rates of x of shape (n,) or (samples, n)."""
+        """Returns the velocity of y for a velocity `x_dot` of x, of shape (n,) or (samples, n)."""
         return np.asarray(x_dot, float) @ self.matrix.T
 
     def pull_back_effort(self, effort_y: ArrayLike) -> NDArray[np.float64]:
         """Returns the effort on x that does the same work as `effort_y` on y.
 
-        It is matrix' effort_y, for `effort_y` of shape (m,) or (samples, m).
+        The effort on x is matrix' effort_y, for `effort_y` of shape (m,) or (samples, m).
         """
         return np.asarray(effort_y, float) @ self.matrix
 

@@ -1,4 +1,4 @@
-"""Closes the kinematic loops of a plant: the parallelogram of an MTM, the remote centre linkage of a PSM."""
+"""Closes the kinematic loops of a plant: the parallelogram of an MTM and the remote centre linkage of a PSM."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import LoopClosure
 from dvrk_drake.models.sdf_model import DRAKE
 
-#: Methods of closing the loops of a linkage: "mimic" couples joints of the tree, "ball" adds constraints at the cuts.
+#: Methods of closing the loops of a linkage: "mimic" couples joints of the tree, "ball" adds constraints where the tree
+#: cuts the loops.
 Closure = Literal["mimic", "ball"]
 
 
 def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure) -> None:
-    """Pins frame_a of the closing bar to frame_b, and adds a distance constraint for the bar's length.
+    """Pins frame_a of the closing bar to frame_b, and adds a distance constraint with the length of the bar.
 
-    SAP assigns each constraint the compliance 5e-10 s^2 / m at 1 ms, where m is the effective mass of the unconstrained
-    tree at the pin. The three equations of the pin share one effective mass. A light bar that swings freely makes the
-    pin compliant in all directions, including the direction of the bar, which carries the load of the linkage. The
-    distance constraint has the effective mass of the linkage and is stiff. With it, the PSM's remote centre moves by
-    1e-8 m under its weight, instead of 2e-6 m.
+    SAP assigns each constraint the compliance 5e-10 s^2 / m at a time step of 1 ms, where m is the effective mass of
+    the unconstrained tree at the pin. The three equations of the pin share one effective mass. A light bar that rotates
+    freely makes the pin compliant in all directions, including the direction of the bar, which carries the load of the
+    linkage. The distance constraint has the effective mass of the linkage and is stiff. With this constraint, the
+    weight of the PSM moves its remote centre by 1e-8 m instead of 2e-6 m.
     """
     A, B = (plant.GetFrameByName(name, instance) for name in (loop.frame_a, loop.frame_b))
     p_AP, p_BQ = (frame.GetFixedPoseInBodyFrame().translation() for frame in (A, B))
@@ -42,8 +43,7 @@ def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClos
 def remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
     """Removes the mimic tags of the joints in a loop.
 
-    The mimic of a rotor or counterweight that follows another joint is kept, because it represents a cable and closes
-    no loop.
+    The mimic tag of a rotor or counterweight is kept, because it represents a cable and closes no loop.
     """
     loop_joints = _loop_joints(root, arm)
     for joint in root.iter("joint"):
@@ -53,7 +53,7 @@ def remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
 
 
 def _loop_joints(root: ElementTree.Element, arm: Arm) -> set[str]:
-    """Returns the dependent joints between the base and the cut of a loop."""
+    """Returns the names of the dependent joints between the base and the two frames of each loop."""
     parent_joint = {joint.findtext("child"): joint for joint in root.iter("joint")}
     frame_link = {frame.get("name"): frame.get("attached_to") for frame in root.iter("frame")}
     names = set()

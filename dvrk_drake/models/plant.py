@@ -35,23 +35,23 @@ def add_arm(
 ) -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world, and sets gravity and limits.
 
-    Joint couplings and pins require Drake's SAP solver, which the contact approximations sap, similar and lagged use. A
-    discrete plant with tamsi is set to sap. A continuous plant can be simulated only with the integrator CENIC. Its
-    pins require drake 1.56 or newer.
+    The loop closures require Drake's SAP solver, which the contact approximations sap, similar and lagged use. If a
+    discrete plant uses the approximation tamsi, it is changed to sap. A continuous plant can be simulated only with the
+    integrator CENIC. For a continuous plant, the closure "ball" requires drake 1.56 or newer.
 
     Args:
         plant: Plant, with or without a scene graph.
         arm: Arm to add.
         closure: Method of closing the loops of the linkage.
-        collision_shapes: Whether to add collision shapes. Without them the arm has no contact, and a plant with a scene
-            graph needs less time per step.
+        collision_shapes: Whether to add collision shapes. Without collision shapes, the arm has no contact, and a plant
+            with a scene graph needs less time per step.
 
     Raises:
         ArmError: The closure is unknown, or Drake cannot load the SDF.
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; allowed: {", ".join(get_args(Closure))}')
-    # Compared by name, because newer versions of drake have no tamsi.
+    # The approximation is compared by its name, because newer versions of drake have no tamsi.
     if plant.time_step() > 0 and plant.get_discrete_contact_approximation().name == "kTamsi":
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
@@ -81,8 +81,8 @@ def check_plant(arm: Arm) -> None:
     """Checks that a plant of the arm can be created with each method of loop closure.
 
     Raises:
-        ArmError: Drake cannot load the SDF, a link has no joint, or a frame of a loop or one of the frames dh_0, dh_1,
-            ... is missing.
+        ArmError: Drake cannot load the SDF, or a link has no joint. A frame of a loop closure, or one of the frames
+            dh_0, dh_1, ..., is missing.
     """
     for closure in get_args(Closure):
         try:
@@ -105,7 +105,7 @@ def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:
-    """Returns a finalized plant that contains only `arm`; `time_step` [s]."""
+    """Returns a finalized plant that contains only `arm`. The unit of `time_step` is s."""
     plant = MultibodyPlant(time_step)
     add_arm(plant, arm, closure)
     plant.Finalize()
@@ -125,9 +125,9 @@ def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> No
 
 
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
-    """Returns the index in the positions of the plant of each joint in `arm.tree_joint_names`.
+    """Returns the indices of the joints `arm.tree_joint_names` in the positions of the plant.
 
-    The indices are also valid for v, because all joints have one degree of freedom.
+    The indices are also valid for the velocities, because all joints have one degree of freedom.
     """
     joints = [plant.GetJointByName(name, instance) for name in arm.tree_joint_names]
     return np.array([joint.position_start() for joint in joints])
@@ -143,7 +143,8 @@ def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: Arra
 def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:
     """Returns the torque (n,) on the independent joints that compensates gravity at the context's pose.
 
-    The gravity forces of Drake do not include constraints. They are projected through the linkage: tau = -G' tau_g.
+    Drake's gravity forces tau_g do not include the forces of constraints. They are projected onto the independent
+    joints with the matrix G of the linkage: tau = -G' tau_g.
     """
     tau_g = plant.CalcGravityGeneralizedForces(context)[tree_selector(plant, arm)]
     return -arm.linkage.pull_back_effort(tau_g)

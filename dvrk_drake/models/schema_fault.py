@@ -1,4 +1,4 @@
-"""Checks the content of files and of objects created in Python. Messages name the key, value and accepted values.
+"""Checks the content of files and of Python objects. Messages name the key, its value and the accepted values.
 
 The range of a number is metadata of its field: `field(default=0.05, metadata=within(0.002, 1.0, "s"))`. It applies to
 all numbers in the field, including those in lists and mappings. `schema_fault` checks the content of a file,
@@ -24,7 +24,7 @@ _MANY = {bool: "true or false", int: "integers", float: "numbers", str: "strings
 RANGE = "range"
 #: Metadata key of a field: its name in files of earlier versions.
 FORMERLY = "formerly"
-#: Mapping from a unit to a unit that is used by mistake, and the size of the latter.
+#: Mapping from a unit to another unit that is often used by mistake, and the value of the other unit in the first unit.
 _MISTAKEN = {
     "rad": ("degrees", math.pi / 180),
     "rad/s": ("degrees/s", math.pi / 180),
@@ -33,7 +33,7 @@ _MISTAKEN = {
     "s": ("ms", 1e-3),
     "kg": ("g", 1e-3),
 }
-#: Upper bound of the absolute value of whole numbers.
+#: Upper bound of the absolute value of integers.
 _MAX_INT = 2**63
 #: Maximum number of characters of a value in a message.
 _MAX_LENGTH = 60
@@ -45,7 +45,7 @@ class Range:
 
     Attributes:
         low, high: Smallest and largest accepted number.
-        unit: Unit of both; "rad or m" if it depends on the joint type.
+        unit: Unit of both numbers; "rad or m" if it depends on the joint type.
         also: Additional accepted numbers, e.g. 0 or infinity.
         either_sign: Whether low and high apply to the absolute value.
     """
@@ -57,7 +57,7 @@ class Range:
     either_sign: bool = False
 
     def __contains__(self, value: float) -> bool:
-        """Returns whether the number is accepted; NaN never is."""
+        """Returns whether the number is accepted. NaN is not accepted."""
         return bool(self.low <= (abs(value) if self.either_sign else value) <= self.high) or value in self.also
 
     def __str__(self) -> str:
@@ -67,7 +67,7 @@ class Range:
         return "".join(f"{number:g} or " for number in self.also) + text
 
     def fault(self, key: str, value: float) -> str:
-        """Returns a message if the number is not accepted, with the unit that it probably has; "" otherwise."""
+        """Returns a message if the number is not accepted, or "". The message may suggest another unit."""
         if value in self:
             return ""
         mistaken = [_MISTAKEN[unit] for unit in self.unit.split(" or ") if unit in _MISTAKEN]
@@ -121,7 +121,7 @@ def with_current_keys(schema: Any, content: Any, where: str) -> Any:
 
 
 def number_fault(instance: object) -> str:
-    """Returns a message on the first number in a dataclass that is not finite or out of range, or "".
+    """Returns a message on the first number of a dataclass object that is not finite or is out of range, or "".
 
     The message contains the key of the number. Nested lists, tuples, mappings, arrays and dataclasses are searched.
     Values that are not numbers are ignored.
@@ -151,12 +151,12 @@ def _number_faults(value: Any, key: str, allowed: Range | None) -> Iterator[str]
 
 
 def schema_fault(schema: type, content: Any, what: str) -> str:
-    """Returns a message on the first part of `content` that does not match the schema, or "".
+    """Returns a message on the first part of `content` that does not match the schema, or "" if all parts match.
 
     Args:
-        schema: Dataclass of dataclasses, lists, mappings with text keys, bool, int, float, str, and optional values
-            of these types. Numbers must be finite and within the range of their field, see `within`.
-        content: Content as returned by yaml_load.
+        schema: Dataclass whose fields are dataclasses, lists, mappings with text keys, bool, int, float, str, or
+            optional values of these types. Numbers must be finite and within the range of their field, see `within`.
+        content: Parsed content of the file.
         what: Kind of file that is expected, e.g. "a gains file".
     """
     if not isinstance(content, dict):
@@ -166,7 +166,7 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
 
 
 def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None) -> Iterator[str]:
-    """Yields messages on faults; `key` is the key of the value, `what` describes the keys of a mapping."""
+    """Yields messages on faults of the value of `key`. In messages on an unknown key, `what` names the mapping."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         if value is not None:
@@ -207,9 +207,9 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
 
 
 def missing_key(schema: Any, content: Any, key: str = "") -> str:
-    """Returns the first missing key of `content`, which matches the schema otherwise, or "".
+    """Returns the first missing key of `content`, or "" if there is none.
 
-    Keys whose default is None are optional.
+    The other keys must match the schema. Keys whose default is None are optional.
     """
     if content is not None and get_origin(schema) in (Union, types.UnionType):
         (schema,) = (argument for argument in get_args(schema) if argument is not types.NoneType)
@@ -227,7 +227,7 @@ def missing_key(schema: Any, content: Any, key: str = "") -> str:
 
 
 def _fits(schema: type, value: Any) -> bool:
-    """Returns whether a value can be converted to the type as in yaml_load_typed; numbers must be finite."""
+    """Returns whether yaml_load_typed would convert the value to the type `schema`. Numbers must be finite."""
     if schema is bool:
         return isinstance(value, bool) or value in ("true", "false")
     if schema is str:
@@ -277,7 +277,10 @@ def _keys(schema: Any) -> str:
 
 
 def suggest_name(name: object, known: Iterable[str]) -> str:
-    """Returns "did you mean ...? " with the known name closest to a wrong name, or "" if there is none or a tie."""
+    """Returns "did you mean ...? " with the known name that is most similar to `name`.
+
+    Returns "" if no known name is similar, or if several names are equally similar.
+    """
     of_lower_case = {key.lower(): key for key in known}
     given = str(name)[:_MAX_LENGTH].lower()
     near = difflib.get_close_matches(given, of_lower_case, 2)

@@ -1,4 +1,4 @@
-"""Combines the SDF files of an arm into one model, and reads properties that Drake parses but does not expose."""
+"""Combines the SDF files of an arm into one model, and reads properties that Drake's API does not provide."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ PACKAGE_URL = "package://dvrk_drake/"
 DRAKE = "{http://drake.mit.edu}"
 #: Maximum nesting of elements; the SDF of an arm has 7 levels.
 _MAX_DEPTH = 50
-#: Limits of joints without a limit in SDF files.
+#: Numbers in SDF files that mean that a joint has no position limit.
 _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
 _LENGTHS = Range(1e-6, 10.0, "m")
-#: Mapping from an element or attribute to the range of its numbers. The links of a dVRK weigh 1 g to 10 kg, those of a
-#: UR10e up to 13 kg. All are shorter than 1 m. -1 and 0 denote unspecified limits of velocity or effort.
+#: Mapping from an element or attribute to the range of its numbers. The links of a dVRK have masses of 1 g to 10 kg,
+#: those of a UR10e up to 13 kg. All these links are shorter than 1 m. -1 and 0 denote unspecified limits of velocity or
+#: effort.
 _RANGES = {
     "mass": Range(1e-6, 200.0, "kg"),
     **{f"i{axis}": _MOMENTS for axis in ("xx", "yy", "zz")},
@@ -72,17 +73,19 @@ def local_path(url: str) -> Path:
 
 
 def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | None = None) -> ElementTree.Element:
-    """Returns the model of the first file, extended by the links, joints and frames of further files (an instrument).
+    """Returns the model of the first file, extended by the links, joints and frames of the other files.
 
     Relative paths of meshes become absolute. If a file repeats a link of an earlier file, only the shapes of that link
-    are added. This draws the housing of an instrument on the carriage of the arm without a body of its own.
+    are added. For example, the housing of an instrument is drawn on the carriage of the arm, without an additional
+    body.
 
     Args:
         urls: Package URLs or paths.
         mirrored: Mapping from a URL to the links of that file that are mirrored (`mirror_links`).
 
     Raises:
-        ArmError: A file is not an SDF with one model, repeats a link with inertia, or lacks a link in `mirrored`.
+        ArmError: A file is not an SDF with one model, repeats a link with inertia, or does not contain a link in
+            `mirrored`.
     """
     root, *others = (_read(local_path(url)) for url in urls)
     for url, part in zip(urls, (root, *others), strict=True):
@@ -111,14 +114,14 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     """Reads the moving joints from a composed model.
 
     Raises:
-        ArmError: A joint has `<friction>`, which Drake ignores silently, has an unsupported type, or follows another
-            joint with a multiplier of 0; two joints have the same name; base_link is missing; or another link has no
-            mass.
+        ArmError: The link base_link is missing, another link has no mass, or two joints have the same name. A joint has
+            an unsupported type, has `<friction>`, which Drake ignores silently, or follows another joint with a
+            multiplier of 0.
     """
     if root.find("model/link[@name='base_link']") is None:
         raise ArmError("the SDF has no link base_link")
     for link in root.findall("model/link"):
-        # Drake uses 1 kg without a warning.
+        # If the mass is missing, Drake uses 1 kg without a warning.
         if link.get("name") != "base_link" and not float(link.findtext("inertial/mass") or 0.0) > 0:
             raise ArmError(f"link {link.get('name')} of the SDF needs a positive <inertial><mass>")
     names, mimics, efforts, prismatic = [], {}, {}, set()
@@ -162,7 +165,7 @@ def _read(path: Path) -> ElementTree.Element:
     if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
         raise ArmError(f"{path}: <sdf> must contain exactly one <model>, without a nested <model> or <include>")
     for link in root.iterfind("model/link"):
-        # Required by Drake's parser, which uses 1 kg for a link without <inertial>.
+        # Files contain a mass of 0 only because Drake's parser uses 1 kg for a link without <inertial>.
         for inertial in link.findall("inertial"):
             if _number(inertial.findtext("mass") or "") == 0:
                 link.remove(inertial)
@@ -243,7 +246,7 @@ def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -
         source: Source of the SDF, for messages.
 
     Raises:
-        ArmError: A link does not exist, or one of its poses is not six plain numbers.
+        ArmError: A link does not exist, or one of its poses does not consist of six numbers.
     """
     by_name = {link.get("name", ""): link for link in root.iterfind("model/link")}
     for name in links:

@@ -14,14 +14,15 @@ from dvrk_drake.models.schema_fault import schema_fault, with_current_keys
 
 Schema = TypeVar("Schema")
 
-#: Maximum nesting and maximum number of values of a file, with expanded aliases. The files of a PSM have 6 and 6000.
+#: Maximum nesting and maximum number of values of a file, with expanded aliases. The files of a PSM have a nesting of 6
+#: and 6000 values.
 MAX_DEPTH, MAX_VALUES = 50, 1_000_000
 # The parser of libyaml is faster than the Python parser, and its speed does not depend on the nesting.
 _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_FastLoader):
-    """YAML loader that refuses duplicate keys in a mapping. By default YAML uses the last one."""
+    """YAML loader that refuses duplicate keys in a mapping. By default, the last of these keys is used."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys: set[str] = set()
@@ -41,10 +42,11 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
         schema: Dataclass, see `schema_fault`.
         path: Path of the file.
         error: Type of error to raise.
-        what: Kind of file that is expected, for the message: "a gains file".
+        what: Kind of file that is expected, for messages, e.g. "a gains file".
 
     Raises:
-        DvrkDrakeError: Error of type `error`: the file cannot be read, is not YAML, or does not match the schema.
+        DvrkDrakeError: The file cannot be read, is not YAML, or does not match the schema. The exception has the type
+            `error`.
     """
     return typed_content(schema, load_yaml(path, error), str(path), error, what)
 
@@ -64,18 +66,18 @@ def load_yaml(path: str | Path, error: type[DvrkDrakeError]) -> Any:
     """Returns the content of the YAML file at `path`, without a schema.
 
     Raises:
-        DvrkDrakeError: Error of type `error`: the file cannot be read or is not YAML.
+        DvrkDrakeError: The file cannot be read or is not YAML. The exception has the type `error`.
     """
     return parse_yaml(read_text_input(path, error), str(path), error)
 
 
 def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
-    """Returns the content of a YAML text, None for an empty text; `where` names the source of the text.
+    """Returns the content of a YAML text, or None for an empty text. `where` names the source of the text.
 
-    Keys that begin with "_" are omitted, because they may hold anchors.
+    Top-level keys that begin with "_" are omitted. A file can define anchors under such keys.
 
     Raises:
-        DvrkDrakeError: Error of type `error`: the text is not YAML.
+        DvrkDrakeError: The text is not YAML. The exception has the type `error`.
     """
     try:
         if excess := _excess(text):
@@ -84,9 +86,9 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
     except DvrkDrakeError:
         raise
     except Exception as cause:
-        # The parser raises errors of various types. Only YAML errors contain the line.
+        # The parser raises errors of various types. Only YAML errors contain the line number.
         mark, problem = getattr(cause, "problem_mark", None), getattr(cause, "problem", None)
-        # At the end of a text libyaml reports one line too many.
+        # At the end of a text, the line number of libyaml is too large by one.
         line = "" if mark is None else f"line {min(mark.line, len(text.splitlines()) - 1) + 1}: "
         raise error(f"{where}: invalid YAML: {line}{problem or cause}") from cause
     if isinstance(content, dict):
@@ -99,7 +101,7 @@ def _excess(text: str) -> str:
 
     The check processes the events of the parser one by one, and stops as soon as a maximum is exceeded.
     """
-    # Number of values so far and anchor of each open collection.
+    # For each open collection: number of values so far, and anchor.
     open_values: list[int] = [0]
     open_anchors: list[str | None] = []
     values_of: dict[str, int] = {}
@@ -128,7 +130,7 @@ def _excess(text: str) -> str:
 
 
 def _converted(schema: Any, value: Any) -> Any:
-    """Converts a value that `schema_fault` accepts to the type of the schema."""
+    """Converts a value to the type of the schema. `schema_fault` must accept the value."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         (inner,) = (argument for argument in arguments if argument is not types.NoneType)

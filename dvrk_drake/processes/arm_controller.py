@@ -19,12 +19,13 @@ from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class ArmController:
-    """Gravity compensation or pose hold of one arm, from status message to command message.
+    """Controller for gravity compensation or position control of one arm, from status message to command message.
 
     The controller is a Diagram of DvrkStatusReceiver, GravityPidController, an optional FrictionCompensator, EffortRamp
-    and DvrkCommandSender. Forced updates step the Diagram, so each status produces one command immediately. While the
-    arm does not apply the commanded efforts, the controller commands the measured efforts. When the arm begins to apply
-    them, the controller latches the pose to hold and ramps to its own efforts.
+    and DvrkCommandSender. Each status causes a forced update of the Diagram, so the command is available immediately.
+    While the arm does not apply the commanded efforts, the controller commands the measured efforts. When the arm
+    begins to apply the commanded efforts, the controller latches the pose to hold. It then ramps from the measured
+    efforts to its own efforts.
 
     Attributes:
         arm: Controlled arm.
@@ -46,8 +47,9 @@ class ArmController:
             model: Model of the arm in its actual mounting.
             mode: Mode of the controller.
             period: Period of the status messages [s].
-            friction: Friction compensator for mode "gravity", which is added to the Diagram. None: no compensation.
-            gains: Gains for holding and braking. None: the gains of the arm.
+            friction: Friction compensator for mode "gravity", which is added to the Diagram. None: friction is not
+                compensated.
+            gains: Gains for holding and braking. None: the gains of the arm are used.
         """
         builder = DiagramBuilder()
         self.arm, self._mode = arm, mode
@@ -95,7 +97,7 @@ class ArmController:
     def answer(
         self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None
     ) -> lcmt_dvrk_command:
-        """Computes the command that answers a status.
+        """Computes the command for a status.
 
         Args:
             status: Received status.
@@ -119,9 +121,9 @@ class ArmController:
         return self._sender.get_output_port().Eval(self._sender_context)
 
     def _set_acting(self, acting: bool) -> None:
-        """Sets whether the arm applies the efforts. If it does, restarts the ramp and latches the pose to hold."""
+        """Stores whether the efforts act on the arm. If they act, restarts the ramp and latches the pose to hold."""
         self._acting = acting
         self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
-        # The change to "hold" latches the pose again and resets the integrator.
+        # The change of the mode from "gravity" to "hold" latches the pose and resets the integrator.
         controller_context = self._controller.GetMyMutableContextFromRoot(self._context)
         self._controller.SetMode(controller_context, self._mode if acting else "gravity")

@@ -18,7 +18,8 @@ from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.teacher import CubicTrajectory, RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
 
-#: Largest time step of the trajectory between two statuses [s]. It prevents a jump after a pause of the computer.
+#: Largest time step of the trajectory between two statuses [s]. This limit prevents a jump of the desired state after a
+#: pause of the computer.
 _MAX_STEP = 0.01
 #: Longest time until the arm applies the commanded efforts [s].
 _START = 10.0
@@ -29,10 +30,11 @@ _REST, _REST_TIME, _SETTLE = (2e-3, 2e-4), 0.5, 10.0
 _MEASURE = 0.25
 #: Duration of braking after a stop during a motion [s].
 _BRAKE = 0.3
-#: Largest tracking error of a joint as a share of its range.
+#: Largest allowed tracking error of a joint, as a fraction of the range of the joint.
 _MAX_TRACKING_ERROR = 0.1
-#: Proportional effort of the controller at the start of an approach, divided by the effort limit. It defines the
-#: distance of the approach. Static friction of up to half of this effort changes its sign during the approach.
+#: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
+#: determines the distance of the approach. Static friction of up to half of this effort changes its sign during the
+#: approach.
 _APPROACH = 0.3
 
 Steps = Generator[None, None, None]
@@ -57,10 +59,11 @@ class CollectionSettings:
 
 
 class Collector:
-    """Computes the desired state of a controller in "hold" mode, one per status, until all poses are measured.
+    """Computes the desired state of a controller in mode "hold" for each status, until all poses are measured.
 
-    The collection ends after the last pose or after a requested stop, for which the arm brakes. It also ends if the arm
-    takes over, a joint does not follow or the disk is full. `finished` is then true, and the caller commands HOLD.
+    The collection ends after the last pose. It also ends after a requested stop, for which the arm brakes. It ends with
+    an error if the guard holds the arm, if a joint does not follow its target, or if the file cannot be written.
+    `finished` is then true, and the caller commands HOLD.
 
     Attributes:
         finished: True after the end of the collection.
@@ -89,7 +92,7 @@ class Collector:
             settings: Settings of the collection.
             stopped: Function that returns whether to stop. It is called once per status.
             report: Function that is called with one line per completed pose.
-            writer: Executor that writes the rows of the file. None: a separate thread.
+            writer: Executor that writes the rows of the file. None: a separate thread is used.
         """
         self.finished = False
         self.problem: DvrkDrakeError | None = None
@@ -115,7 +118,7 @@ class Collector:
     def update(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
         """Processes a status and returns the desired state.
 
-        The trajectory advances with the arm's clock, which may be slow.
+        The trajectory advances with the arm's clock, which may be slower than the controller's clock.
 
         Args:
             status: Received status.
@@ -159,7 +162,7 @@ class Collector:
     def _check(self, status: lcmt_dvrk_status) -> None:
         if not self._controller.acting:
             reason = takeover_reason(status, self._last_applied, self._answers)
-            raise CollectionError(f"{self._arm.name} took over and holds: {reason}")
+            raise CollectionError(f"the guard of {self._arm.name} holds the arm: {reason}")
         n = self._arm.num_joints
         away = np.abs(self._q - self._desired[:n]) / self._tracking_tolerance
         if away.max() > 1:
@@ -181,7 +184,7 @@ class Collector:
                 self._report(f"pose {k + 1} measured, {count} of {len(self.done)}; about {left / 60:.1f} min left")
 
     def _begin(self) -> Steps:
-        """Waits until the arm applies the efforts and their ramp is complete. Holds the pose at which this began."""
+        """Waits until the efforts act and their ramp is complete. The arm holds the pose at the start of the ramp."""
         began = self._time
         while not self._controller.acting:
             if self._time - began > _START:
@@ -192,7 +195,7 @@ class Collector:
             self._desired = np.concatenate([self._q, np.zeros_like(self._q)])
             yield
         self._in_control = True
-        self._activity = "taking over"
+        self._activity = "starting the control"
         while not self._controller.ramped:
             yield
 
@@ -229,7 +232,7 @@ class Collector:
         self._desired = trajectory.state(trajectory.duration)
 
     def _settle(self) -> Generator[None, None, bool]:
-        """Waits until the arm is at rest. Returns False if it does not come to rest in time."""
+        """Waits until the arm is at rest. Returns False if it does not come to rest within `_SETTLE`."""
         tolerance = self._arm.per_joint(*_REST) + 1.5 * self._arm.encoder_counts()
         detector = RestDetector(tolerance, _REST_TIME)
         end = self._time + _SETTLE
@@ -240,7 +243,7 @@ class Collector:
         return True
 
     def _measure(self) -> Generator[None, None, NDArray[np.float64]]:
-        """Returns the means of q (n,) and tau (n,) over `_MEASURE`, concatenated."""
+        """Returns the means of q (n,) and tau (n,), concatenated, over the next `_MEASURE` seconds."""
         end = self._time + _MEASURE
         samples = []
         while self._time < end:
@@ -260,7 +263,7 @@ class Collector:
         self.done[k] = True
 
     def _brake(self) -> Steps:
-        """Brakes to rest, at the latest at the end of the trajectory, so the arm stays inside the limits."""
+        """Brakes the arm to rest before the present trajectory would end, so that the arm stays inside the limits."""
         self._activity = "stopping"
         if self._in_control:
             duration = min(_BRAKE, max(self._motion_end - self._time, 1e-3))

@@ -26,15 +26,15 @@ from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
 from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 
-#: Time without a status after which an arm is considered absent, and the longer time for its first status [s].
+#: Time without a status after which an arm is considered absent [s]. Longest time until the first status [s].
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
-#: Longest period of the measurements [us]. With the gains of the arm files, a PSM oscillates at a period of 7 ms and an
-#: MTM at 10 ms.
+#: Longest period of the measurements [us]. With the gains of the arm files, a PSM oscillates if this period is 7 ms,
+#: and an MTM oscillates if it is 10 ms.
 _MAX_PERIOD = 5000
 
-#: Length of the queue of statuses; further statuses are dropped. Number of statuses that are processed at once, which
-#: limits the delay that a flood of messages can cause.
+#: Length of the queue of statuses. If the queue is full, further statuses are dropped. Largest number of statuses that
+#: are processed at once. It limits the delay that a flood of messages can cause.
 _QUEUE, _MESSAGES_AT_ONCE = 100, 200
 
 #: Number of statuses that are inspected before an arm is controlled.
@@ -57,7 +57,7 @@ _REPORT_PERIOD = 0.2
 
 
 class ArmLink:
-    """Status and command channel of one arm for a message-driven loop. Only the newest status is used."""
+    """Status channel and command channel of one arm for a message-driven loop. Only the newest status is used."""
 
     def __init__(
         self,
@@ -73,8 +73,9 @@ class ArmLink:
         Args:
             arm: Arm whose statuses are received.
             url: URL of the LCM network.
-            key: Key that must have signed the statuses, and that signs the commands. None: messages are not signed.
-            before: Status of the session to use. None: the first received session.
+            key: Key that must have signed the statuses, and that signs the commands. None: statuses are not verified
+                and commands are not signed.
+            before: Status whose session is used. None: the first received session is used.
             replays: True to accept statuses of any session and time, for example from a replayed log. Must be False for
                 a controller, because old statuses would determine the commands.
         """
@@ -134,13 +135,13 @@ class ArmLink:
         self._last, self._is_new = status, True
 
     def _ignored_text(self) -> str:
-        """Describes the statuses that were ignored since the last accepted status, or returns ""."""
+        """Returns a description of the statuses that were ignored since the last accepted status, or ""."""
         ignored = self._filter.ignored.most_common()
         if not ignored:
             return ""
         advice = {
             StatusFilter.OTHER_SESSION: f"; {self.arm.name} was restarted: look at it, then start again",
-            StatusFilter.NOT_AUTHENTIC: "; both sides need the same key (--key)",
+            StatusFilter.NOT_AUTHENTIC: "; the arm and this process need the same key (--key)",
         }
         return f"; ignored: {', '.join(f'{n} {reason}' for reason, n in ignored)}{advice.get(ignored[0][0], '')}"
 
@@ -172,8 +173,8 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         raise ControllerError(
             f"{name}: utime or sequence of its status does not increase. Restart its driver or bridge"
         )
-    # The smallest interval is the period, because a busy computer may miss statuses. Statuses of one measurement have
-    # the same utime.
+    # The smallest interval is the period, because a busy computer may miss statuses. Several statuses of one
+    # measurement have the same utime.
     gaps = np.diff(np.unique(utimes))
     if min(gaps) > _MAX_PERIOD:
         raise ControllerError(
@@ -184,11 +185,11 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
 
 
 def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
-    """Clears the latched fault of the arm, or resumes after the watchdog took over. The arm is then in HOLD.
+    """Clears the latched fault of the arm, or resumes after a watchdog hold. Afterwards, the arm is in HOLD.
 
     Args:
         link: Channels of the arm.
-        report: Function that is called with a description of the fault, or of the reason why the watchdog took over.
+        report: Function that is called with a description of the fault, or of the reason of the watchdog hold.
 
     Raises:
         ControllerError: No status arrives, or the fault remains because its cause persists.
@@ -198,7 +199,7 @@ def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
         return
     fault = status.fault_text
     if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
-        report(f"{name} took over and waits for an operator, who resumes now: {fault}")
+        report(f"the guard of {name} held the arm, and the operator resumes now: {fault}")
     else:
         report(f"{name} has a fault, which is reset now: {fault}")
     sender = DvrkCommandSender(link.arm)
@@ -211,7 +212,7 @@ def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
         sender.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
         link.send(sender.get_output_port().Eval(context))
         status = link.next_status(_SILENCE)
-    # For up to a second, the guard would ignore a new sender.
+    # The guard ignores a new sender for up to a second after the last command of this sender.
     end = link.now() + _SENDER_RESERVED
     while link.now() < end:
         status = link.next_status(_SILENCE)
@@ -227,14 +228,14 @@ def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda
     Args:
         status: Status of the arm.
         name: Name of the arm.
-        late: Function that describes late answers, which may be the reason why the arm took over. It returns "" if
-            there are none.
+        late: Function that returns a description of late commands, or "" if no command is late. Late commands may be
+            the reason of a watchdog hold.
     """
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
         raise ControllerError(f"{name} has a fault: {status.fault_text}. {_RESET}")
     if status.fault_text:
         reason = "; ".join(filter(None, [status.fault_text, late()]))
-        raise ControllerError(f"{name} took over and holds: {reason}. {_RESET}")
+        raise ControllerError(f"the guard of {name} holds the arm: {reason}. {_RESET}")
     if status.gravity_compensation:
         raise ControllerError(
             f"{name} adds its own gravity compensation. Together with this controller, it would throw the arm upward. "
@@ -254,7 +255,7 @@ def control(
     report: Callable[[LiveStatus], None],
     on_status: StatusHandler = lambda status, time: None,
 ) -> None:
-    """Answers every status until `stopped` returns true, then commands HOLD.
+    """Sends a command for every status until `stopped` returns true, then commands HOLD.
 
     Args:
         link: Channels of the arm.
@@ -264,7 +265,8 @@ def control(
         on_status: Function that returns the desired state; see `StatusHandler`. It is called once per status.
 
     Raises:
-        ControllerError: The arm stopped sending, restarted, had a fault, took over, or applied no commands.
+        ControllerError: The arm stops sending statuses, is restarted, has a fault, is held by its guard, adds its own
+            gravity compensation, or applies no commands.
     """
     start = link.now()
     first = link.next_status(_SILENCE)
@@ -289,7 +291,7 @@ def control(
 
 
 def _release(link: ArmLink, controller: ArmController, start: float) -> None:
-    """Commands HOLD until the status confirms it."""
+    """Commands HOLD until a status confirms the state HOLD or OFF."""
     end = link.now() + _RELEASE
     while link.now() < end:
         status = link.next_status(_SILENCE)
@@ -299,4 +301,4 @@ def _release(link: ArmLink, controller: ArmController, start: float) -> None:
         command = controller.answer(status, link.now() - start)
         command.control_mode = lcmt_dvrk_command.HOLD
         link.send(command)
-    raise ControllerError(f"{link.arm.name} did not confirm HOLD. It holds when the last command expires")
+    raise ControllerError(f"{link.arm.name} did not confirm HOLD. It will hold when the last command expires")

@@ -1,4 +1,4 @@
-"""Opens an LCM network and raises an error if it is not usable. LCM only writes an error to stderr and continues."""
+"""Opens an LCM network and handles its messages. A network that is not usable causes an exception, unlike in LCM."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pydrake.lcm import DrakeLcm, DrakeLcmParams
 
 from dvrk_drake.errors import DvrkDrakeError
 
-#: Longest time for a message to this process on a busy computer [s]. Time between two attempts [s], which are needed
-#: because UDP may lose messages.
+#: Longest time until this process receives its own message on a busy computer [s]. Time between two such messages [s].
+#: Several messages are sent, because UDP may lose messages.
 _OWN_MESSAGES, _NEXT_MESSAGE = 5.0, 0.2
 
 
@@ -20,7 +20,7 @@ def open_lcm(url: str = "") -> DrakeLcm:
     """Opens an LCM network.
 
     Args:
-        url: URL of the network. Empty: LCM_DEFAULT_URL of the environment, or LCM's default.
+        url: URL of the network. If it is empty, the environment variable LCM_DEFAULT_URL or LCM's default is used.
 
     Returns:
         LCM interface of the network.
@@ -28,7 +28,7 @@ def open_lcm(url: str = "") -> DrakeLcm:
     Raises:
         DvrkDrakeError: LCM does not support the URL, or this process does not receive its own messages.
     """
-    # Receiving is deferred: a network that only publishes needs no thread that wakes up for every message.
+    # Receiving is deferred, because an interface that only publishes needs no thread that wakes up for every message.
     network = DrakeLcm(DrakeLcmParams(lcm_url=url, defer_initialization=True))
     name = network.get_lcm_url()
     try:
@@ -52,7 +52,10 @@ def open_lcm(url: str = "") -> DrakeLcm:
 
 
 def handle_message(network: lcm.LCM, seconds: float) -> bool:
-    """Handles one message if it arrives within `seconds`, and returns whether it did. A signal causes no error."""
+    """Handles one message that arrives within `seconds`, and returns whether one arrived.
+
+    A signal of the operating system, such as SIGINT, does not raise an error.
+    """
     ready, _, _ = select.select([network.fileno()], [], [], seconds)
     if ready:
         network.handle()

@@ -23,7 +23,7 @@ class LiveLine:
 
         Args:
             stream: Stream to write to. If it is not a terminal, nothing is written.
-            period: Least time between two updates [s].
+            period: Minimum time between two updates [s].
             clock: Function that returns a monotonic time [s].
         """
         self._stream, self._period, self._clock = stream, period, clock
@@ -49,16 +49,16 @@ class LiveLine:
         self._stream.flush()
 
 
-#: Time window in which answers are counted [s]. Interval between answers above which the controller is too slow [s].
+#: Time window in which commands are counted [s]. Interval between commands above which the controller is too slow [s].
 _WINDOW, _LATE = 1.0, 0.02
-#: Reasons of the guard for refusing commands if the sender or the arm is slow.
+#: Reasons for which the guard refuses commands if the sender or the arm is too slow.
 _REFUSED_IF_LATE = (
     lcmt_dvrk_status.REFUSAL_STALE,
     lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER,
     lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP,
     lcmt_dvrk_status.REFUSAL_CLOCK_JUMP,
 )
-#: Reasons of the guard for refusing all commands until the last accepted command expires.
+#: Reasons for which the guard refuses all commands until the last accepted command expires.
 _EXPIRED_IF_REFUSED = (lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP, lcmt_dvrk_status.REFUSAL_CLOCK_JUMP)
 
 
@@ -69,7 +69,8 @@ class LiveStatus:
     Attributes:
         state: State of the guard.
         pace: Rate, round-trip time and lost messages.
-        problem: Reasons why commands were refused, ignored or expired since the previous live status, or "".
+        problem: Reasons why commands were refused, ignored or expired since the previous live status, or "" if there
+            are none.
     """
 
     state: str
@@ -81,7 +82,7 @@ class LiveStatus:
 
 
 class LiveStatusMaker:
-    """Computes live statuses from the answers of a controller."""
+    """Computes live statuses from the arm's statuses and the times of the controller's commands."""
 
     def __init__(self, sender_id: int, first: lcmt_dvrk_status) -> None:
         """Starts the counts for a sender at the `first` status of the arm. A restarted arm requires a new object."""
@@ -90,13 +91,13 @@ class LiveStatusMaker:
         self._trips: deque[float] = deque(maxlen=1000)
 
     def answer(self, status: lcmt_dvrk_status, time: float) -> None:
-        """Counts an answer to `status` at `time` [s] of the sender's clock."""
+        """Counts a command that was sent for `status` at `time` [s] of the sender's clock."""
         self._answered += 1
         if status.command_sender_id == self._sender_id:
             self._trips.append(time - 1e-6 * status.command_utime)
 
     def make(self, status: lcmt_dvrk_status, time: float, lost: int) -> LiveStatus:
-        """Returns the live status for the time since the previous one.
+        """Returns the live status for the time since the previous live status.
 
         Args:
             status: Last status of the arm.
@@ -111,31 +112,31 @@ class LiveStatusMaker:
         if status.num_ignored > self._before.num_ignored:
             problem.append(f"the arm ignores messages: {describe_refusal(status.ignored_code)}")
         if status.num_expired > self._before.num_expired:
-            problem.append("the last command expired and the arm took over")
+            problem.append("the guard holds the arm because the last command expired")
         self._before, self._last_time, self._answered = status, time, 0
         pace = f"{rate:.0f} Hz, {trip}, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))
 
 
 class AnswerTimes:
-    """Times of a controller's answers in the last second, from which it computes their rate and longest interval."""
+    """Times of a controller's commands in the last second, to determine the rate and longest interval of commands."""
 
     def __init__(self) -> None:
         self._times: deque[float] = deque()
 
     def add(self, time: float) -> None:
-        """Adds an answer at `time` [s] of the controller's clock."""
+        """Adds a command at `time` [s] of the controller's clock."""
         self._times.append(time)
         while time - self._times[0] > _WINDOW and len(self._times) > 2:
             self._times.popleft()
 
     def lateness(self) -> str:
-        """Describes the rate and longest interval of the answers if they were too infrequent, otherwise returns ""."""
+        """Returns a description of the rate and longest interval of commands that are too infrequent, otherwise ""."""
         intervals = np.diff(np.array(self._times))
         if not len(intervals) or intervals.max() <= _LATE:
             return ""
         return (
-            f"this computer, or that of the arm, is too slow: {1 / intervals.mean():.0f} answers per second, longest "
+            f"this computer or the arm's computer is too slow: {1 / intervals.mean():.0f} commands per second, longest "
             f"interval {1e3 * intervals.max():.0f} ms. End other programs, or use --realtime"
         )
 
@@ -146,7 +147,7 @@ def takeover_reason(status: lcmt_dvrk_status, before: lcmt_dvrk_status, answers:
     Args:
         status: Status in which the arm does not accept commands.
         before: Last status in which the arm accepted commands. Earlier refusals are not considered.
-        answers: Times of the answers to the statuses.
+        answers: Times of the controller's commands.
     """
     expired, refused = status.num_expired > before.num_expired, status.num_refused > before.num_refused
     late = answers.lateness()

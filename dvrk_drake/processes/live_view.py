@@ -1,4 +1,4 @@
-"""Displays an arm from its status messages. `arm --meshcat` starts it as `dvrk-drake view --live`."""
+"""Displays the poses in the status messages of an arm. `arm --meshcat` runs the process `dvrk-drake view --live`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _TIMEOUT = 0.2
 
 
 def show_status(view: ArmView, link: ArmLink) -> None:
-    """Displays the pose of the newest status. Keeps the last pose without a status, or if the pose is not finite."""
+    """Displays the pose in the newest status, if there is a new status and its pose is finite."""
     try:
         q = link.next_status(_TIMEOUT).position
     except ControllerError:
@@ -29,7 +29,7 @@ def show_status(view: ArmView, link: ArmLink) -> None:
         view.show(q)
 
 
-# This symbol is looked up before the fork, because few operations are safe after a fork.
+# The function `prctl` is looked up before the fork, because few operations are safe after a fork.
 _prctl = getattr(ctypes.CDLL(None), "prctl", None)
 _PR_SET_PDEATHSIG = 1
 

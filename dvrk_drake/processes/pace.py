@@ -8,10 +8,11 @@ import os
 import time
 from collections.abc import Callable
 
-#: Priority of SCHED_FIFO. It is above all processes that are not real-time and below the kernel's own threads at 99.
+#: Priority of SCHED_FIFO. This priority is above all processes that are not real-time, and below the kernel's own
+#: threads, which have priority 99.
 _PRIORITY = 50
 
-#: Longest delay [s] that a loop makes up for. After a longer delay, the loop continues from the current time.
+#: Longest delay [s] for which a loop catches up. After a longer delay, the loop continues from the current time.
 _MAX_DELAY = 0.1
 
 
@@ -57,9 +58,9 @@ class Pace:
 def make_realtime() -> list[str]:
     """Makes this process real-time (SCHED_FIFO, priority 50), locks its memory and prevents sleep states of the cores.
 
-    Threads that are started later, such as those of LCM, inherit the priority. A core in a sleep state takes longer to
-    wake up than an answer takes to compute. The request of https://docs.kernel.org/power/pm_qos_interface.html prevents
-    sleep states until this process ends.
+    Threads that are started later, such as those of LCM, inherit the priority. A core in a sleep state needs more time
+    to wake up than a controller needs to compute a command. The request to /dev/cpu_dma_latency
+    (https://docs.kernel.org/power/pm_qos_interface.html) prevents sleep states until this process ends.
 
     Returns:
         One warning for each setting that was not permitted, with the reason.
@@ -88,7 +89,7 @@ def _lock_memory() -> None:
 
 
 def _keep_cores_awake() -> None:
-    # The file stays open because the request lasts until it is closed.
+    # The file stays open, because closing it would end the request.
     os.write(os.open("/dev/cpu_dma_latency", os.O_WRONLY), (0).to_bytes(4, "little"))
 
 

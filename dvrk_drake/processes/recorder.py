@@ -16,7 +16,8 @@ from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
 from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
 
-#: Longest time until the first status [s]. Time without a status after which the live line reports it [s].
+#: Longest time until the first status [s]. Time without a status after which the status line reports missing statuses
+#: [s].
 FIRST_STATUS, SILENCE = 10.0, 0.5
 #: Time without a status of the session after which the statuses of a new session are recorded [s].
 _RESTART = 1.0
@@ -29,7 +30,7 @@ _POLL = 0.1
 
 
 class Recorder:
-    """Appends every status of one arm to a new file as it arrives in real time.
+    """Appends every status of one arm to a new file in real time.
 
     Attributes:
         stream: Filter that counts accepted and rejected statuses.
@@ -65,13 +66,13 @@ class Recorder:
         self._subscription.set_queue_capacity(_QUEUE)
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
-        """Records until `stopped` returns true, or for `duration` from the first message.
+        """Records until `stopped` returns true, or until `duration` has elapsed since the first status.
 
         Args:
             duration: Duration of the recording [s], which may be infinite.
             stopped: Function that returns whether to stop. It is called at least every 0.1 s.
             show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
-                function that returns the live line.
+                function that returns the text of the status line.
 
         Raises:
             RecordingError: The recording ended before the first status, no status arrived within 10 s, or the file
@@ -96,7 +97,7 @@ class Recorder:
                 self._file.close()
 
     def describe(self) -> str:
-        """Returns the live line with the number of rows, the rate, lost messages and the state of the arm."""
+        """Returns the text of the status line: the number of rows, the rate, lost messages and the state of the arm."""
         now = time.monotonic()
         while self._arrivals and self._arrivals[0] < now - 1:
             self._arrivals.popleft()
@@ -114,7 +115,7 @@ class Recorder:
         return ", ".join(parts)
 
     def notes(self) -> list[str]:
-        """Returns one line per kind of messages that were not recorded or were lost."""
+        """Returns one line for each reason why messages were not recorded, and for lost messages."""
         left_out = [f"messages not recorded, {reason}: {count}" for reason, count in self.foreign.items()]
         return [*left_out, *self.stream.notes()]
 

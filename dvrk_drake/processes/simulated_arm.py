@@ -25,8 +25,9 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
-#: Length of the queue of commands; further commands are dropped. Number of commands that are handled at the start of a
-#: tick, which limits the delay that a flood can cause. Most commands are handled while the arm waits for its tick.
+#: Length of the queue of commands. If the queue is full, further commands are dropped. Largest number of commands that
+#: are handled at the start of a tick. It limits the delay that a flood of messages can cause. Most commands are handled
+#: while this process waits for the next tick.
 _QUEUE, _MESSAGES_PER_STEP = 200, 10
 
 
@@ -55,7 +56,8 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
 
     Args:
         arm: Simulated arm.
-        pose: Pose (n,) [rad, m]. None: the pose nearest to zero with a margin to the limits.
+        pose: Pose (n,) [rad, m]. None: the pose nearest to zero is used that has a distance of at least 10 % of the
+            range from each limit.
 
     Raises:
         StationError: `pose` does not have n entries inside the arm's limits.
@@ -89,8 +91,8 @@ class SimulatedArm:
             driver: Configuration of the driver.
             url: URL of the LCM network.
             q: Initial pose (n,) [rad, m].
-            wall_clock: Function that returns a monotonic time [us]. The guard uses it, so that commands also expire
-                while this process is late or suspended.
+            wall_clock: Function that returns a monotonic time [us]. The guard uses this function, so that commands also
+                expire while this process is late or suspended.
         """
         self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0
@@ -139,14 +141,14 @@ class SimulatedArm:
         self._driver.SetStalled(False)
 
     def send(self, network: lcm.LCM) -> None:
-        """Publishes the current state."""
+        """Publishes the last status."""
         network.publish(status_channel(self.arm), self._status)
 
     def run(self, stopped: Callable[[], bool], report: Callable[[str], None] = lambda line: None) -> Pace:
         """Steps the simulation by the wall clock until `stopped` returns true.
 
         A status is published when a tick begins. The simulation then computes the next state while the controller
-        computes the answer. The answer is applied from the next tick on, as on a real arm.
+        computes a command. The command is applied from the next tick on, as on a real arm.
 
         Args:
             stopped: Function that returns whether to stop. It is called once per tick.
@@ -155,12 +157,13 @@ class SimulatedArm:
         Returns:
             Pace with the number of late ticks.
         """
-        # LCM is opened here because its receive thread inherits the scheduling of the thread that opens it. Drake's
-        # subscription would keep only one message between two steps, so a second sender would not be noticed.
+        # LCM is opened here, because its receive thread inherits the scheduling of the thread that opens LCM. Drake's
+        # subscription is not used, because it keeps only one message between two steps. The guard would then not detect
+        # a second sender.
         network = lcm.LCM(self._url)
         network.subscribe(command_channel(self.arm), self.receive).set_queue_capacity(_QUEUE)
-        # The first period of the guard is too long because it includes the time since the simulation was created. The
-        # status of that step is not published, because a controller would reject the arm.
+        # The first measured period of the guard is too long, because it includes the time since the simulation was
+        # created. The status of the first step is not published, because a controller would refuse to control the arm.
         self.step()
         self.step()
         pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))

@@ -18,7 +18,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.recordings.pose_file import load_poses_if_any, same_pose, save_poses
 
-#: Shortest duration of a trajectory [s]. Shorter trajectories would begin and end with a jerk.
+#: Shortest duration of a trajectory [s]. Shorter trajectories would begin and end with a large acceleration.
 MIN_DURATION = 0.3
 
 
@@ -51,20 +51,20 @@ class CubicTrajectory:
     ) -> CubicTrajectory:
         """Returns a trajectory from rest to rest on which no joint exceeds `speed` (n,) [rad/s, m/s].
 
-        The path is a straight line in joint space. It is inside all limits if both poses are.
+        The path is a straight line in joint space. It is inside all limits if both poses are inside all limits.
         """
-        # The peak speed of a cubic from rest to rest is 1.5 times its mean.
+        # The peak speed of a cubic from rest to rest is 1.5 times its mean speed.
         duration = max(MIN_DURATION, 1.5 * float(np.max(np.abs(q_end - q_start) / speed)))
         return cls(q_start, np.zeros_like(q_start), q_end, duration)
 
     @classmethod
     def braking(cls, state: NDArray[np.float64], duration: float) -> CubicTrajectory:
-        """Returns a trajectory from `state` (2n,), q, then v, to rest at constant deceleration."""
+        """Returns a trajectory with constant deceleration from `state` (2n,) to rest. The state is q, then v."""
         q, v = np.split(state, 2)
         return cls(q, v, q + 0.5 * duration * v, duration)
 
     def state(self, time: float) -> NDArray[np.float64]:
-        """Returns the state (2n,), q, then v, at `time` [s], which is limited to 0..`duration`."""
+        """Returns the state (2n,), q, then v, at `time` [s]. The time is limited to the range from 0 to `duration`."""
         time = min(max(time, 0.0), self.duration)
         return np.concatenate([self._q.value(time).ravel(), self._v.value(time).ravel()])
 
@@ -84,18 +84,18 @@ class RestDetector:
         self._q: NDArray[np.float64] | None = None
 
     def is_at_rest(self, time: float, q: NDArray[np.float64]) -> bool:
-        """Returns whether the arm is at rest at `time` [s] with measured q (n,). Call it at every measurement."""
-        if self._q is None or not np.all(np.abs(q - self._q) <= self._tolerance):  # also true of NaN
+        """Returns whether the arm is at rest at `time` [s]. Call this method for every measurement q (n,)."""
+        if self._q is None or not np.all(np.abs(q - self._q) <= self._tolerance):  # also true for NaN
             self._q, self._since = q, time
         return time - self._since >= self._duration
 
 
-#: Tolerance [rad], [m] and duration [s] for detecting that a hand-guided arm is at rest, for --at-rest.
+#: Tolerance [rad], [m] and duration [s] for detecting that a hand-guided arm is at rest. They are used with --at-rest.
 _REST, _REST_TIME = (0.01, 0.001), 1.0
 
 
 class Teacher:
-    """Records poses of an arm in "gravity" mode to a file of poses, on request or whenever the arm is at rest.
+    """Records poses of an arm in mode "gravity" to a file, on request or whenever the arm is at rest.
 
     Attributes:
         poses: Poses (m, n) [rad, m] in the file, including a pose that is being written.
@@ -114,12 +114,12 @@ class Teacher:
         """Creates a teacher for the arm of `controller`.
 
         Args:
-            controller: Controller in "gravity" mode.
-            path: Path of the file, which is created or extended. It is complete at any time.
+            controller: Controller in mode "gravity".
+            path: Path of the file. The poses are added to an existing file. The file is complete at any time.
             at_rest: True to record each pose at which the arm is at rest for a second.
             requested: Function that returns whether to record the present pose. It is called once per status.
             report: Function that is called with one line per pose.
-            writer: Executor that writes the file. None: a separate thread.
+            writer: Executor that writes the file. None: a separate thread is used.
 
         Raises:
             CollectionError: The file exists and does not contain poses of this arm.
@@ -133,7 +133,7 @@ class Teacher:
         self._writing: Future[None] | None = None
 
     def update(self, status: lcmt_dvrk_status, time: float) -> None:
-        """Processes a status that arrived at `time` [s]. Returns None, because the operator moves the arm.
+        """Processes a status that arrived at `time` [s]. There is no desired state, because the operator moves the arm.
 
         Raises:
             DvrkDrakeError: The file cannot be written.
@@ -175,11 +175,11 @@ class EnterKey:
     """Detects a new line on a stream without blocking."""
 
     def __init__(self, stream: IO[str]) -> None:
-        """Starts reading `stream`, e.g. sys.stdin. Nothing else may read from it."""
+        """Starts reading `stream`, e.g. sys.stdin. No other code may read from this stream."""
         self._descriptor, self._open = stream.fileno(), True
 
     def __call__(self) -> bool:
-        """Returns whether Enter was pressed since the last call. False after the end of the stream."""
+        """Returns whether Enter was pressed since the last call, or False after the end of the stream."""
         if not self._open or not select.select([self._descriptor], [], [], 0.0)[0]:
             return False
         data = os.read(self._descriptor, 4096)

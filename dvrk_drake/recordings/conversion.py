@@ -1,4 +1,4 @@
-"""Converts CSV files with a header, LCM logs and public recordings of real arms to the CSV format of this project.
+"""Converts recordings of all supported formats to the CSV format of this project.
 
 The public recordings are from the WPI AIM lab and have two layouts; `docs/public_recordings.md` explains how to obtain
 them.
@@ -31,11 +31,17 @@ from dvrk_drake.recordings.public_formats import (
     wpi_in_joint_coordinates,
 )
 from dvrk_drake.recordings.recording import Coordinates, Recording, column_names, read_recording, write_recording
+from dvrk_drake.recordings.ros_bag import is_ros_bag
 
-Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log"]
+Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log", "ros-bag"]
 
-#: Mapping from a format to its coordinates. A CSV with a header has no defined coordinates.
-DEFINED_COORDINATES: dict[str, Coordinates] = {"team-mat": "joint", "wpi-csv": "actuator", "lcm-log": "joint"}
+#: Mapping from a format to its coordinates. The format "csv" has no entry, because it does not define its coordinates.
+DEFINED_COORDINATES: dict[str, Coordinates] = {
+    "team-mat": "joint",
+    "wpi-csv": "actuator",
+    "lcm-log": "joint",
+    "ros-bag": "joint",
+}
 
 
 def convert(
@@ -45,6 +51,7 @@ def convert(
     format: Format | None = None,
     coordinates: Coordinates | None = None,
     variable: str | None = None,
+    topic: str | None = None,
     rate: float | None = None,
     arm: Arm | None = None,
     skip_invalid: bool = False,
@@ -58,18 +65,22 @@ def convert(
         output: Path of the CSV to write; an existing file is replaced.
         format: Format of the recording; None to detect it.
         coordinates: Coordinates of q, qd and tau, required for "csv". Other formats define their coordinates.
-        variable: Name of the variable, for "team-mat"; required if several variables match.
-        rate: Sampling rate [Hz] of a CSV without time stamps. None: 200 Hz for "wpi-csv", no times for "csv".
-        arm: For "csv" and "wpi-csv": arm whose joint coordinates are written; None for the coordinates of the file. For
-            "lcm-log": arm whose statuses are read; required if there are several.
-        skip_invalid: Whether to omit and count invalid rows (or poses) instead of refusing the file.
+        variable: For "team-mat": name of the MATLAB variable, required if several variables match.
+        topic: For "ros-bag": JointState topic or its namespace, see `read_joint_states`.
+        rate: Sampling rate [Hz] of a CSV without time stamps. If None, the rate is 200 Hz for "wpi-csv", and a "csv"
+            gets no time stamps.
+        arm: For "csv" and "wpi-csv": the joint coordinates of this arm are written. If None, the coordinates of the
+            file are written. For "lcm-log" and "ros-bag": the measurements of this arm are read. The arm is required
+            for a bag, and for a log with statuses of several arms.
+        skip_invalid: Whether to omit invalid rows (or poses) and to count them in `notes`. If False, a file with
+            invalid rows is refused.
 
     Returns:
         Written recording. Its `source`, `lines` and `notes` refer to the original file.
 
     Raises:
-        RecordingError: The file does not have the layout of the format, its coordinates are unknown, or an option does
-            not apply to its format.
+        RecordingError: The file does not have the layout of the format, its coordinates are unknown, or an argument
+            does not apply to its format.
         DvrkDrakeError: The output cannot be written.
     """
     if format is not None and format not in get_args(Format):
@@ -77,19 +88,27 @@ def convert(
     if coordinates is not None and coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
-        raise RecordingError(f"{output} is the input recording. Choose another output.")
+        raise RecordingError(f"{output} is the input recording. Choose another output file.")
     chosen = format or detect_format(path)
     defined = DEFINED_COORDINATES.get(chosen)
     if defined is not None and coordinates not in (None, defined):
         raise RecordingError(f"{path}: a {chosen} file is in {defined} coordinates, not in {coordinates} coordinates")
-    if variable is not None and chosen in ("csv", "wpi-csv"):
+    if variable is not None and chosen != "team-mat":
         raise RecordingError(f"{path}: --variable does not apply to {chosen} files")
+    if topic is not None and chosen != "ros-bag":
+        raise RecordingError(f"{path}: --topic does not apply to {chosen} files")
     if chosen == "lcm-log":
-        if rate is not None or variable is not None or skip_invalid:
-            raise RecordingError(f"{path}: --rate, --variable and --skip-invalid do not apply to an LCM log")
+        if rate is not None or skip_invalid:
+            raise RecordingError(f"{path}: --rate and --skip-invalid do not apply to an LCM log")
         if not is_lcm_log(Path(path)):
             raise RecordingError(f"{path} is not an LCM log")
         recording = read_recording(path, arm)
+    elif chosen == "ros-bag":
+        if rate is not None:
+            raise RecordingError(f"{path}: --rate does not apply to a ROS bag, whose messages have time stamps")
+        if not is_ros_bag(path):
+            raise RecordingError(f"{path} is not a ROS bag")
+        recording = read_recording(path, arm, topic=topic, skip_invalid=skip_invalid)
     elif chosen == "team-mat":
         if rate is not None:
             raise RecordingError(f"{path}: --rate does not apply to team-mat files, which have no times")
@@ -110,8 +129,8 @@ def convert(
     if recording.coordinates == "actuator":
         first, *others = recording.notes
         note = (
-            "in actuator coordinates, which the CSV does not state: pass --coordinates actuator to every command that "
-            "reads the CSV, or convert with --arm"
+            "in actuator coordinates, but the CSV does not state this: pass --coordinates actuator to every command "
+            "that reads the CSV, or convert with --arm"
         )
         if chosen == "wpi-csv":
             note += " (required for a PSM, whose roll is recorded at the joint)"
@@ -147,9 +166,10 @@ def _read_csv(
 
 
 def detect_format(path: str | Path) -> Format:
-    """Returns the format of a file from its first bytes: LCM, MATLAB, or text with or without q1 in a header.
+    """Returns the format of a file, detected from its first bytes and its name.
 
-    The content is checked later by the reader of the format.
+    A text file is a "csv" if its header contains q1, and a "wpi-csv" otherwise. The reader of the format checks the
+    content later.
 
     Raises:
         RecordingError: The file does not exist, is empty, or has none of the formats.
@@ -157,13 +177,17 @@ def detect_format(path: str | Path) -> Format:
     path = Path(path)
     if is_lcm_log(path):
         return "lcm-log"
+    if is_ros_bag(path):
+        return "ros-bag"
     content = read_bytes(path)
     if not content.strip():
         raise RecordingError(f"{path} is empty")
     if looks_like_matlab(path, content):
         return "team-mat"
     if b"\0" in content[:_HEAD]:
-        raise RecordingError(f"{path}: unknown format; allowed: LCM log, MATLAB file (team-mat), UTF-8 text file (CSV)")
+        raise RecordingError(
+            f"{path}: unknown format; allowed: ROS bag, LCM log, MATLAB file (team-mat), UTF-8 text file (CSV)"
+        )
     return "csv" if "q1" in _header(content) else "wpi-csv"
 
 

@@ -39,11 +39,12 @@ class CsvReader:
     unmodified cells) of the rows that are not blank. A new iteration continues after the last row that was read.
 
     Attributes:
-        has_underscore: Whether the text read so far contains an underscore, which Python accepts in numbers.
+        has_underscore: Whether the text read so far contains an underscore. Python accepts underscores in numbers, but
+            `is_number` does not.
     """
 
     def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Opens the file at `path`; `progress` is called with the completed share 0..1.
+        """Opens the file at `path`. `progress` is called with the completed fraction (0 to 1).
 
         Raises:
             RecordingError: The file cannot be read.
@@ -83,7 +84,7 @@ class CsvReader:
         if len(cells) == 1 and re.search(r"[;\s]", cells[0].strip()):
             raise RecordingError(
                 f"{self._path}, line {self._reader.line_num}: the first row has no comma. Separate cells by commas "
-                "and use a point as the decimal sign."
+                "and use a point as the decimal separator."
             )
 
     def _lines(self) -> Iterator[str]:
@@ -121,7 +122,7 @@ class CsvReader:
 def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     """Returns (line number, stripped cells) of all rows that are not blank, and the SHA-256 of the file.
 
-    The required memory is about 15 times the file size. Use `CsvReader` for files of numbers that may be large.
+    The required memory is about 15 times the file size. Use `CsvReader` for large files of numbers.
 
     Raises:
         RecordingError: The file cannot be read, is too large, is not text, or its cells are not separated by commas.
@@ -133,13 +134,13 @@ def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
 
 
 def listed(numbers: Iterable[int]) -> str:
-    """Returns a text that lists the first ten numbers."""
+    """Returns a text with the first ten numbers, separated by commas."""
     texts = list(map(str, numbers))
     return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "..."])
 
 
 def skipped_note(skipped: NDArray[np.int_], count: int) -> str:
-    """Returns the note on the skipped lines of `count` rows."""
+    """Returns a note on the skipped lines of a file with `count` rows."""
     return f"{len(skipped)} of {count} rows skipped (empty, NaN or infinite): lines {listed(skipped)}"
 
 
@@ -160,7 +161,7 @@ def parse_number(cell: str, where: str) -> float:
 
     Args:
         cell: Text of the cell.
-        where: Beginning of the error message, "file, line 2: column".
+        where: Beginning of the error message, e.g. "file, line 2: column".
 
     Raises:
         RecordingError: The cell is not a number.
@@ -184,13 +185,13 @@ def parse_finite(cell: str, where: str) -> float:
 
 
 class GrowingFile:
-    """File that is extended by one unbuffered write per row.
+    """File to which rows are appended, each by one unbuffered write.
 
     Written rows survive the termination of the process. With `sync` they also survive a power failure.
     """
 
     def __init__(self, path: str | Path, *, resume: bool = False, sync: bool = False) -> None:
-        """Creates a new file, or with `resume` opens an existing one and truncates it after its last complete line.
+        """Creates a new file. With `resume`, opens an existing file and removes an incomplete last line.
 
         Args:
             path: Path of the file.

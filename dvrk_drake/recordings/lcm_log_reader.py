@@ -2,8 +2,8 @@
 
 The format is described at https://lcm-proj.github.io/lcm/content/log-file-format.html. A log is a sequence of events.
 Each event is big-endian and consists of a magic number, the event number, a time, two lengths, channel and data.
-`EventLog` of the `lcm` package is not used. It crashes on a damaged length (segmentation fault in lcm 1.5.3), and does
-not write the last events before the log is closed.
+`EventLog` of the `lcm` package is not used. It crashes on a damaged length (segmentation fault in lcm 1.5.3), and
+writes the last events only when the log is closed.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ class StatusStream:
         return notes
 
     def _examine(self, status: lcmt_dvrk_status) -> str:
-        """Returns the reason why a status is not usable, or "". Unusable statuses also advance the sequence number."""
+        """Returns the reason why a status is not usable, or "" if it is usable. Also counts the lost statuses."""
         if status.arm_name != self.arm_name or status.num_joints != self.num_joints:
             return _FOREIGN
         continues = self._follow_session(status.session_id)
@@ -201,7 +201,7 @@ class StatusStream:
         return _OFF if status.guard_state == lcmt_dvrk_status.STATE_OFF else ""
 
     def _follow_session(self, session_id: int) -> bool:
-        """Returns whether the session is that of the previous message. Raises an error if an earlier one reappears."""
+        """Returns whether the session is unchanged. Raises RecordingError if an earlier session reappears."""
         if self._sessions and self._sessions[-1] == session_id:
             return True
         if session_id in self._sessions:
@@ -243,18 +243,18 @@ class StatusLog(NamedTuple):
 
 
 def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
-    """Reads an LCM log written by lcm-logger or `dvrk-drake record`; other channels are ignored.
+    """Reads an LCM log written by lcm-logger or `dvrk-drake record`. Messages of other channels are ignored.
 
-    Some messages are omitted and noted: those that cannot be read or are not of the arm, that are not later than the
-    previous one, that contain numbers that are not finite, or that were sent with the motors off.
+    A message is omitted and counted in `notes` if it cannot be read, is of another arm, is not later than the previous
+    message, contains a number that is not finite, or was sent while the motors were off.
 
     Args:
         path: Path of the log.
         arm: Arm whose statuses are read; None if the log has statuses of only one arm.
 
     Raises:
-        RecordingError: The file is not an LCM log, has no usable status, or has (without `arm`) statuses of several
-            arms.
+        RecordingError: The file is not an LCM log or has no usable status, or `arm` is None and the log has statuses of
+            several arms.
     """
     log = LcmLogReader(path)
     channel = status_channel(arm) if arm else _only_status_channel(log)

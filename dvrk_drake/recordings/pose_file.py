@@ -1,4 +1,4 @@
-"""Files of a collection: the poses to visit (YAML) and the measured poses (CSV).
+"""Files of the command `collect`: the poses to measure (YAML) and the measured poses (CSV).
 
 Postponed annotations are not used here because yaml_load_typed reads the types at run time.
 """
@@ -19,7 +19,7 @@ from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite, read_bytes, read_rows
 from dvrk_drake.recordings.recording import SAME_POSE, Recording, column_names
 
-#: Tolerance of the limits, for poses written with few digits [rad, m].
+#: Tolerance of the limits [rad, m], because the positions in a file may be rounded.
 _ROUNDING = 1e-9
 
 
@@ -63,11 +63,11 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
 
 
 def check_poses(poses: NDArray[np.float64], arm: Arm, source: str) -> None:
-    """Checks that `arm` can reach poses (m, n) and that no pose is repeated; `source` begins the message.
+    """Checks that `arm` can reach poses (m, n) and that no pose is repeated. Messages begin with `source`.
 
     Raises:
-        CollectionError: Numbers are not finite, in degrees or millimetres, or outside the limits, or a pose is
-            repeated.
+        CollectionError: A number is not finite or outside the limits, positions are in degrees or millimetres, or a
+            pose is repeated.
     """
     for k, pose in enumerate(poses):
         if not np.all(np.isfinite(pose)):
@@ -87,7 +87,7 @@ def check_poses(poses: NDArray[np.float64], arm: Arm, source: str) -> None:
 
 
 def same_pose(poses: NDArray[np.float64], pose: NDArray[np.float64], arm: Arm) -> int | None:
-    """Returns the index of `pose` (n,) in `poses` (m, n), or None."""
+    """Returns the index of the first row of `poses` (m, n) that equals `pose` (n,) within `SAME_POSE`, or None."""
     rows = np.flatnonzero(np.all(np.abs(poses - pose) < arm.per_joint(*SAME_POSE), axis=1))
     return int(rows[0]) if len(rows) else None
 
@@ -107,7 +107,7 @@ def save_poses(poses: NDArray[np.float64], arm: Arm, path: str | Path) -> None:
 
 
 def load_poses_if_any(path: str | Path, arm: Arm) -> NDArray[np.float64]:
-    """Returns the poses as `load_poses` does, or no poses (0, n) if the file does not exist."""
+    """Returns the poses as `load_poses` does, or an array (0, n) if the file does not exist."""
     return load_poses(path, arm) if os.path.lexists(path) else np.empty((0, arm.num_joints))
 
 
@@ -120,7 +120,8 @@ class CollectionFile:
     - pose1..posen: requested pose.
     - arm: name of the arm.
     - utime: time when the row was written [us since 1970].
-    - friction1..frictionn: half of the difference between the efforts of the two approach directions, if both are used.
+    - friction1..frictionn: half of the difference between the efforts of the two approach directions, if each pose is
+      approached from both directions.
     """
 
     def __init__(self, path: str | Path, arm: Arm, both_sides: bool) -> None:
@@ -155,7 +156,8 @@ class CollectionFile:
             if not which.any():
                 raise CollectionError(
                     f"{self._path}, line {line}: the requested pose of this row is not in the pose file. Choose "
-                    "another output, or the pose file of this collection (poses may be added to it)."
+                    "another output file, or the pose file that this output was measured with. New poses can be added "
+                    "to that pose file."
                 )
             done |= which
         return done
@@ -207,7 +209,9 @@ class CollectionFile:
             if len(cells) != len(header):
                 raise RecordingError(f"{where}: the row has {len(cells)} cells, the header has {len(header)}")
             if (name := cells[header.index("arm")]) != self._arm.name:
-                raise CollectionError(f"{where}: the row is of {name}, not of {self._arm.name}. Choose another output.")
+                raise CollectionError(
+                    f"{where}: the row is of {name}, not of {self._arm.name}. Choose another output file."
+                )
             found.append((line, np.array([parse_finite(cells[j], f"{where}: {header[j]}") for j in columns])))
         return found
 
@@ -218,5 +222,5 @@ class CollectionFile:
             sides = "one side (--no-both-sides)" if self._both_sides else "both sides (--both-sides)"
             raise CollectionError(f"{self._path} was collected from {sides}. Continue with the same option.")
         raise CollectionError(
-            f"{self._path} already exists and is not a collection of {self._arm.name}. Choose another output."
+            f"{self._path} already exists and is not a collection of {self._arm.name}. Choose another output file."
         )

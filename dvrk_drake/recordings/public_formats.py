@@ -35,7 +35,7 @@ from dvrk_drake.recordings.recording import Recording
 #: Nominal sampling rate of the recordings [Hz].
 WPI_RATE = 200.0
 
-#: Joints that are recorded in joint coordinates, although a disc drives them.
+#: Joints that are recorded in joint coordinates instead of actuator coordinates.
 WPI_DIRECT_JOINTS = ("roll",)
 
 _NUM_JOINTS = 7
@@ -48,20 +48,20 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
 
     Units are rad, rad/s and N m. For a PSM, axis 3 is in m, m/s and N, and axis 7 is the jaw. The file has no time
     stamps: t = row / rate. The CSV that `convert` wrote without an arm (header t, q1.., qd1.., tau1..) is also
-    accepted. It keeps its time stamps.
+    accepted. Its time stamps are kept.
 
     Format: https://github.com/WPI-AIM/dvrk_dynamics_identification, files
     `data/*/measured_trajectory/*_results.csv`.
 
     Args:
         path: Path of the CSV file.
-        rate: Sampling rate [Hz]; default: `WPI_RATE`.
-        skip_invalid: Whether to omit rows with an empty cell, a NaN or an infinity instead of refusing the file. The
-            other rows keep their t.
+        rate: Sampling rate [Hz]; None for `WPI_RATE`.
+        skip_invalid: Whether to omit rows that contain an empty cell, a NaN or an infinity. The times of the other rows
+            do not change. If False, a file with such rows is refused.
 
     Raises:
         RecordingError: The file does not have this layout, has fewer than two rows, or has a cell that is not a finite
-            number; or a rate is given for a file with time stamps.
+            number, or `rate` is given for a file with time stamps.
     """
     path = Path(path)
     rows, sha256 = read_rows(path)
@@ -102,7 +102,7 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
     repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
     if repeats:
         notes.append(
-            f"{repeats} of {len(kept)} rows repeat the previous row (polled faster than updated); they are kept"
+            f"{repeats} of {len(kept)} rows repeat the previous row (read faster than the arm measures); they are kept"
         )
     q, qd, tau = np.split(kept, 3, axis=1)
     return Recording(
@@ -125,7 +125,7 @@ def refuse_rate(path: Path, rate: float | None) -> None:
 
 
 def generated_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
-    """Returns times [s] for the row numbers of a file without time stamps, and a note on them.
+    """Returns times [s] for the row numbers of a file without time stamps, and a note on the times.
 
     Raises:
         RecordingError: The rate is not a positive number.
@@ -136,7 +136,7 @@ def generated_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.flo
 
 
 def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
-    """Returns notes for the user on recorded time stamps (m,); `lines` (m,) are their lines in the file."""
+    """Returns notes for the user on recorded time stamps `t` (m,), which are on the `lines` (m,) of the file."""
     steps = np.diff(t)
     interval = f", median interval {1e3 * np.median(steps):.4g} ms" if len(steps) else ""
     notes = [f"{len(t)} rows, t from {t[0]:g} to {t[-1]:g} s as in the file{interval}"]
@@ -152,8 +152,8 @@ def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
 def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
     """Converts a "wpi-csv" recording of `arm` from actuator to joint coordinates.
 
-    The recorded coordinates are those of the actuators of the dVRK. The roll of a PSM is recorded at the joint instead
-    (Wang et al. 2019, table of the PSM).
+    The recorded coordinates are those of the actuators of the dVRK. The exception is the roll of a PSM, which is
+    recorded at the joint (Wang et al. 2019, table of the PSM).
 
     Raises:
         RecordingError: The number of joints is wrong, or the arm cannot reach the poses.
@@ -181,12 +181,13 @@ def looks_like_matlab(path: Path, content: bytes) -> bool:
 
 
 def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid: bool = False) -> Recording:
-    """Reads static poses from a MATLAB array of 8 x 2 x N: joint, position (first) or effort (second), pose.
+    """Reads static poses from a MATLAB array of 8 x 2 x N. The indices are joint, quantity (position, effort) and pose.
 
-    The first seven rows are the joints in the dVRK's order [rad, N m], in joint coordinates. The eighth row, the
-    gripper, is not actuated and is dropped. An array of 8 x 2 is one pose, because MATLAB drops trailing dimensions of
-    1. A pose is invalid if its first seven rows contain a NaN or an infinity, or only zeros: the arrays are allocated
-    before they are filled. In messages and in `Recording.lines`, poses are counted from 1 as in MATLAB.
+    The first seven rows are the joints in the dVRK's order [rad, N m], in joint coordinates. The eighth row is the
+    gripper, which has no actuator. It is omitted. An array of 8 x 2 is one pose, because MATLAB drops trailing
+    dimensions of 1. A pose is invalid if its first seven rows contain a NaN or an infinity, or only zeros. Zeros mean
+    that the pose was not recorded, because the arrays are allocated before they are filled. In messages and in
+    `Recording.lines`, poses are counted from 1 as in MATLAB.
 
     Format: https://github.com/WPI-AIM/dvrk_gravity_comp, `GettingTorques/GetData.m`. MATLAB files up to
     version 7 are supported; version 7.3 (HDF5) is not.
@@ -194,7 +195,7 @@ def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid
     Args:
         path: Path of the `.mat` file.
         variable: Name of the array; None if only one array of the file matches.
-        skip_invalid: Whether to omit invalid poses instead of refusing the file.
+        skip_invalid: Whether to omit invalid poses. If False, a file with invalid poses is refused.
 
     Raises:
         RecordingError: The file does not have this layout, no variable or several variables match, or a pose is
@@ -263,7 +264,7 @@ def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, 
 def _matlab(path: Path, read: Callable[[], _T]) -> _T:
     try:
         with warnings.catch_warnings():
-            # "returned data may be corrupt"
+            # Raises the warning "returned data may be corrupt" as an error.
             warnings.simplefilter("error", UserWarning)
             return read()
     except Exception as error:

@@ -1,4 +1,7 @@
-"""Defines `Recording`: positions and efforts over time or poses, read from CSV or an LCM log, written to CSV."""
+"""Defines `Recording`: positions and efforts of a motion or of static poses.
+
+A recording is read from a CSV or an LCM log, and written to a CSV.
+"""
 
 from __future__ import annotations
 
@@ -27,16 +30,16 @@ from dvrk_drake.recordings.ros_bag import is_ros_bag, read_joint_states
 
 Coordinates = Literal["joint", "actuator"]
 
-#: Tolerance of the position limits [rad], [m]; a pose further outside is refused. Joint stops are compliant, so real
-#: poses may exceed the limits slightly.
+#: Tolerance of the position limits [rad], [m]. A pose that exceeds a limit by more is refused. Joint stops are
+#: compliant, so real poses may exceed the limits slightly.
 LIMIT_TOLERANCE = 0.2, 0.02
-#: Maximum number of rows of a CSV; 15 min at 1 kHz. With these, `check` needs 1.5 GB.
+#: Maximum number of rows of a CSV, i.e. 15 min at 1 kHz. For so many rows, `check` needs 1.5 GB of memory.
 MAX_COUNT = 900_000
 #: Minimum number of rows of a motion, and maximum median sampling interval of a motion [s].
 MIN_ROWS, MAX_PERIOD = 100, 0.05
 #: RMS joint velocity above which a recording is a motion [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
-#: Maximum joint differences between samples of the same pose [rad], [m].
+#: Maximum difference of each joint position between samples of the same pose [rad], [m].
 SAME_POSE = 0.01, 0.001
 
 
@@ -50,11 +53,11 @@ class Recording:
         q: Positions (m, n).
         tau: Efforts (m, n) applied by the motors, or None.
         qd: Velocities (m, n), or None.
-        t: Times (m,), or None for poses.
+        t: Times (m,), or None for static poses.
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
-        lines: Line number (m,) of each row in the source, or None. For an LCM log it is the number of the event, for a
-            MATLAB array the number of the pose.
+        lines: Line number (m,) of each row in the source, or None. For an LCM log, `lines` contains event numbers; for
+            a MATLAB array, it contains pose numbers.
         sha256: SHA-256 of the source, or "".
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
         line_label: Name of the numbers in `lines`, for messages: "line", "event" or "pose".
@@ -77,7 +80,7 @@ class Recording:
     sha256: str = ""
     notes: tuple[str, ...] = ()
     line_label: str = "line"
-    # Cache of this recording in the other coordinates, by transmission.
+    # Cache: mapping from a transmission to this recording in the other coordinates.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -102,13 +105,13 @@ class Recording:
         return len(self.q)
 
     def where(self, row: int) -> str:
-        """Returns the source and the line of a row, "poses.csv, line 2", or its row number if there are no lines."""
+        """Returns the source and the line of a row, e.g. "poses.csv, line 2", or the row number if `lines` is None."""
         source = self.source or "recording"
         return f"{source}, row {row + 1}" if self.lines is None else f"{source}, {self.line_label} {self.lines[row]}"
 
     @property
     def is_motion(self) -> bool:
-        """Returns whether the rows are samples of a motion: at least `MIN_ROWS`, at intervals below `MAX_PERIOD`.
+        """Returns whether the rows are samples of a motion: at least `MIN_ROWS` rows at intervals below `MAX_PERIOD`.
 
         Times may decrease, see `has_increasing_times`. `motion` determines whether the arm moves.
         """
@@ -117,7 +120,7 @@ class Recording:
 
     @property
     def has_increasing_times(self) -> bool:
-        """Returns whether there are times and each is later than the previous one."""
+        """Returns whether the recording has times, and each time is later than the previous one."""
         return self.t is not None and bool(np.all(np.diff(self.t) > 0))
 
     def motion(self, arm: Arm) -> str:
@@ -170,7 +173,7 @@ class Recording:
         self._check_joint_count(arm)
         if self.coordinates == coordinates:
             return self
-        # The same arm with another mounting has the same transmission.
+        # The same arm with another gravity vector has the same transmission.
         if arm.transmission not in self._converted:
             to_other = arm.transmission if coordinates == "actuator" else arm.transmission.inverse
             converted = self._converted[arm.transmission] = replace(
@@ -204,8 +207,8 @@ class Recording:
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
         revolute = np.max(shares[~arm.prismatic])
-        # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3; in degrees by up to
-        # 57.
+        # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3. Positions in degrees
+        # exceed them by a factor of up to 57.
         if outside > 0.3 and revolute > 4 and np.radians(revolute) <= 1.2:
             message += " Are the positions in degrees instead of rad, or of another arm?"
         elif arm.prismatic[joint] and shares[joint] > 4:
@@ -261,17 +264,17 @@ def read_recording(
     For the content of a log, see `read_status_log`.
 
     Args:
-        path: Path of the CSV or log.
-        arm: Arm that defines the number and the names of the joints, and whose statuses are read from a log. Without
-            an arm, a CSV must have 7 joints, and a log must have statuses of only one arm.
+        path: Path of the CSV, log or bag.
+        arm: Arm that defines the number and the names of the joints. From a log or a bag, only the measurements of this
+            arm are read. If None, a CSV must have 7 joints, and a log must have statuses of only one arm.
         coordinates: Coordinates of q, qd and tau in a CSV. Logs and bags contain joint coordinates.
-        topic: JointState topic of a bag or its namespace, see `read_joint_states`.
-        skip_invalid: Whether to omit and note rows of a CSV with an empty cell, a NaN or an infinity, instead of
-            refusing the file.
-        progress: Callback that receives the step, "reading", and the completed share 0..1 of a CSV.
+        topic: JointState topic of a bag, or its namespace; see `read_joint_states`.
+        skip_invalid: Whether to omit rows and messages that contain an empty cell, a NaN or an infinity, and to list
+            them in `notes`. If False, a file with such rows is refused.
+        progress: Callback that receives the name of the step ("reading") and the completed fraction (0 to 1).
 
     Returns:
-        Recording with SHA-256 and line numbers. Its `notes` list omitted rows and messages.
+        Recording with SHA-256 and line numbers. Its attribute `notes` contains the omitted rows and messages.
 
     Raises:
         RecordingError: The file cannot be read as a recording. The message names the file, line and column.
@@ -375,7 +378,7 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
 def _read_numbers(
     path: Path, reader: CsvReader, header: list[str], blocks: dict[str, list[int]], skip_invalid: bool
 ) -> tuple[dict[str, array], array, list[int]]:
-    """Returns the numbers of each prefix row by row, the line of each row, and the skipped lines."""
+    """Returns the numbers of each prefix row by row, the line of each row, and the lines of skipped rows."""
     skipped: list[int] = []
     values, lines = {prefix: array("d") for prefix in blocks}, array("q")
     parts = [(values[prefix], columns) for prefix, columns in blocks.items()]
@@ -413,11 +416,11 @@ def column_names(prefix: str, num_joints: int) -> list[str]:
 
 
 def write_recording(recording: Recording, path: str | Path) -> None:
-    """Writes the CSV that `read_recording` reads, atomically and with full precision.
+    """Writes a CSV for `read_recording`, atomically and with full precision.
 
     Args:
         recording: Recording in the coordinates to write. A CSV does not state the coordinates.
-        path: Path of the file; an existing one is replaced.
+        path: Path of the file; an existing file is replaced.
 
     Raises:
         DvrkDrakeError: The folder does not exist or cannot be written.

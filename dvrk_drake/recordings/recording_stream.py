@@ -23,7 +23,7 @@ _ORIGIN = ("utime", "sequence", "guard_state")
 
 
 class RecordingFile(Protocol):
-    """New file that is extended message by message."""
+    """New file to which messages are written one by one."""
 
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         """Processes a message of the status channel that arrived at `utime` [us since 1970].
@@ -45,8 +45,8 @@ def check_stream_output(path: str | Path) -> None:
     """Checks that a recording can be created at a path.
 
     Raises:
-        RecordingError: The file exists, its folder does not exist or is not writable, or it ends in neither .csv nor
-            .log.
+        RecordingError: The file exists, its folder does not exist or is not writable, or the file name ends in neither
+            .csv nor .log.
     """
     path = Path(path)
     if path.suffix not in (".csv", ".log"):
@@ -63,7 +63,7 @@ def check_stream_output(path: str | Path) -> None:
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:
-    """Creates the file at `path`: .csv for the statuses that `stream` uses, .log for every message as received.
+    """Creates the file at `path`. A .csv contains the statuses that `stream` uses, a .log every message as received.
 
     Raises:
         RecordingError: See `check_stream_output`; additionally if the file cannot be written.

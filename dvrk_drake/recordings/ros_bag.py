@@ -242,14 +242,15 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
                 raise RecordingError(f"{bag.path}: message {number} of {topic} has no positions")
         elif tuple(message.name) != names:
             raise RecordingError(
-                f"{bag.path}: message {number} of {topic} has the joints {', '.join(message.name)}, but the first one has "
-                f"{', '.join(names)}. Choose a topic with one publisher."
+                f"{bag.path}: message {number} of {topic} has the joints {', '.join(message.name)}, but the first one "
+                f"has {', '.join(names)}. Choose a topic with one publisher."
             )
         rows = [getattr(message, name) for name, _ in present]
         for (name, _), row in zip(present, rows, strict=True):
             if len(row) != len(names):
                 raise RecordingError(
-                    f"{bag.path}: message {number} of {topic} has {len(row)} numbers in `{name}`, but {len(names)} joints"
+                    f"{bag.path}: message {number} of {topic} has {len(row)} numbers in `{name}`, but {len(names)} "
+                    "joints"
                 )
         if not math.isfinite(sum(float(row.sum()) for row in rows)):
             if not skip_invalid:
@@ -278,7 +279,7 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
         raise RecordingError(f"{bag.path}: {topic} has no usable message ({reasons})")
     if late > len(stamps):
         raise RecordingError(
-            f"{bag.path}: the header stamps of {topic} stand still or go back in {late} of {late + len(stamps)} messages. "
+            f"{bag.path}: the header stamps of {topic} do not increase in {late} of {late + len(stamps)} messages. "
             "Record a bag while the console publishes measured data."
         )
     q, qd, tau = (np.frombuffer(block).reshape(len(stamps), -1) if block else None for block in blocks.values())
@@ -344,8 +345,8 @@ def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> li
     """Returns the column of each joint of the arm. Joints that are not in the arm are ignored."""
     if missing := [joint for joint in arm.joint_names if joint not in names]:
         raise RecordingError(
-            f"{path}: {topic} has the joints {', '.join(names)}; {arm.name} also needs {', '.join(missing)}. Is it a bag of "
-            "another arm?"
+            f"{path}: {topic} has the joints {', '.join(names)}; {arm.name} also needs {', '.join(missing)}. "
+            "Check --arm and --topic."
         )
     return [names.index(joint) for joint in arm.joint_names]
 

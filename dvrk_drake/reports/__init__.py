@@ -1,1 +1,1 @@
-"""Results as people read them: tables in a terminal, figures, pages."""
+"""Output of results as tables in a terminal, figures and pages."""

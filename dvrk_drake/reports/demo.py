@@ -31,7 +31,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     Args:
         console: Console to print to.
         result: Result of the demo.
-        folder: Folder that the demo wrote.
+        folder: Output folder of the demo.
         verbose: Whether to print the identified parameters and the steps for a real arm.
     """
     arm = result.arm
@@ -40,8 +40,8 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     identified, nominal = (f"{angle.max():.4f} rad ({arm.joint_names[int(np.argmax(angle))]})" for angle in angles)
     print_answer(
         console,
-        f"Released without dry friction, {arm.name} turns by at most {identified} with the identified model, and by "
-        f"{nominal} with the nominal model.",
+        f"Largest joint rotation of {arm.name} after a release without dry friction: {identified} with the identified "
+        f"model, {nominal} with the nominal model.",
         f"open {folder}/arm.html in a browser",
     )
     table = make_table(
@@ -62,8 +62,8 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     if arm.coupled_limits:
         print_note(
             console,
-            "The simulated arm has no joint stops in q2 + q3. A real arm would hit them in the step and in the release "
-            "with the nominal model.",
+            "The simulated arm has no joint stops in q2 + q3. A real arm would hit these stops in the step and in the "
+            "release with the nominal model.",
         )
 
 

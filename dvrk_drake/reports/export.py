@@ -22,7 +22,7 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 
 
 def print_export(console: Console, path: str, export: ModelExport, *, verbose: bool = False) -> None:
-    """Prints the content of an exported file, and effects of the model that the file cannot represent.
+    """Prints the content of an exported file, and the effects of the model that the file cannot represent.
 
     Args:
         console: Console to print to.
@@ -56,7 +56,7 @@ def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: Model
     answer = f"The {export.format.upper()} has the same inertias as the SDF of the arm."
     if changes:
         before, after = (sum(getattr(c, which).parameters[0] for c in changes) for which in ("before", "after"))
-        answer = f"{len(changes)} links differ from the SDF of the arm, total mass by {after - before:+.4f} kg."
+        answer = f"{len(changes)} links differ from the SDF of the arm. Their mass changes by {after - before:+.4f} kg."
     print_answer(console, answer, f"dvrk-drake export {_source(export.model, export.origin)} --diff")
     if changes:
         console.print(_mass_table(changes))
@@ -73,7 +73,7 @@ def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: Model
 def _mass_table(changes: Sequence[LinkChange]) -> Table:
     """Returns a table with the mass and the centre of mass of each changed link."""
     columns = ("mass, SDF [kg]", "mass [kg]", "centre of mass, SDF [mm]", "centre of mass [mm]")
-    table = make_table("Links in the SDF of the arm and as exported, in link frames", "", *columns)
+    table = make_table("Links in the SDF of the arm and in the exported file, in link frames", "", *columns)
     for change in changes:
         bodies = [inertia.to_spatial_inertia() for inertia in (change.before, change.after)]
         masses = [f"{body.get_mass():.4f}" for body in bodies]
@@ -125,8 +125,8 @@ def _print_compensation(
         console.print()
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
-        console.print(f"Torque limited by the motor at some poses: {', '.join(short)}.")
-    console.print('Name the file as "gravity_compensation" in the JSON file of the arm.')
+        console.print(f"Joints whose torque limit equals the effort limit of the arm: {', '.join(short)}.")
+    console.print('Enter the path of the file as "gravity_compensation" in the JSON file of the arm.')
 
 
 def _print_kinematic_compensation(
@@ -138,10 +138,10 @@ def _print_kinematic_compensation(
     print_answer(
         console,
         f"The file differs from the model by at most {file.error[j]:.1e} {units[j]} ({ARM_JOINTS[j]}), at rest.",
-        "reference the file in the JSON file of the arm",
+        "enter the path of the file in the JSON file of the arm",
     )
     table = make_table(
-        "Largest difference from the model at rest", "", "straight instrument", "added by a bent wrist", ""
+        "Largest difference from the model at rest", "", "straight instrument", "change by a bent wrist", ""
     )
     for name, error, wrist, unit in zip(ARM_JOINTS, file.error, file.wrist, units, strict=True):
         table.add_row(name, f"{error:.1e}", f"{wrist:.1e}", unit)
@@ -174,7 +174,7 @@ def print_comparison(
     print_answer(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). At {wrong:.0f} % of "
-        f"the poses, a joint is at its torque limit, runs away or opposes the model.",
+        "the poses, the torque of a joint is at a limit, far outside the range of the model, or opposite to the model.",
         _next_step(comparison.model, model_name),
         "yellow" if wrong else "green",
     )
@@ -191,10 +191,11 @@ def print_comparison(
         return
     print_note(
         console,
-        f"Sweep: range of the data from which the file was identified ({_sweep(comparison)}). At limit: share of the "
-        "poses at which the torque of the file is limited. Runaway: the torque of the file before the limit is outside "
-        "the range of the model by more than half of it. Opposed: the torques of file and model have opposite signs, "
-        "and both exceed a tenth of the largest torque of the model.",
+        f"Sweep: joint positions of the recording from which the file was computed ({_sweep(comparison)}). At "
+        "limit, runaway, opposed: shares of the poses. At limit: the torque of the file is at a torque limit. Runaway: "
+        "without the torque limits, the torque of the file is outside the torque range of the model by more than half "
+        "of the width of this range. Opposed: the torques of file and model have opposite signs, and both exceed a "
+        "tenth of the largest torque of the model.",
     )
     table = make_table(f"Torque ranges [N m] of {file_name}, {model_name}", "", "model", "file before limits", "limits")
     for joint in joints:
@@ -210,7 +211,7 @@ def print_comparison(
 def _sweep(comparison: CompensationComparison) -> str:
     if comparison.file.sweep is None:
         return "not stated in the file"
-    return f"{100 * comparison.in_sweep.mean():.0f} % of the poses"
+    return f"contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
 
 
 def _range(lower: float, upper: float) -> str:

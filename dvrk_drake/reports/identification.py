@@ -86,7 +86,7 @@ def print_validation(
         console: Console to print to.
         validation: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
-        verbose: Whether to print the rule of the verdicts, the kinds of errors, and the excluded measurements.
+        verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
     """
     verdicts, model = validation.verdicts, validation.model
     source = _source(validation.recording)
@@ -118,7 +118,8 @@ def print_recalibration(
         console: Console to print to.
         result: Result of the recalibration.
         model_path: Path of the new model, for the suggested next command.
-        verbose: Whether to print the definition of the errors, and friction that several actuators share.
+        verbose: Whether to print the definition of the errors, and the factors of friction that acts on several
+            actuators.
     """
     before, after = (float(np.mean([getattr(a, which) for a in result.actuators])) for which in ("before", "after"))
     kept = sum(a.kept for a in result.actuators)
@@ -148,8 +149,8 @@ def print_recalibration(
     console.print(table)
     print_note(
         console,
-        "The improvement is valid for similar motions. At other positions and speeds it can be much smaller. Validate "
-        "the new model on the motion that you need.",
+        "The improvement is valid for similar motions. At other positions and speeds, the improvement can be much "
+        "smaller. Validate the new model on the motion that you need.",
     )
     if not verbose:
         return
@@ -160,7 +161,7 @@ def print_recalibration(
     )
     if result.shared:
         shared = ", ".join(f"{name} x {scale:.2f}" for name, scale in result.shared.items())
-        console.print(f"Factors of friction that several actuators share: {shared}", markup=False)
+        console.print(f"Factors of friction that acts on several actuators: {shared}", markup=False)
 
 
 def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str, next_command: str) -> None:
@@ -174,7 +175,7 @@ def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str
 
 
 def _largest_error(arm: Arm, errors: np.ndarray, torques: np.ndarray, kind: str = "") -> str:
-    """Returns a sentence about the joint whose error is the largest share of its effort limit."""
+    """Returns a sentence about the joint with the largest ratio of error to effort limit."""
     j = int(np.nanargmax(np.where(torques > 0, errors / arm.effort_limits, -1.0)))
     unit, share = "N" if arm.prismatic[j] else "N m", _percent(errors[j] / arm.effort_limits[j])
     return f"Largest {kind}error: {share} of the effort limit ({arm.joint_names[j]}, {errors[j]:.3g} {unit})."
@@ -216,7 +217,8 @@ def _print_motion_details(console: Console, result: DynamicIdentification) -> No
         f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: 6 folds over the "
         "phase of the motion; effects, base tilt and parameters are estimated anew in each fold. On another recording "
         "the error can be larger, because friction changes from day to day. Repeatability: difference between periods "
-        "of the motion. The fit error can be smaller if the periods of the executed motion differ.",
+        "of the motion. The fit error can be smaller than the repeatability if the periods of the executed motion "
+        "differ.",
     )
     _print_links(console, section, result.nominal_mass)
     _print_base_parameters(console, section)
@@ -247,8 +249,8 @@ def _print_links(console: Console, section: DynamicSection, nominal_mass: float)
         console.print("* The estimate is at its bound, so the recording does not determine the value.", style="yellow")
     print_note(
         console,
-        "+-: standard error. A motion determines the base parameters, which combine parameters of several links, more "
-        "accurately than the parameters of one link.",
+        "+-: standard error. Base parameters combine parameters of several links. A motion determines the base "
+        "parameters more accurately than the parameters of one link.",
     )
 
 
@@ -340,7 +342,7 @@ def _print_pose_errors(
 
 
 def _print_pose_details(console: Console, result: StaticIdentification) -> None:
-    """Prints the excluded measurements, the parameters with standard errors, and further errors of each joint."""
+    """Prints the excluded measurements, the parameters with standard errors, and the errors of each joint."""
     print_note(
         console,
         "Cross-validation error: 10 folds over the poses. Effects, parameters and feedforward scales are estimated "
@@ -415,7 +417,8 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     console.print(table)
     print_note(
         console,
-        "Large share of bias or friction: recalibrate. Large position-dependent share: the cables changed.",
+        "If the share of bias or friction is large, recalibrate. A large position-dependent share indicates that the "
+        "cables changed.",
     )
 
 

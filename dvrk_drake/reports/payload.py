@@ -23,13 +23,14 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 def print_payload(
     console: Console, result: PayloadIdentification, *, model_path: str | None = None, verbose: bool = False
 ) -> None:
-    """Prints the mass of the payload and its link, then mass and position with confidence intervals.
+    """Prints the mass and the link of the payload, then its mass and position with confidence intervals.
 
     Args:
         console: Console to print to.
         result: Result to print.
-        model_path: Path of the model, for the suggested next command. None if it was identified from the reference.
-        verbose: Whether to print the estimate on each link, and the efforts that the payload explains.
+        model_path: Path of the model, for the suggested next command. None if the model was
+            identified from the reference recording.
+        verbose: Whether to print the estimate for each link, and the efforts that the payload explains.
     """
     payload, estimates = result.payload, result.estimates
     others = equally_good_links(estimates) if result.link is None else better_links(payload, estimates)
@@ -75,7 +76,7 @@ def _estimate_table(payload: Payload) -> Table:
 
 
 def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
-    """Prints the estimate on each link, best first."""
+    """Prints the estimate for each link, best first."""
     table = make_table("Estimates by link, best first", "", "error*", "mass [kg]", "+- [kg]", "")
     table.columns[-1].justify = "left"
     good = equally_good_links(estimates)
@@ -89,8 +90,8 @@ def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
     console.print(table)
     print_note(
         console,
-        "* cross-validated over the phase of the motion: ratio of the whitened RMS errors with and without payload, "
-        "geometric mean over the actuators",
+        "* ratio of the whitened RMS errors with and without payload, cross-validated over the phase of the motion. "
+        "Geometric mean over the actuators.",
     )
 
 
@@ -101,17 +102,17 @@ def _print_efforts(console: Console, payload: Payload) -> None:
         numbers = (f"{x:.4f}" for x in (actuator.change, actuator.payload, actuator.left))
         table.add_row(actuator.name, *numbers, explained)
     console.print(table)
-    print_note(console, "* after subtraction of the payload and of changed offsets and friction")
+    print_note(console, "* after subtraction of the efforts of the payload and of the changes of offsets and friction")
 
 
 def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
-    """Returns one line with the largest mass that remains undetected, or the link that carries a payload."""
+    """Returns a message with the upper limit of the mass, or with another link on which a payload is possible."""
     answer = f"No payload found on {payload.link}: the interval of its mass includes 0. "
     if elsewhere:
         first = elsewhere[0]
         share = f"{100 * first.relative_error:.1f} %"
         return answer + f"A payload on {first.link} explains the change (cross-validated error {share})."
     if payload.largest_at_com > MAX_MASS:
-        return answer + "This motion cannot detect a mass at the centre of mass of the link."
+        return answer + "With this motion, a payload at the centre of mass of the link cannot be detected."
     largest = f"{1e3 * payload.largest_at_com:.3g} g ({100 * CONFIDENCE:.0f} %)"
-    return answer + f"A mass at the centre of mass of the link is below {largest}."
+    return answer + f"The mass of a payload at the centre of mass of the link is below {largest}."

@@ -19,8 +19,8 @@ def print_simulation(
         console: Console to print to.
         simulation: Simulation to print.
         arm: Simulated arm.
-        scenario: Argument of the command that selects the scenario, for the suggested next command. None if figures
-            were written already.
+        scenario: Argument of the command that selects the scenario, for the suggested next command. None if the
+            command has already written figures.
         verbose: Whether to print the start and end positions, and the effort limits.
     """
     recording, desired = simulation.recording, simulation.desired

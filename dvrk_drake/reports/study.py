@@ -11,7 +11,7 @@ from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-#: Maximum number of variations in the answer, and of failed runs that are printed without `verbose`.
+#: Maximum number of variations in the first sentence, and of failed runs that are printed without `verbose`.
 _MAX_COUNT = 3
 
 
@@ -24,7 +24,8 @@ def print_study(
         console: Console to print to.
         study: Study to summarize.
         rows: Results by number of the case.
-        study_path: Path of the study, for the suggested next command. None if figures were written already.
+        study_path: Path of the study, for the suggested next command. None if the command has
+            already written figures.
         verbose: Whether to print all failed runs.
     """
     summaries = summarise(study, rows)

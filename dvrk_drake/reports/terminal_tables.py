@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 TABLE_WIDTH = 80
-#: Width of tables in a file, where names of base parameters fit on one line.
+#: Width of tables in a file [characters]. The names of base parameters fit on one line.
 WIDTH_OF_FILES = 120
 #: Pattern for a space inside a unit in brackets or before a percent sign.
 _IN_UNIT = re.compile(r" (?=[^\[]*\]|%)")
@@ -21,7 +21,7 @@ _NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 
 class TableConsole(Console):
-    """Console whose tables never cut off digits.
+    """Console that never cuts off digits in tables.
 
     In a narrow terminal, headings and names are broken into several lines. A table can be wider than the terminal.
     """
@@ -43,11 +43,11 @@ class TableConsole(Console):
             self.width = width
 
     def on_broken_pipe(self) -> None:
-        """Raises BrokenPipeError for the program to handle. The method of rich would end the process."""
+        """Raises BrokenPipeError, which the program handles. The method of rich would end the process."""
         raise BrokenPipeError
 
     def _width_of(self, table: Table, folded: bool = False) -> int:
-        """Returns the width of a table in which no number is broken, and no name unless `folded`."""
+        """Returns the width that a table needs so that no number is broken. If `folded` is False, no name is broken."""
         free = self.options.update(max_width=10 * TABLE_WIDTH)
         width = 2 * (len(table.columns) - 1)
         for column in table.columns:
@@ -65,7 +65,7 @@ def _stack(heading: str, lines: int) -> str:
 
 
 def make_console() -> Console:
-    """Returns a console on stdout. If stdout is not a terminal, its width is `TABLE_WIDTH`."""
+    """Returns a console on stdout. If stdout is not a terminal, the width of the console is `TABLE_WIDTH`."""
     console = TableConsole(highlight=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = TABLE_WIDTH
@@ -78,7 +78,8 @@ def print_answer(console: Console, answer: str, next_step: str | None, style: st
     Args:
         console: Console to print to.
         answer: Result in one or two sentences.
-        next_step: Next step, usually a command. It is not wrapped, so that it can be copied. None if there is none.
+        next_step: Next step, usually a command. The line is not wrapped, so that a user can copy the command. None if
+            there is no next step.
         style: Style of the answer.
     """
     console.print(answer, style=style, markup=False)
@@ -88,7 +89,7 @@ def print_answer(console: Console, answer: str, next_step: str | None, style: st
 
 
 def print_note(console: Console, text: str) -> None:
-    """Prints an explanation of a table below it, then an empty line."""
+    """Prints an explanation below a table, then an empty line."""
     console.print(f"{text}\n", style="dim", markup=False, width=min(console.width, TABLE_WIDTH))
 
 

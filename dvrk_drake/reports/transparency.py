@@ -15,7 +15,7 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 
 
 def print_transparency(console: Console, arm: Arm, forces: Sequence[OperatorForces], *, verbose: bool = False) -> None:
-    """Prints the compensation with the smallest interaction force, then force and torque of each compensation.
+    """Prints the compensation with the smallest interaction force, then the forces and torques with each compensation.
 
     Args:
         console: Console to print to.
@@ -46,7 +46,7 @@ def print_transparency(console: Console, arm: Arm, forces: Sequence[OperatorForc
 
 
 def write_transparency(path: Path, forces: Sequence[OperatorForces]) -> None:
-    """Writes the numbers of the table in SI units to a CSV file, atomically."""
+    """Writes the values of the table to a CSV file in SI units. The file is written atomically."""
     with atomic_write(path) as stream:
         rows = csv.writer(stream, lineterminator="\n")
         rows.writerow(["compensation", *_numbers(forces[0])])

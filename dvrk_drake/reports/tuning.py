@@ -19,12 +19,13 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = None, verbose: bool = False) -> None:
     """Prints the best gains, then the comparison of all gains.
 
-    The best gains have the fewest steps that do not settle and then the shortest settling time.
+    The best gains have the fewest steps that do not settle. For equal numbers of such steps, the best gains have the
+    smallest mean settling time.
 
     Args:
         console: Console to print to.
         tuning: Tuning to print.
-        gains_path: Path of the written gains, for the suggested next command. None if they were not written.
+        gains_path: Path of the written gains, for the suggested next command. None if the gains were not written.
         verbose: Whether to print the tuning steps, and the comparison for each joint and pose.
     """
     comparison, name = tuning.comparison, tuning.arm.source
@@ -51,7 +52,7 @@ def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = N
 
 
 def _print_summary(console: Console, comparison: Comparison) -> None:
-    """Prints one row per condition of the arm, over all joints and poses."""
+    """Prints the settled steps and the mean settling time of all joints and poses, with one row per condition."""
     title = f"{comparison.arm.name}, simulated: number of settled steps, mean settling time"
     table = make_table(title, "condition", *comparison.gains)
     for c, condition in enumerate(comparison.conditions):
@@ -82,8 +83,8 @@ def _print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, .
     console.print(table)
     print_note(
         console,
-        "dead zone: dry friction / ultimate Kp. growth: ratio of successive amplitudes. >: oscillations decay up to "
-        "this Kp, and the effort saturates above it. residual: error after the step; * during an oscillation.",
+        "dead zone: dry friction / ultimate Kp. growth: ratio of successive amplitudes. >: oscillations decay at "
+        "this Kp, and the effort saturates at larger Kp. residual: error after the step; * during an oscillation.",
     )
     _print_gains(console, f"{arm.name}, gains of the paper's procedure", arm, joints)
 
@@ -113,21 +114,21 @@ def _print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     print_note(
         console,
         "inertia: smallest (all other joints free) and largest (all other joints locked) over the joint range [kg m^2; "
-        "kg]. frequency: natural frequency of the closed loop. phase [deg] and gain: stability margins. Limited by "
-        "other joints: slower than alone, so that all joints are stable together.",
+        "kg]. frequency: natural frequency of the closed loop. phase [deg] and gain: stability margins. limited by "
+        "other joints: slower than the design of the single joint, so that all joints are stable together.",
     )
     _print_gains(console, f"{arm.name}, gains of the model-based design", arm, design.joints)
 
 
 def _print_joints(console: Console, comparison: Comparison) -> None:
-    """Prints one table per joint."""
+    """Prints one table per joint with the settling times and other measures of all gains."""
     arm, poses = comparison.arm, len(comparison.poses)
     print_note(
         console,
-        "Settling time [s] of the slowest pose, into a band of 2 % of the step, but at least one encoder count. "
+        "Settling time [s] of the slowest pose. The settling band is 2 % of the step, but at least one encoder count. "
         f"n/{poses}: not settled within {DURATION - REST_TIME:g} s at n poses. Overshoot, steady-state error and "
         "ripple "
-        "(peak-to-peak effort at rest / effort limit): largest values over all poses, arm as modelled.",
+        "(peak-to-peak effort at rest / effort limit): largest values over all poses, if the arm equals its model.",
     )
     for j, joint in enumerate(arm.joint_names):
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])

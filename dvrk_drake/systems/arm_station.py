@@ -38,7 +38,7 @@ class StationPorts:
 
 
 def station_ports(arm: Arm) -> StationPorts:
-    """Returns the ports of a station. The names are those of Drake's iiwa driver with the arm's name as a prefix.
+    """Returns the ports of a station. Their names are those of Drake's iiwa driver with the arm's name as a prefix.
 
     Each port has n numbers, or 2n for a state, in the arm's order of joints [rad, rad/s, N m; m, m/s, N].
     """
@@ -57,7 +57,7 @@ def station_ports(arm: Arm) -> StationPorts:
 def arm_plant_config(time_step: float = 1e-3) -> MultibodyPlantConfig:
     """Returns the default configuration of a station's plant, with the given time step [s].
 
-    The contact solver is SAP. Without sampled output ports, the output is the state at the start of a step.
+    The contact solver is SAP. Sampled output ports are disabled, so the plant outputs the state at the start of a step.
     """
     return MultibodyPlantConfig(
         time_step=time_step, discrete_contact_approximation="sap", use_sampled_output_ports=False
@@ -87,9 +87,10 @@ class ArmStation(Diagram):
     order [rad, rad/s, N m; m, m/s, N on a prismatic joint]. `state_estimated` has 2n numbers: q, then v.
 
     - `effort_commanded`: commanded effort, clamped to the plant's effort limits. Unconnected: zero effort.
-    - `effort_disturbance`: effort that is added after the motors without a limit, e.g. of a hand. Unconnected: zero.
-    - `effort_measured`: applied motor effort, i.e. the command after the limits.
-    - `state_true` (2n): true q, then v, without the effects on the measurement.
+    - `effort_disturbance`: additional joint effort, e.g. of a hand. The effort limits do not apply to it. Unconnected:
+      zero effort.
+    - `effort_measured`: measured motor effort. Without `effects`, it is the clamped command.
+    - `state_true` (2n): true q, then true v, i.e. without sensor effects.
     - `plant_state`, `body_poses`, `query_object`: ports of the plant.
 
     The ports `effort_disturbance`, `state_true` and those of the plant exist only in simulation. All other ports are
@@ -102,9 +103,10 @@ class ArmStation(Diagram):
     **Timing.** A discrete controller receives the state at the start of a period. Its command acts from the next period
     on, i.e. with a delay of one period as on hardware.
 
-    **Constraints.** With either `closure`, Drake's solver closes the linkage to about 1e-8 m at a time step of 1 ms and
-    enforces the position limits. The effect `stops` adds the coupled limits. The links of an arm do not collide with
-    each other. They have collision shapes only if `modify_plant` adds a shape that they can touch.
+    **Constraints.** For both values of `closure`, Drake's solver closes the linkage with an error of about 1e-8 m at a
+    time step of 1 ms. It also enforces the position limits of the joints. The effect `stops` adds the coupled limits.
+    The links of an arm do not collide with each other. The links have collision shapes only if `modify_plant` adds a
+    shape that they can touch.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -131,14 +133,15 @@ class ArmStation(Diagram):
         """Builds the station. The arm starts at zero, or at the nearest pose inside its limits.
 
         Args:
-            arm: Arm that defines the names of the ports. Controllers of this station use it as well.
+            arm: Arm that defines the names of the ports. Controllers of this station use the same arm.
             plant_config: Configuration of the plant. None: `arm_plant_config()`.
             meshcat: Meshcat in which the arm is drawn, below the path of its lower-case name. `SetTransform("mtml",
                 X_WB)` places the arm. None: the arm is not drawn.
             closure: Method that closes the loops of the linkage; see `add_arm`.
-            plant_arm: Simulated arm, which may have another mounting or SDF with the same joints. None: `arm`.
-            modify_plant: Function that is called with the plant before it is finalized, e.g. to add a payload or
-                damping. Drake can change the inertia of existing links only in a Context; see `SetLinkInertias`.
+            plant_arm: Arm to simulate. Its gravity direction or SDF may differ from that of `arm`, but its joints must
+                be the same. None: `arm`.
+            modify_plant: Function that receives the plant before `Finalize`, e.g. to add a payload or damping. Drake
+                can change the inertia of existing links only in a Context; see `SetLinkInertias`.
             effects: Simulated effects of the real arm, e.g. `arm.effects` or `arm.effects.only(["friction"])`. None: no
                 effects.
             seed: Seed of the effects' noise.
@@ -174,7 +177,8 @@ class ArmStation(Diagram):
         self._joints = PlantJoints(self._plant, self._ground_truth_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
-            # The visualizer deletes its path when it starts. An earlier SetTransform at the path above persists.
+            # At its start, the visualizer deletes its own path, but not the parent path. An earlier SetTransform of the
+            # parent path therefore remains valid.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
         if effects is None or self._plant_effects is None:
@@ -206,7 +210,7 @@ class ArmStation(Diagram):
         return self._plant
 
     def SetPositions(self, context: Context, q: ArrayLike) -> None:
-        """Sets the pose q (n,) of the independent joints, with the linkage consistent and all velocities zero.
+        """Sets the independent joints to the pose q (n,), the linkage to a consistent pose, and all velocities to zero.
 
         Args:
             context: Context of this station, not of a Diagram that contains it.
@@ -244,7 +248,7 @@ class ArmStation(Diagram):
             inertias: Spatial inertia M_LLo_L [kg, m, kg m^2] about the link's origin in the link's frame, by link name.
 
         Raises:
-            StationError: The arm does not have a link of that name.
+            StationError: The arm has no link with one of the given names.
         """
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._instance)}
@@ -254,7 +258,7 @@ class ArmStation(Diagram):
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
     def _remove_idle_collision_shapes(self) -> None:
-        """Removes the collision shapes if no two of them can collide, because they would slow down every step."""
+        """Removes the collision shapes if no two of them can collide. The shapes would slow down every step."""
         if self._scene_graph.model_inspector().GetCollisionCandidates():
             return
         plant = self.plant
@@ -292,13 +296,13 @@ class ArmStation(Diagram):
 
 
 def plant_config_fault(config: MultibodyPlantConfig) -> str:
-    """Returns the reason why a configuration is not valid for a station's plant, or ""."""
+    """Returns the reason why a configuration is not valid for a station's plant, or "" if it is valid."""
     if not 0 < config.time_step <= 0.01:
         return f"time_step must be above 0 and at most 0.01 s (the wrist is unstable above); got {config.time_step}"
     if config.discrete_contact_approximation == "tamsi":
         return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
     if config.use_sampled_output_ports:
-        # With sampled output ports, Drake steps the plant before all discrete updates. These would then use
-        # measurements from after the step.
+        # With sampled output ports, Drake steps the plant before all discrete updates. The discrete updates would then
+        # use measurements from after the step.
         return "use_sampled_output_ports must be false, so that a command acts after its measurement"
     return ""

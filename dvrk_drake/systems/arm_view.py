@@ -14,19 +14,21 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
-#: Direction from the target to the camera in the base frame. Magnification of Meshcat's view of 75 degrees.
+#: Direction from the target to the camera in the base frame. Magnification relative to Meshcat's default view angle of
+#: 75 degrees.
 DIRECTION, ZOOM = (1.1, 1.0, 0.3), 2.8
-#: Half the height of the view at distance 1. Aspect ratio (width / height) of a common browser window.
+#: Half the height of the view at distance 1 from the camera. Aspect ratio (width / height) of a common browser window.
 HALF_HEIGHT, ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2
-#: Distance from home to the poses that the view contains, as a fraction of the distance to the limits. With the whole
-#: range, the arm would be small. Factor by which the view is larger than these poses.
+#: Joint displacement from home in the poses inside the view, as a fraction of the distance to the joint limit. With the
+#: whole distance, the arm would appear small. Ratio of the size of the view to the size that these poses require.
 SHARE, MARGIN = 0.75, 1.05
 
 
 def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns positions (3,) [m] of a camera and of its target in the base frame, so that the arm fills the view.
 
-    The view contains the arm at home, and with one joint at a time moved by SHARE of the distance to each limit.
+    The view contains the arm at home. It also contains the poses in which one joint is displaced towards one of its
+    limits by the fraction `SHARE` of the distance.
 
     Raises:
         ArmError: The arm has no visual geometry.
@@ -84,7 +86,7 @@ def start_meshcat(
             and `target` define the view.
         camera: Position (3,) [m] of the camera, for a view without an arm.
         target: Position (3,) [m] of the camera's target, for a view without an arm.
-        zoom: Magnification of Meshcat's view of 75 degrees.
+        zoom: Magnification relative to Meshcat's default view angle of 75 degrees.
         port: Port in 1024..65535. None: a free port.
 
     Raises:
@@ -119,10 +121,10 @@ def start_meshcat(
 
 
 class ArmView:
-    """Draws an arm at poses of its independent joints, optionally with sliders for them.
+    """Draws an arm at poses of its independent joints, and optionally adds one slider per independent joint.
 
-    The dependent joints follow from the arm's linkage. Drake's JointSliders would move every joint of the tree
-    independently and open the parallelogram.
+    The positions of the dependent joints follow from the linkage. Drake's JointSliders would move every joint of the
+    tree independently and open the parallelogram.
     """
 
     def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
@@ -165,9 +167,10 @@ class ArmView:
             self.meshcat.AddSlider(name, lower, upper, (upper - lower) / 1000, self._q[i])
 
     def follow_sliders(self) -> NDArray[np.float64]:
-        """Draws the pose of the sliders if it changed. Returns the drawn pose (n,) [rad, m].
+        """Draws the pose of the sliders if a slider was moved. Returns the drawn pose (n,) [rad, m].
 
-        The sliders of the joints of a coupled limit stop at this limit. A button without function shows its name.
+        Sliders of joints with a coupled limit stop at this limit. While a slider is stopped, a button without a
+        function shows the name of the limit.
         """
         requested = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
         if np.array_equal(requested, self._q):
@@ -188,7 +191,8 @@ class ArmView:
     def _inside_coupled_limits(self, requested: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
         """Returns the pose inside the coupled limits, and a description of the limits that stopped the sliders.
 
-        A slider moves in steps, so the drawn pose may exceed a limit slightly. It then moves no further.
+        A slider moves in steps, so the drawn pose may exceed a limit slightly. In that case, the sliders cannot move
+        further beyond the limit.
         """
         A, lower, upper = self.arm.limit_matrix()
         n, q, stops = self.arm.num_joints, requested.copy(), []

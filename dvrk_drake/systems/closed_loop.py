@@ -1,4 +1,4 @@
-"""Connections between an arm's station, its controller and the source of its desired state."""
+"""Functions that connect the station of an arm to a controller and to a source of desired states."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_closed_loop(
         station: Station of the arm.
         controller: Controller of an arm with the same joints: a `GravityPidController`, or a System with an input port
             `state_estimated` (2n) and an output port `effort` (n).
-        desired: Source with one output port (2n): q_d, then v_d. None: the controller holds the initial pose.
+        desired: Source with one output port (2n): q_d, then v_d. None: the controller regulates the initial pose.
         friction: Compensator for a share of the arm's friction. None: no compensation.
 
     Example:
@@ -51,7 +51,7 @@ def connect_controller(
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:
-    """Adds a controller to a Diagram that contains the station, and connects both.
+    """Adds a controller to a Diagram that contains the station, and connects the controller to the station.
 
     The arguments are those of `add_closed_loop`.
     """

@@ -8,10 +8,10 @@ from dvrk_drake.errors import ControllerError
 
 
 class EffortRamp(LeafSystem):
-    """Outputs the measured effort until the ramp is enabled, then changes to the desired effort over `duration`.
+    """Outputs the measured effort until the ramp is enabled. The output then changes to the desired effort.
 
-    A command guard accepts the first efforts only near the measured ones. With the ramp, the effort on the arm has no
-    step.
+    A command guard accepts the first commanded efforts only if they are close to the measured efforts. The ramp also
+    avoids a step of the effort on the arm.
 
     .. pydrake_system::
 
@@ -26,10 +26,10 @@ class EffortRamp(LeafSystem):
     - `effort_wanted` (n): desired effort [N m; N on a prismatic joint].
     - `effort_measured` (n): measured effort.
     - `enabled` (1): 0 disables the ramp, any other value enables it.
-    - `effort` (n): start + share * (effort_wanted - start). start is the last measured effort before the ramp was
-      enabled. share increases from 0 to 1.
+    - `effort` (n): start + share * (effort_wanted - start). `start` is the last measured effort before the ramp was
+      enabled. `share` increases linearly from 0 to 1 within `duration`.
 
-    start and share are discrete state, updated every `period` or by a forced discrete update.
+    `start` and `share` are discrete states. They are updated every `period` seconds and by a forced discrete update.
     """
 
     def __init__(self, num_joints: int, *, period: float = 1e-3, duration: float = 1.0) -> None:

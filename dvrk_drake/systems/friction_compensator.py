@@ -33,19 +33,19 @@ class FrictionCompensator(LeafSystem):
     - `effort` (n): effort_wanted + friction_effort, inside the effort limits.
     - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k' over the elements k of the identified friction;
       see `dvrk_drake.dynamics.actuator_effects`. Dry friction is compensated as a hysteresis that depends on the travel
-      of the joint. The sign of the velocity is not used, because it is noise near zero.
+      of the joint. The sign of the velocity is not used, because noise determines it near zero velocity.
 
-    **Passivity.** An elasto-plastic element with coefficient c and travel d until it slips dissipates c |slip|. The
-    compensating element slips after `widening` >= 1 times this travel, so it never slips more than the arm's element.
-    Apart from its stored energy, ratio c d widening / 2, it therefore returns at most the share `ratio` of the energy
-    that the arm's friction dissipates. Viscous and smoothed Coulomb terms are at most `ratio` times those of the arm at
-    every speed. A delay shifts the phase of such a term, but the arm's own term remains larger. The remaining friction
-    prevents any cycle from gaining energy. It also holds the arm against errors of the gravity compensation; see
-    `safe_ratios`.
+    **Passivity.** An elasto-plastic friction element with coefficient c slips after a travel d, and then dissipates the
+    energy c |slip|. The compensating element slips after `widening` >= 1 times this travel, so it never slips more than
+    the arm's element. Therefore it supplies at most the share `ratio` of the energy that the arm's friction dissipates,
+    plus its stored energy of ratio c d widening / 2. The compensating viscous and smoothed Coulomb terms are at most
+    `ratio` times those of the arm at every speed. A delay shifts the phase of such a term, but the arm's own term
+    remains larger. The remaining friction prevents any cycle from gaining energy. The remaining friction also holds the
+    arm against errors of the gravity compensation; see `safe_ratios`.
 
-    **Time.** The state consists of the deflections of the elements and the last position. It is updated every `period`,
-    at initialization and by a forced update. At initialization, the elements are relaxed. While `state_estimated` is
-    not finite, `friction_effort` is zero. The elements are relaxed afterwards.
+    **Time.** The state consists of the deflections of the elements and the last positions of their coordinates. It is
+    updated every `period` seconds, at initialization and by a forced update. The initial deflections are zero. While
+    `state_estimated` is not finite, `friction_effort` is zero. Afterwards, the deflections start from zero again.
     """
 
     def __init__(
@@ -63,10 +63,11 @@ class FrictionCompensator(LeafSystem):
         Args:
             friction: Identified friction of the arm.
             ratio: Compensated share of the friction, 0..`MAX_RATIO`.
-            hysteresis_ratio: Least compensated share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves a
+            hysteresis_ratio: Minimum compensated share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves a
                 released arm back towards its earlier position; see `safe_ratios`.
-            holding_error: Error (n,) [N m, N] of the gravity compensation, which may reduce the ratio. None: no error.
-            widening: Ratio of the scales of the compensation to the identified scales, 1..10.
+            holding_error: Error (n,) [N m, N] of the gravity compensation. A large error reduces the compensated
+                shares; see `safe_ratios`. None: no error.
+            widening: Ratio of the scales of the compensating elements to the identified scales, 1..10.
             period: Period of the update [s].
 
         Raises:
@@ -76,7 +77,8 @@ class FrictionCompensator(LeafSystem):
         check_ratios(ratio, hysteresis_ratio)
         if not (1 <= widening <= 10 and 0 < period < 1):
             raise ControllerError(
-                f"widening must be 1..10 and period must be 0..1 s; got {widening:g} and {period:g} s"
+                f"widening must be 1..10 and period must be larger than 0 and smaller than 1 s; got {widening:g} and "
+                f"{period:g} s"
             )
         n = friction.arm.num_joints
         error = np.zeros(n) if holding_error is None else holding_error
@@ -91,7 +93,8 @@ class FrictionCompensator(LeafSystem):
         )
         self._state_port = self.DeclareVectorInputPort("state_estimated", 2 * n)
         self._wanted_port = self.DeclareVectorInputPort("effort_wanted", n)
-        # Deflections of the elements, last positions of their coordinates, friction effort, flag of valid positions.
+        # Deflections of the elements, last positions of their coordinates, friction effort, and 1 if the last positions
+        # are valid, else 0.
         self._memory = self.DeclareDiscreteState(2 * len(kinds) + n + 1)
         self._at = slice(2 * len(kinds), 2 * len(kinds) + n)
         ticket = self.discrete_state_ticket(self._memory)
@@ -133,7 +136,7 @@ def _advance(
     weights: NDArray[np.float64],
     memory: NDArray[np.float64],
 ) -> None:
-    """Computes one update of all elements, in place in `memory`; see FrictionCompensator."""
+    """Updates the states of all elements and their effort in the array `memory`; see FrictionCompensator."""
     k, n = rows.shape
     deflection, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
     effort[:] = 0.0

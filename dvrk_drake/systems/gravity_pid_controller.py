@@ -1,4 +1,4 @@
-"""Compiled gravity compensation and PID control of one arm: equation 11 of the paper."""
+"""Compiled gravity compensation and PID control of one arm: equation 11 of Rutfield et al. (WPI, 2015)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _MODES: tuple[Mode, ...] = get_args(Mode)
 class GravityPidController(LeafSystem):
     """Compensates gravity and, in "hold" mode, regulates the arm's pose.
 
-    The control law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), the paper's equation 11, with e = q_d - q and
-    de = v_d - v for every joint. The damping term uses no positions. G(q) is the model's static torque: gravity and
-    joint effects, scaled by each joint's feedforward scale. Gains are diagonal. In "gravity" mode tau = G(q). In
-    "damped" mode tau = G(q) - Kd v, so an error of G causes a slow motion that does not accelerate.
+    The control law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), with e = q_d - q and de = v_d - v for every joint.
+    It is equation 11 of Rutfield et al. (WPI, 2015). G(q) is the model's static torque: gravity and joint effects,
+    scaled by each joint's feedforward scale. Gains are diagonal. In "gravity" mode tau = G(q). In "damped" mode tau =
+    G(q) - Kd v, so an error of G causes a slow motion that does not accelerate.
 
     .. pydrake_system::
 
@@ -44,29 +44,31 @@ class GravityPidController(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `state_estimated` (2n): q, then v. Not connected: ControllerError at initialization.
-    - `desired_state` (2n): q_d, then v_d, read only in "hold" mode. Unconnected: "hold" mode holds the latched pose,
-      which is latched at initialization, at a change to "hold" and at the end of a fault.
+    - `desired_state` (2n): q_d, then v_d, read only in "hold" mode. Unconnected: "hold" mode regulates the pose
+      measured at initialization, at the last change to "hold", or at the end of the last fault.
     - `effort` (n): commanded effort inside the effort limits.
     - `gravity_effort` (n): G(q) alone, before the limits.
-    - `fault` (1): 1 while `state_estimated`, or a `desired_state` that is read, is not finite or above 1e6. Else 0.
+    - `fault` (1): 1 while a number in `state_estimated` is not finite or its magnitude exceeds 1e6, else 0. In "hold"
+      mode, `desired_state` is checked as well.
 
-    **Time.** Inputs are sampled and outputs change every `period` seconds and at initialization, which also resets the
-    integrator and latches the pose. With the plant of ArmStation and the same period, the command is one period late,
-    as on hardware. With sampled output ports (Drake's default), the plant steps first and there is no delay. A forced
-    discrete update executes the same step, for loops that are driven by messages. Gains and mode are numeric parameters
-    of the Context and can be changed while running.
+    **Time.** Inputs are sampled and outputs change every `period` seconds and at initialization. Initialization also
+    resets the integrator and stores the pose to regulate. If the plant of an ArmStation has the same period, the
+    command acts one period later, as on hardware. In a plant with sampled output ports (Drake's default), the plant
+    steps first, so there is no delay. A loop that is driven by messages can use a forced discrete update, which
+    executes the same step. Gains and mode are numeric parameters of the Context and can be changed while running.
 
-    **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration (Astrom and
-    Hagglund, Advanced PID Control, 2006, chapter 3). The integrator of a joint stops while the command exceeds the
-    limit and the error would increase the command further. It also stops while Kp e alone exceeds the limit. The
-    integral is stored as an effort, so a change of Ki causes no step. Ki = 0 resets the integral.
+    **Saturation.** `effort` is clamped to the effort limits. Conditional integration prevents integrator windup (Astrom
+    and Hagglund, Advanced PID Control, 2006, chapter 3). The integrator of a joint stops while the command exceeds the
+    limit and the integration would increase the excess. The integrator also stops while the magnitude of Kp e alone
+    exceeds the limit. The integral is stored as an effort, so a change of Ki causes no step of the effort. Ki = 0
+    resets the integral.
 
-    **Fault.** A running Diagram is not stopped by an exception. While an input is not finite, the command is the
-    gravity effort of the last finite pose, without PID, so the arm neither falls nor moves to another pose. Before the
-    first finite pose it is zero. Regulation resumes automatically, with the integrator at zero, when the inputs are
-    finite again.
+    **Fault.** An invalid input does not raise an exception, so the Diagram continues to run. While an input is not
+    finite, the command is the gravity effort of the last finite pose, without PID. The arm then neither falls nor moves
+    to another pose. Before the first finite pose, the command is zero. Regulation resumes automatically, with the
+    integrator at zero, when the inputs are finite again.
 
-    To compensate gravity of a plant without an identification, use the model from the arm's SDF, as in the example.
+    To compensate gravity without an identified model, use the model of the arm's SDF, as in the example.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -87,7 +89,7 @@ class GravityPidController(LeafSystem):
         mode: Mode = "hold",
         effort_limits: ArrayLike | None = None,
     ) -> None:
-        """Compiles the controller for the model's arm. The first time takes seconds, later ones are fast.
+        """Compiles the controller for the model's arm. The first compilation takes seconds, later ones are fast.
 
         Args:
             model: Model that defines G(q). Its parameters are copied.
@@ -118,7 +120,7 @@ class GravityPidController(LeafSystem):
         self._check_gains(gains)
         self._gains = [self.DeclareNumericParameter(BasicVector(k)) for k in (gains.kp, gains.kd, gains.ki)]
         self._mode = self.DeclareNumericParameter(BasicVector([self._mode_number(mode)]))
-        # The order is that of the arguments of the compiled step. NaN means that there is no pose yet.
+        # The states have the order of the arguments of the compiled step. NaN means that there is no pose yet.
         effort, gravity_effort, fault, *_ = (
             self.DeclareDiscreteState(BasicVector(np.full(size, value)))
             for size, value in [(n, 0.0), (n, 0.0), (1, 0.0), (n, 0.0), (n, np.nan), (n, np.nan)]

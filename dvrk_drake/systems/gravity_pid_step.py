@@ -16,19 +16,19 @@ HOLD, GRAVITY, DAMPED = 0, 1, 2
 
 @cache
 def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
-    """Returns one update of the controller as a compiled function without allocation.
+    """Returns a compiled function that performs one update of the controller.
 
-    The function has these arguments. Vectors have n numbers unless another size is stated.
+    The function does not allocate memory. It has these arguments. Vectors have n numbers unless another size is stated.
 
-    - `state` (2n), `desired` (2n), `has_desired`: inputs
+    - `state` (2n), `desired` (2n): input values; `has_desired`: false if there is no desired state
     - `restart`: true for the update at initialization
     - `period`: period of the update [s]
     - `mode`: index into `Mode`
     - `per_joint` (5, n): kp, kd, ki, feedforward_scale, effort limits
     - `theta`: parameters of the model
-    - `effort`, `gravity`, `fault` (1), `integral`: results, written in place
-    - `latched_q`: pose that is held without `desired`, changed in place; NaN before the first pose
-    - `last_q`: last finite pose, changed in place; NaN before the first pose
+    - `effort`, `gravity`, `fault` (1), `integral`: results, which the function writes into these arrays
+    - `latched_q`: array with the pose that is regulated if `has_desired` is false; NaN before the first pose
+    - `last_q`: array with the last finite pose; NaN before the first pose
     """
 
     def step(

@@ -61,23 +61,24 @@ class Hand(LeafSystem):
     - `spatial_force` (6): force F of the hand on the arm at the origin of G, expressed in B: torque [N m], then
       force [N].
 
-    Spring and damper are evaluated at the end of the coming step, to first order (linearly implicit Euler):
+    F is the spring and damper force at the end of the next time step, to first order (linearly implicit Euler method):
 
         (1 + h (D + h K) J M^-1 J') F = K (e - h V) - D V
 
     - h: time step of the station
-    - e: difference to the desired pose (rotation vector, then translation)
+    - e: difference from the present to the desired pose (rotation vector, then translation)
     - V: spatial velocity of the frame
     - M: mass matrix of the arm
     - K, D: stiffness and damping
 
-    A stiff hand therefore causes no oscillations of a light wrist, for any gains. As h goes to zero, F = K e - D V.
+    Therefore a stiff hand causes no numerical oscillations of a light wrist, for any stiffness and damping. As h goes
+    to zero, F = K e - D V.
 
-    If torque or force exceeds its limit, both are limited. Each of them is then computed again with the other one
-    fixed, because a wrist that slips in the hand rotates further during the step. The hand therefore adds no energy
-    beyond its own work.
+    If the torque or the force exceeds its limit, each is first reduced to at most its limit. Each is then computed
+    again with the other one fixed, because a wrist that slips in the hand rotates further during the step. This
+    prevents a numerical gain of energy.
 
-    While a state or pose is not finite, the hand exerts no force.
+    While an input is not finite, the hand exerts no force.
     """
 
     def __init__(self, arm: Arm, frame_name: str = "dh_7", grip: Grip | None = None, time_step: float = 1e-3) -> None:
@@ -91,7 +92,7 @@ class Hand(LeafSystem):
 
         Raises:
             ArmError: The frame does not exist.
-            StationError: A number of the grip or the time step is not positive.
+            StationError: A number of the grip is out of range, or the time step is not positive.
         """
         super().__init__()
         grip = grip or Grip()
@@ -156,7 +157,7 @@ def _limited(vector: NDArray[np.floating], limit: float) -> NDArray[np.floating]
 
 
 class PoseTrajectorySource(LeafSystem):
-    """Outputs the pose of a trajectory at the time of the context, or the nearest end pose outside the time span.
+    """Outputs the pose of a trajectory at the time of the context. Outside the time span, the pose is constant.
 
     .. pydrake_system::
 
@@ -164,7 +165,7 @@ class PoseTrajectorySource(LeafSystem):
         output_ports:
         - pose
 
-    - `pose` (RigidTransform): pose of the trajectory. Drake's TrajectorySource outputs only vectors.
+    - `pose` (RigidTransform): pose of the trajectory. Drake's TrajectorySource cannot output poses, only vectors.
     """
 
     def __init__(self, trajectory: PiecewisePose) -> None:
@@ -192,7 +193,7 @@ class HandPath(LeafSystem):
         - X_BG_desired
 
     - `X_BG_desired` (RigidTransform): pose for `Hand`'s port of that name. It is NaN before the start and after the end
-      of the trajectory, so the hand exerts no force.
+      of the trajectory. The hand then exerts no force.
     """
 
     def __init__(self, arm: Arm, frame_name: str, trajectory: PiecewisePolynomial) -> None:

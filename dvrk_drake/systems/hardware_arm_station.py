@@ -29,9 +29,9 @@ class HardwareArmStation(Diagram):
 
     Measured values are those of the last DVRK_STATUS message, and NaN before the first message. Efforts are sent in
     DVRK_COMMAND messages every `driver.status_period` and on forced publishing. The command guard of the arm checks
-    them. If the effort input is unconnected, the messages command HOLD.
+    these messages. If the effort input is unconnected, the messages command HOLD.
 
-    If the watchdog of the guard took over, e.g. because this process was stopped for 50 ms, an operator must resume:
+    If the watchdog of the guard holds the arm, e.g. because this process stopped for 50 ms, an operator must resume:
 
     1. Stop this process and inspect the arm.
     2. Run `dvrk-drake run --reset`, then stop it.
@@ -45,7 +45,7 @@ class HardwareArmStation(Diagram):
             arm: Arm that defines the names of ports and channels.
             driver: Configuration of the driver. None: `DvrkDriver()`.
             lcm: LCM interface whose `HandleSubscriptions` the caller calls, for loops that are driven by messages.
-                None: a new interface at `driver.lcm_url`, which a Simulator of this station handles.
+                None: the station creates an interface at `driver.lcm_url`, and the Simulator handles its messages.
 
         Raises:
             KeyFileError: The driver's key cannot be used.

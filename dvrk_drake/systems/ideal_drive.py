@@ -1,4 +1,4 @@
-"""Ideal drive of an arm without joint effects: the commanded effort is applied, and measurements are exact."""
+"""Ideal drive of an arm. It applies the commanded effort without friction, and its measurements are exact."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class PlantJoints:
         selection: Matrix (nv, n) from joint efforts to generalized forces. The transpose selects the joint positions.
         actuators: Actuators of the arm's instance, in Drake's order.
         actuation: Matrix (len(actuators), n) from joint efforts to efforts of all actuators. Actuators that do not
-            drive a joint of the arm only represent rotor inertia of the linkage. Their effort is zero.
+            drive an independent joint only represent rotor inertia. Their effort is zero.
         effort_limits: Effort limits (n,) [N m, N] of the joints' motors.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
-        """Finds the joints of the `arm` that `add_arm` added to `plant` as `instance`.
+        """Finds the joints of `arm` in `plant`. `add_arm` added the arm as the model instance `instance`.
 
         Raises:
             StationError: The plant has a floating body, or a joint has no motor.
@@ -69,10 +69,11 @@ class DrivePorts:
 def add_ideal_drive(
     builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints, instance: ModelInstanceIndex
 ) -> DrivePorts:
-    """Connects the inputs of a finalized plant and returns the ports. All added systems are C++ and have no state."""
+    """Connects the inputs of a finalized plant and returns the ports. All added systems are C++ without state."""
     n = len(joints.index)
     commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
-    # The plant also clamps but does not output the result. The effort is clamped here for the effort measurement.
+    # The plant clamps the effort as well, but does not output the clamped effort. Therefore the effort is clamped here
+    # for the port effort_measured.
     limits = joints.effort_limits
     clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
     to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=joints.actuation))
@@ -88,7 +89,7 @@ def add_ideal_drive(
 
 
 def add_true_state(builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints) -> OutputPort:
-    """Adds an output of q, then v of the independent joints (2n), and returns its port."""
+    """Adds a system that outputs the state (2n) of the independent joints, q, then v; returns the output port."""
     S = joints.selection.T
     true = builder.AddNamedSystem("state_true", MatrixGain(D=np.kron(np.eye(2), S)))
     builder.Connect(plant.get_state_output_port(), true.get_input_port())

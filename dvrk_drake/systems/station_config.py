@@ -37,8 +37,8 @@ class ArmConfig:
         closure: Method that closes the loops of the linkage: "ball" or "mimic".
         gravity: Gravity vector (3,) in the base frame [m/s^2]. None: the gravity vector of the arm.
         effects: Additional position-dependent effects in the drive of the simulated arm. Controllers do not model them.
-        stretch: Elastic cables of the simulated arm by actuator, in addition to those of `simulated_effects`.
-        simulated_effects: Names of the simulated parts of the arm's `effects`; ["all"] for all parts.
+        stretch: Additional elastic cables of the simulated arm, by name of the actuator.
+        simulated_effects: Names of the arm's `effects` that are simulated; ["all"] for all of them.
         seed: Seed of all noise.
     """
 
@@ -98,7 +98,7 @@ class StationConfig(ArmConfig):
 
     Attributes:
         plant: Configuration of the simulated plant. The default is `arm_plant_config()`.
-        simulator: Configuration for `ApplySimulatorConfig`, which the caller applies.
+        simulator: Configuration of the simulator. The caller applies it with `ApplySimulatorConfig`.
         driver: Configuration of the hardware driver. Its paths are relative to the station file.
     """
 
@@ -133,7 +133,7 @@ def load_station_config(path: str | Path) -> StationConfig:
         config.check()
     except ArmError as error:
         raise ArmError(f"{path}: {error}") from error
-    except Exception as error:  # types of Drake, YAML and the operating system
+    except Exception as error:  # exceptions of Drake, YAML and the operating system
         raise StationError(f"{path}: {' '.join(str(error).split())}") from error
     config.driver.relative_to(Path(path).parent)
     return config

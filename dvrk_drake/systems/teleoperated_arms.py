@@ -61,7 +61,7 @@ class TeleoperatedArms(Diagram):
         R_FM: RotationMatrix | None = None,
         meshcat: Meshcat | None = None,
     ) -> None:
-        """Builds the diagram. Both arms have exact models, and the master has a small joint friction.
+        """Builds the diagram. The controllers have exact gravity models. The master has viscous joint friction.
 
         Args:
             master: MTM.
@@ -115,10 +115,10 @@ class TeleoperatedArms(Diagram):
         builder.BuildInto(self)
 
     def SetPositions(self, context: Context, q_master: ArrayLike, q_follower: ArrayLike) -> None:
-        """Sets the poses of both arms, at rest. `context` is the context of this system.
+        """Sets the poses of both arms, and all velocities to zero. `context` is the context of this system.
 
         Raises:
-            StationError: A pose is not valid.
+            StationError: A pose does not have n finite numbers.
         """
         for station, q in ((self.master, q_master), (self.follower, q_follower)):
             station.SetPositions(self.GetMutableSubsystemContext(station, context), q)

@@ -1,4 +1,4 @@
-"""Teleoperation of a patient side manipulator by a master arm: scaled translation, unscaled rotation, clutch."""
+"""Teleoperation of a patient-side manipulator by a master arm: scaled translation, unscaled rotation, clutch."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from dvrk_drake.models.plant import make_arm_plant
 #: Frames of the master and of the follower. They are the frames of the dVRK's measured_cp, at the wrist centre of the
 #: MTM and at the wrist yaw axis of the PSM.
 MASTER_FRAME, FOLLOWER_FRAME = "dh_7", "dh_6"
-#: Least distance [m] of the follower's wrist centre from the remote centre of motion, where yaw and pitch are singular.
+#: Minimum distance [m] of the follower's wrist centre from the remote centre of motion. At the remote centre, yaw and
+#: pitch are singular.
 MIN_DEPTH = 0.02
 #: Largest lag of the follower [s]. The allowed position error of a joint is its velocity limit times this lag.
 MAX_LAG = 0.1
@@ -41,40 +42,43 @@ class Teleoperation(LeafSystem):
     Ports [rad, rad/s; m, m/s on a prismatic joint], joints in the arms' order:
 
     - `master_position` (n of the master), `follower_position` (n of the follower): measured joint positions.
-    - `engaged` (1): clutch state. Above 0.5 the follower follows. Pressing the dVRK's clutch pedal disengages.
+    - `engaged` (1): clutch state. Above 0.5, the clutch is closed and the follower follows. On a dVRK, pressing the
+      clutch pedal opens the clutch.
     - `jaw_angle` (1): desired opening of the jaw, e.g. the master's gripper angle. Unconnected: the jaw does not move.
     - `desired_state` (2n of the follower): commanded joint positions, then their rates, for `GravityPidController`.
     - `following` (1): 1 while the follower follows the master, else 0.
     - `fault` (1): 1 while an input is not valid or the follower is not at its commanded position, else 0.
 
     **Control law.** X_MG is the pose of the handle in the master's base. X_FT is the pose of the tip in the follower's
-    base. Both are stored when the clutch engages (index 0). R_FM is the rotation from the master's to the follower's
-    base, as seen by the operator:
+    base. Both are stored when the clutch closes; the stored poses have the index 0. R_FM is the rotation from the
+    master's to the follower's base, as seen by the operator:
 
         p_FT = p_FT0 + scale R_FM (p_MG - p_MG0),    R_FT = R_FM R_MG R_MG0' R_FM' R_FT0
 
-    Engaging the clutch therefore does not move the follower, and the difference of the two orientations stays constant.
-    (The dVRK aligns the master's wrist instead. A master in gravity compensation has no controller for this.)
+    Closing the clutch therefore does not move the follower, and the difference of the two orientations stays constant.
+    (The software of the dVRK instead moves the master's wrist to align both orientations. A master in gravity
+    compensation has no controller for this motion.)
 
-    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits. Each joint then moves
-    towards them within its velocity limit. A pose without a solution, such as at and above the remote centre of motion,
-    moves only the jaw. When the handle moves beyond a limit and returns, the tip stops at the limit and then moves
-    again with the same relation to the handle.
+    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits. Each commanded position
+    then moves towards the clamped position within the velocity limit of the joint. If a desired pose has no solution,
+    e.g. at and above the remote centre of motion, only the jaw moves. If the handle moves beyond a limit, the tip stops
+    at the limit. When the handle returns, the tip moves again as defined by the control law.
 
     **Hold.** `desired_state` is constant with zero rates in any of these cases:
 
     - The clutch is open.
-    - `master_position` or `jaw_angle` is not finite or above 1e6.
-    - The follower is farther from the command than its velocity limits allow in `MAX_LAG`. The jaw is not checked,
-      because it may press on an object.
+    - A number of an input is not finite, or its magnitude exceeds 1e6.
+    - A joint of the follower is farther from its commanded position than its velocity limit times `MAX_LAG`. The jaw is
+      not checked, because it may press on an object.
     - The instrument is inside the cannula, i.e. less than `MIN_DEPTH` beyond the remote centre.
 
-    Afterwards, the clutch engages again. If the follower was moved externally while the clutch was open, the command is
-    set to the measured position. Before the first finite follower_position, `desired_state` is NaN, which the
-    controller rejects.
+    After each of these cases, X_MG and X_FT are stored again, as when the clutch closes. If the follower was moved
+    externally while the clutch was open, the command is set to the measured position. Before the first finite
+    follower_position, `desired_state` is NaN, which the controller rejects.
 
-    The ports do not contain the age of a value, so a receiver of delayed messages must open the clutch. Inputs are
-    sampled and outputs change every `period` seconds and at initialization, which resets the state.
+    The input ports do not contain the age of a value. A program that receives the inputs as messages must therefore
+    open the clutch if messages are delayed. Inputs are sampled and outputs change every `period` seconds and at
+    initialization, which resets the state.
     """
 
     def __init__(
@@ -91,12 +95,12 @@ class Teleoperation(LeafSystem):
         Args:
             master: Arm that the operator moves.
             follower: Arm that follows.
-            scale: Ratio of the displacements of tip and handle, above 0 and at most 1; see `SetScale`.
+            scale: Ratio of the tip's displacement to the handle's displacement, above 0 and at most 1; see `SetScale`.
             R_FM: Rotation from the master's base to the follower's base. None: identity, for parallel bases.
             period: Period of the update [s].
 
         Raises:
-            ArmError: An arm is of another kind.
+            ArmError: The master has no frame "dh_7", or the follower does not have the kinematics of a PSM.
             ControllerError: Scale or period is out of range, or the follower has no velocity limits.
         """
         super().__init__()
@@ -153,7 +157,7 @@ class Teleoperation(LeafSystem):
         jaw = self._read(context, _JAW) if self.get_input_port(_JAW).HasValue(context) else q_d[6:]
         is_engaged = engaged[0] > 0.5
 
-        lags = not np.all(np.abs(q_follower - q_d) <= self._max_lag)  # also true of NaN
+        lags = not np.all(np.abs(q_follower - q_d) <= self._max_lag)  # also true for NaN
         if lags and _is_valid(q_follower) and (not is_engaged or np.isnan(q_d[0])):
             q_d[:] = q_follower
             lags = False
@@ -169,7 +173,7 @@ class Teleoperation(LeafSystem):
         state.get_mutable_value(_FAULT)[0] = float(fault)
 
     def _target(self, q_master: NDArray[np.float64], q_d: NDArray[np.float64], state: DiscreteValues) -> RigidTransform:
-        """Returns the desired X_FT. When following begins, stores the present poses, so X_FT is the present pose."""
+        """Returns the desired X_FT. When following begins, stores the present poses and returns the present pose."""
         X_MG = self._master.pose(q_master)
         poses = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
         if state.get_value(_FOLLOWING)[0] == 0.0:
@@ -209,6 +213,6 @@ def _velocity_limits(arm: Arm) -> NDArray[np.float64]:
     limits = np.array([plant.GetJointByName(name).velocity_upper_limits()[0] for name in arm.joint_names])
     if not np.all(np.isfinite(limits)):
         raise ControllerError(
-            f"{arm.name}: a joint has no velocity limit (<velocity> in the SDF). A follower needs one"
+            f"{arm.name}: a joint has no velocity limit (<velocity> in the SDF). A follower requires one for each joint"
         )
     return limits

@@ -177,7 +177,7 @@ def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys
         command = ["validate", bad, "--model", model, "--require", required]
         assert main([*command, "--json", str(report), "--overwrite"]) == 2
         output = capsys.readouterr()
-        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in refusal(output.err)
+        assert f"verdicts below {required} on {bad}: shoulder_pitch (do not use)" in refusal(output.err)
         assert output.out.startswith("Verdict: do not use (shoulder_pitch). ")
         found = json.loads(report.read_text())
         assert found["verdict"] == "do not use" and found["rule"] == rule_text(in_motion=False)
@@ -206,7 +206,7 @@ def test_identification_recording_gives_no_saved_verdicts(files, tmp_path, capsy
     assert main(["validate", good, "--model", model]) == 0
     assert "the model was identified from this recording" in capsys.readouterr().err
     assert main(["validate", good, "--model", model, "--save"]) == 2
-    assert "the model was identified from this recording; --save requires another one" in capsys.readouterr().err
+    assert "the model was identified from this recording; --save requires another recording" in capsys.readouterr().err
     assert (tmp_path / "model.yaml").read_bytes() == before
 
 

@@ -93,7 +93,7 @@ def test_error_for_a_renamed_option_has_the_new_name(command, old, capsys):
         required = REQUIRED[command]
         at = required.index(new)
         error = refused(capsys, command, *required[:at], *required[at + 2 :])
-        assert error == f"{new} is required: it is an option now; see dvrk-drake {command} --help"
+        assert error == f"{new} is required: it was a positional argument before; see dvrk-drake {command} --help"
 
 
 IMPORTS = """

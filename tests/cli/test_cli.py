@@ -163,7 +163,7 @@ def test_input_files_are_never_replaced(folder, capsys):
     assert "is an input" in fails(capsys, "predict", poses, "--model", model, "--output", poses)
     assert "is an input" in fails(capsys, "validate", poses, "--model", model, "--json", model)
     assert "not a regular file" in fails(capsys, "predict", poses, "--model", model, "--output", folder)
-    assert "needs a --format" in fails(capsys, "model", "--arm", "mtml", "--output", folder / "x.txt")
+    assert "--output requires --format" in fails(capsys, "model", "--arm", "mtml", "--output", folder / "x.txt")
     assert (poses.read_bytes(), model.read_bytes()) == before
 
 

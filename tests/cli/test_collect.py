@@ -56,7 +56,8 @@ def test_collect_stops_and_continues(simulated, tmp_path, capsys):
     assert main(command) == 2
     captured = capsys.readouterr()
     assert f"{output}: 1 of 2 poses" in captured.out
-    assert captured.err.startswith("dvrk-drake: error: MTML took over and holds") and captured.err.count("\n") == 1
+    assert captured.err.startswith("dvrk-drake: error: the guard of MTML holds the arm")
+    assert captured.err.count("\n") == 1
 
     simulated.stopped, simulated.off_at = lambda sticky: False, None
     assert main(command) == 0

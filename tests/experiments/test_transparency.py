@@ -108,7 +108,7 @@ def test_command_writes_table(tmp_path, capsys, monkeypatch):
         (["--friction-ratio", "1"], "between 0 and 0.6"),
         (["--model", "nothing.yaml"], "nothing.yaml: no such file"),
         (["--simulated-effects", "wings"], "unknown effect wings; allowed: all, friction"),
-        (["--frame", "dh_9"], 'MTML: its SDF has no frame "dh_9"; it has dh_0, dh_1'),
+        (["--frame", "dh_9"], 'MTML: the SDF has no frame "dh_9"; available frames: dh_0, dh_1'),
         (["--speed", "2"], "--speed requires --path with a recorded motion"),
         (["--path", "nowhere.csv"], "nowhere.csv"),
     ],

@@ -1,4 +1,4 @@
-"""Tests bounding boxes of link masses and their use as bounds."""
+"""Tests the bounding boxes of links and their use as bounds of the mass distribution."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ def point_mass(mass, p):
 
 
 def test_margin_of_a_point_depends_on_distance_from_centre():
-    """Checks that the margin is 1 - (d / w)^2 along each axis. It is positive for bodies inside the box."""
+    """Checks that the margin is 1 - (d / w)^2 on each axis, with the distance d from the centre and the half width w.
+
+    The margin of a body inside the box is positive.
+    """
     box = BoundingBox(np.array([-0.1, 0.0, 0.2]), np.array([0.3, 0.2, 0.3]))
     p = np.array([0.2, 0.1, 0.32])
     expected = 1 - ((p - box.center) / box.half_width) ** 2
@@ -53,9 +56,12 @@ def test_active_bounds_are_named():
     box = BoundingBox(np.full(3, -0.1), np.full(3, 0.1))
     nominal = LinkInertia("link", point_mass(1.0, np.zeros(3)))
     assert reached_bounds(nominal.parameters, nominal, box) == []
-    assert reached_bounds(5 * nominal.parameters, nominal, box) == ["mass at 5 x the SDF's"]
+    assert reached_bounds(5 * nominal.parameters, nominal, box) == ["mass is 5 x the mass in the SDF"]
     far = point_mass(0.1, np.array([0.0, 0.1, 0.0]))
-    assert reached_bounds(far, nominal, box) == ["mass at 0.1 x the SDF's", "mass fills its box along y"]
+    assert reached_bounds(far, nominal, box) == [
+        "mass is 0.1 x the mass in the SDF",
+        "mass reaches its bounding box along y",
+    ]
 
 
 def with_shapes(arm, shapes):
@@ -64,7 +70,7 @@ def with_shapes(arm, shapes):
 
 def test_links_without_bounds_are_refused():
     arm = load_arm("mtmr")
-    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*Give it a box"):
+    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*Define a box"):
         bounding_boxes(with_shapes(arm, BoundingShapes()))
     box = BoxCorners([0, 0, 0], [1, -1, 1])
     with pytest.raises(ArmError, match="lower and upper of crank_link must be three numbers each"):

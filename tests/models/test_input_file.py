@@ -117,7 +117,7 @@ def test_aliases_of_aliases_are_refused():
 
 
 def own_arm(folder, change):
-    """Writes the files of an MTM. `change` (regular expression, new text) is applied to all matches in the SDF."""
+    """Writes the files of an MTM. `change` is a pattern and the text that replaces all its matches in the SDF."""
     mechanism = (MODELS_FOLDER / "mechanisms/mtm.yaml").read_text()
     url = next(line.split()[1] for line in mechanism.splitlines() if line.startswith("sdf:"))
     (folder / "mechanism.yaml").write_text(mechanism.replace(url, "own.sdf"))

@@ -30,7 +30,7 @@ def test_signed_message_is_verified_and_decoded(message):
     assert key.verify(signed) and not key.verify(data)
     back = type(message).decode(signed)
     assert (back.utime, back.arm_name, back.mac_size) == (12345, "MTML", 16)
-    # Independent computation of the code, as in a bridge in another language.
+    # Independent computation of the authentication code, as in a bridge in another language.
     assert back.mac == hashlib.blake2b(data[:-1], key=KEY, digest_size=16).digest()
     assert back.encode() == signed
 
@@ -44,7 +44,7 @@ def test_any_other_byte_length_or_key_is_not_authentic():
         assert not key.verify(signed[:k])
     assert not key.verify(signed + b"\0") and not key.verify(b"") and not key.verify(bytes(17))
     assert not MessageKey(KEY[:-1]).verify(signed)
-    # The signature covers the type: a status cannot be sent as a command.
+    # The signature depends on the message type, so a status cannot be sent as a command.
     other = key.sign(Status().encode())
     assert not key.verify(signed[:8] + other[8:])
 
@@ -100,7 +100,7 @@ def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
         assert main(["key", "--output", str(first)]) == main(["key", "--output", str(second)]) == 0
     finally:
         os.umask(before)
-    assert f"{first}: copy it to the other side" in capsys.readouterr().out
+    assert f"{first}: copy the file to the other computer" in capsys.readouterr().out
     assert stat.S_IMODE(first.stat().st_mode) == 0o600
     content = first.read_bytes()
     assert len(content) == 32 and content != second.read_bytes()

@@ -25,7 +25,7 @@ from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_posi
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links
 from dvrk_drake.recordings.recording import read_recording
 
-#: Signs of the joint angles and torques of an arm that is mirrored in the plane x = 0.
+#: Signs that mirror the joint angles and torques of an arm in the plane x = 0.
 MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
 #: Index of the parameter my5 - mz4 of the lateral wrist brackets in the gravity compensation file.
 P6 = 5
@@ -62,7 +62,7 @@ def test_wrist_brackets_are_on_the_sides_of_real_arms(shared_data):
 
 @pytest.mark.slow
 def test_the_papers_recording_is_of_a_right_arm(shared_data):
-    """Checks that a model of another right arm predicts the recording better unchanged than mirrored."""
+    """Checks that the model of a right arm predicts the recording better than the mirrored recording."""
     model = identify_static(
         read_recording(shared_data / "mtm_static/mtmr_2017_coupled12_may10.csv"), load_arm(PAPER_ARM)
     ).model
@@ -81,7 +81,7 @@ def test_mirrored_file_of_a_right_arm_predicts_left_arms(shared_data):
     for serial in ("MTML-22723", "MTML-34863"):
         left = GravityCompensationFile.load(folder / f"gc-{serial}.json")
         q = np.random.default_rng(0).uniform(*left.sweep, (2000, 7))
-        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # range that the sweeps of both files can reach with the parallelogram
+        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # range of the parallelogram in the sweeps of both files
         tau = controller_torque(left, q)
         as_it_is = np.sqrt(np.mean((controller_torque(right, q) - tau) ** 2, axis=0))
         mirrored = np.sqrt(np.mean((MIRROR * controller_torque(right, MIRROR * q) - tau) ** 2, axis=0))
@@ -98,8 +98,8 @@ def test_compare_gc_refuses_a_file_of_another_arm(tmp_path, capsys):
     file.save(path, "MTML", "test")
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 2
     error = refusal(capsys.readouterr().err)
-    assert error.startswith(f"dvrk-drake: error: {path}: the file is of MTML") and "model is of MTMR" in error
-    # A file with a wrong name is compared. The comparison shows that the name is wrong.
+    assert error.startswith(f"dvrk-drake: error: {path}: the file belongs to MTML") and "model belongs to MTMR" in error
+    # A file with a wrong arm name is compared. A warning shows that the name is wrong.
     file.save(path, "MTMR", "test")
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 0
     (warning,) = messages(capsys.readouterr().err)
@@ -114,11 +114,11 @@ def test_arm_is_taken_from_the_file_name_if_missing(tmp_path):
     for name, arm in (("gc-MTML-12345.json", "MTML"), ("gc-mtmr.json", "MTMR"), ("gc.json", "")):
         file.save(tmp_path / name, "", "test")
         assert GravityCompensationFile.load(tmp_path / name).arm_name == arm
-    with pytest.raises(ModelError, match="the file is of MTMR"):
+    with pytest.raises(ModelError, match="the file belongs to MTMR"):
         compare_compensation(GravityCompensationFile.load(tmp_path / "gc-mtmr.json"), stock("mtml"))
 
 
-#: The last file is labelled MTMR: docs/identification.md, Left and right.
+#: The last file is labelled MTMR, but is of a left arm: docs/identification.md, Left and right.
 REAL_FILES = [("MTML-22723", "mtml"), ("MTML-34863", "mtml"), ("MTMR-32336", "mtmr"), ("MTMR-22403", "mtml")]
 
 

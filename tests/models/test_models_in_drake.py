@@ -40,7 +40,7 @@ def plain_plant(name: str) -> MultibodyPlant:
 
 
 def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the positions of the plant at pose q (n,), and the index of each tree joint of the arm."""
+    """Returns the positions of the plant at pose q (n,), and the index of each tree joint in these positions."""
     index = np.array([plant.GetJointByName(joint).position_start() for joint in arm.tree_joint_names])
     q_plant = np.zeros(plant.num_positions())
     q_plant[index] = arm.linkage.position(q)

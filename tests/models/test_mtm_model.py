@@ -147,9 +147,9 @@ def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
 
 
 def test_pinned_loop_has_the_same_holding_torque(arm, plant):
-    """Computes the statics of the variant with a pin from the null space of its numerical constraint Jacobian."""
+    """Computes the holding torque of closure "ball" from the null space of the numerical constraint Jacobian."""
     loop_plant = make_arm_plant(arm, closure="ball")
-    assert loop_plant.num_constraints() == plant.num_constraints()  # two mimics are replaced by a pin and a distance
+    assert loop_plant.num_constraints() == plant.num_constraints()  # a ball and a distance instead of two mimics
     (loop,) = arm.loop_closures
     A, B = (loop_plant.GetFrameByName(name) for name in (loop.frame_a, loop.frame_b))
     context, loop_context = plant.CreateDefaultContext(), loop_plant.CreateDefaultContext()

@@ -1,4 +1,4 @@
-"""Tests that every number of every file and setting has a range, and that NaN, infinity and outliers are refused."""
+"""Tests that each number of each file and setting has a range. NaN, infinity and too large numbers are refused."""
 
 import dataclasses
 import math
@@ -50,7 +50,7 @@ OBJECTS = (Arm, GravityCompensationFile, CollectionSettings, Grip)
 
 
 def numbers_of(schema: type, path: tuple = ()):
-    """Yields (path, field, type) of each field with numbers. A path has names, 0 for a list and "x" for a mapping."""
+    """Yields (path, field, type) of each field with numbers. In a path, 0 is a list element and "x" a mapping entry."""
     hints = get_type_hints(schema)
     for field in dataclasses.fields(schema):
         yield from numbers_in(hints[field.name], (*path, field.name), field)
@@ -138,7 +138,7 @@ def test_an_arm_with_a_number_outside_its_range_is_refused(name, value):
 
 
 def changed(owner, path, value):
-    """Returns `owner` with `value` at `path`."""
+    """Returns a copy of `owner` with `value` at `path`."""
     if not path:
         return np.full_like(owner, value) if isinstance(owner, np.ndarray) else value
     first, *rest = path
@@ -186,7 +186,7 @@ def test_gains_are_compared_with_the_effort_limit_and_the_range():
 
 @pytest.fixture
 def own_psm(tmp_path):
-    """Writes modified files of a PSM; returns the path of the arm file."""
+    """Returns a function that writes modified files of a PSM and returns the path of the arm file."""
 
     def write(changes=(), sdf=()):
         for kind, name in (("arm", "psm"), ("mechanism", "psm"), ("instrument", "large_needle_driver")):
@@ -380,7 +380,7 @@ def test_invalid_numbers_of_an_arm_made_in_python_are_refused():
         ({"effects": ArmEffects(stretch={"outer_yaw": Cable()})}, r"effects\.stretch\.outer_yaw\.stiffness is 0; all"),
         ({"effects": ArmEffects(friction=[FrictionEffect(coefficient=math.nan)])}, r"coefficient is nan; allowed: "),
         ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing: all coefficients are 0"),
-        ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be a vector of three numbers with a length up to 30"),
+        ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be a vector of three numbers with a norm up to 30"),
     ):
         with pytest.raises(ArmError, match=message):
             dataclasses.replace(arm, **changes)

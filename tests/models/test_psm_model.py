@@ -37,7 +37,7 @@ def plant(arm):
 
 @pytest.fixture(scope="module")
 def box(arm):
-    """Returns random poses and the corners of the limits of the first three joints."""
+    """Returns random poses. In the first eight, the first three joints are at the corners of their limits."""
     poses = np.random.default_rng(0).uniform(arm.position_lower, arm.position_upper, (200, 7))
     corners = np.array(np.meshgrid(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True))).reshape(3, -1).T
     poses[: len(corners), :3] = corners

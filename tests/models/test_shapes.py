@@ -25,7 +25,7 @@ MESHES = sorted((SDF / "meshes").glob("*/*.gltf"))
 
 
 def vertices(mesh):
-    """Returns the vertices (n, 3) [m] of a mesh in the link frame, Z up."""
+    """Returns the vertices (n, 3) [m] of a mesh in the link frame with Z up."""
     document = json.loads(mesh.read_text())
     data = b64decode(document["buffers"][0]["uri"].partition(",")[2])
     parts = []
@@ -81,7 +81,7 @@ def test_both_links_of_a_pin_are_drawn_around_it(plant, psm_vertices):
     pins = []
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
-        if isinstance(joint, RevoluteJoint) and joint.name() not in ("yaw", "roll"):  # shafts, see below
+        if isinstance(joint, RevoluteJoint) and joint.name() not in ("yaw", "roll"):  # the next test checks shafts
             pins.append((joint.frame_on_parent(), joint.frame_on_child(), joint.revolute_axis()))
     for loop in load_arm("psm").loop_closures:
         pins.append((plant.GetFrameByName(loop.frame_a), plant.GetFrameByName(loop.frame_b), np.array([1.0, 0, 0])))
@@ -121,7 +121,7 @@ def test_links_on_shafts_and_slides_touch_at_both_ends(plant, psm_vertices, pare
 def test_shaft_and_cannula_pass_through_the_remote_centre(plant, psm_vertices):
     arm, context = load_arm("psm"), plant.CreateDefaultContext()
     poses = np.random.default_rng(1).uniform(arm.position_lower, arm.position_upper, (50, 7))
-    poses[:, 2] = np.maximum(poses[:, 2], 0.02)  # above, the wrist is inside the cannula
+    poses[:, 2] = np.maximum(poses[:, 2], 0.02)  # otherwise the wrist is inside the cannula
     for q in poses:
         set_arm_positions(plant, context, arm, q)
         for link in ("roll_link", "end_link"):
@@ -135,8 +135,8 @@ def test_shaft_and_cannula_pass_through_the_remote_centre(plant, psm_vertices):
     assert np.linalg.norm(shaft[:, :2], axis=1).max() == pytest.approx(0.0042, abs=2e-4)
 
 
-#: Links that touch although no joint of the tree connects them: the top bar's pin in the end link, the instrument in
-#: the cannula and the fingers' hubs, which share a pin with both wrist links.
+#: Pairs of links that touch although no joint of the tree connects them. The pin of the top bar is in the end link, and
+#: the instrument is in the cannula. The hubs of the fingers share a pin with both wrist links.
 NEIGHBOURS = (
     {"top_bar_link", "end_link"},
     {"end_link", "roll_link"},
@@ -180,7 +180,7 @@ def limits(arm):
 
 
 def box_corners(arm):
-    """Returns the corners of the limits of yaw, pitch and insertion."""
+    """Returns the poses (8, 7) at the corners of the limits of yaw, pitch and insertion. The other positions are 0."""
     corners = np.zeros((8, 7))
     corners[:, :3] = list(product(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True)))
     return corners

@@ -1,4 +1,4 @@
-"""Tests YAML files. Errors name the key, its value and the accepted values at any depth."""
+"""Tests YAML files. At any nesting depth, errors name the key, its value and the accepted values."""
 
 from dataclasses import dataclass, field
 

@@ -79,7 +79,7 @@ def test_ends_when_arm_takes_over(tmp_path):
     sticky.off = True
     run_collector(collector, controller, sticky, 0.1)
     collector.close()
-    assert collector.finished and "MTML took over and holds: its " in str(collector.problem)
+    assert collector.finished and "the guard of MTML holds the arm: its " in str(collector.problem)
     assert len(read_recording(tmp_path / "o.csv")) == 1
 
 
@@ -227,7 +227,7 @@ def test_pause_of_this_computer_is_reported(tmp_path):
         made[2].step()
     problem = problem_after(made, 0.0)
     assert made[2].guard.counts.expired == 1
-    assert "too slow" in problem and "longest interval 81 ms" in problem and "answers per second" in problem
+    assert "too slow" in problem and "longest interval 81 ms" in problem and "commands per second" in problem
     assert "refusal" not in problem
 
 

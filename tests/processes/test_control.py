@@ -110,18 +110,18 @@ def test_stopped_controller_ends_and_operator_resumes(controller, seconds):
         control(link, controller, lambda: link.now() > end, lambda status: None)
         return
     reason = (
-        rf"MTML took over and holds: the last command expired: .* ms old by the arm's clock.*; .*too slow.*\. {LOOK}"
+        rf"guard of MTML holds the arm: the last command expired: .* ms old by the arm's clock.*; .*too slow.*\. {LOOK}"
     )
     with pytest.raises(ControllerError, match=reason):
         control(link, controller, lambda: link.now() > end, lambda status: None)
     assert link.guard.state == Status.STATE_HOLD and link.now() < end
     sent = len(link.commands)
-    with pytest.raises(ControllerError, match=rf"MTML took over and holds: the last command expired: .*\. {LOOK}"):
+    with pytest.raises(ControllerError, match=rf"MTML holds the arm: the last command expired: .*\. {LOOK}"):
         first_status(link)
     assert len(link.commands) == sent
     reset_fault(link, output.append)
     (line,) = output
-    assert line.startswith("MTML took over and waits for an operator, who resumes now: the last command expired: ")
+    assert line.startswith("the guard of MTML held the arm, and the operator resumes now: the last command expired: ")
     first_status(link)
     assert link.guard.hold_reason == ""
 
@@ -142,7 +142,7 @@ def test_takeover_during_release_is_an_error(controller):
     link = GuardedArm()
     end = link.now() + 0.5
     link.before_step = lambda: link.now() > end and link.guard._take_over("its period is 20 ms")
-    with pytest.raises(ControllerError, match=rf"MTML took over and holds: its period is 20 ms\. {LOOK}"):
+    with pytest.raises(ControllerError, match=rf"the guard of MTML holds the arm: its period is 20 ms\. {LOOK}"):
         control(link, controller, lambda: link.now() > end, lambda status: None)
 
 
@@ -212,7 +212,8 @@ def test_live_status_describes_new_refusals():
     maker = LiveStatusMaker(7, first)
     live = maker.make(status, 0.2, 0)
     assert live.problem == (
-        "refused: start too far from the present efforts or pose, the last command expired and the arm took over"
+        "refused: start too far from the present efforts or pose, "
+        "the guard holds the arm because the last command expired"
     )
     assert str(live).endswith(live.problem)
     assert not maker.make(status, 0.4, 0).problem
@@ -361,7 +362,7 @@ def test_key_verifies_statuses_and_signs_commands():
     for message in (status_bytes(100), MessageKey(bytes([1] * 32)).sign(status_bytes(100)), *corrupted):
         assert linked.link._filter.accept(message, 0.0) is None
     assert linked.receive(status_bytes(101)) is None
-    assert linked.output.endswith("both sides need the same key (--key)")
+    assert linked.output.endswith("the arm and this process need the same key (--key)")
     assert linked.receive(signed).sequence == 100
     linked.link._lcm.subscribe("DVRK_COMMAND_MTML", lambda channel, data: sent.append(data))
     linked.link.send(Command())

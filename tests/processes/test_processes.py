@@ -181,7 +181,7 @@ def test_rejects_model_of_another_arm(tmp_path, capfd):
     path = tmp_path / "model.yaml"
     IdentifiedModel.from_arm(load_arm("mtmr")).save(path)
     assert main(["run", "--arm", "mtml", "--model", str(path)]) == 2
-    assert "model.yaml: the model is of MTMR, not of MTML" in capfd.readouterr().err
+    assert "model.yaml: the model is for MTMR, not for MTML" in capfd.readouterr().err
 
 
 def test_takeover_reason():

@@ -79,7 +79,7 @@ def test_other_existing_output_is_refused_and_unchanged(tmp_path):
 
 
 def test_written_rows_survive_kill(tmp_path):
-    """Kills a process that appends rows: rows are complete, in order and without gaps."""
+    """Kills a process that appends rows. The written rows are complete, in order and without gaps."""
     code = (
         "import sys\nfrom dvrk_drake.recordings.csv_rows import GrowingFile\n"
         "file, k = GrowingFile(sys.argv[1], sync=True), 0\n"

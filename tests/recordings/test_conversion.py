@@ -52,7 +52,7 @@ def test_detect_format(tmp_path):
     binary = tmp_path / "model.pkl"
     binary.write_bytes(b"\x80\x04\x95\0\0\0")
     assert_refused(
-        r"model\.pkl: unknown format; allowed: LCM log, MATLAB file .*, UTF-8 text file", detect_format, binary
+        r"model\.pkl: unknown format; allowed: ROS bag, LCM log, MATLAB file .*, UTF-8 text file", detect_format, binary
     )
     assert_refused("nowhere: no such file", detect_format, tmp_path / "nowhere")
     assert_refused("is not a file", detect_format, tmp_path)
@@ -115,7 +115,7 @@ TIMED = "t,q1,q2,q3,q4,q5,q6,q7,qd1,qd2,qd3,qd4,qd5,qd6,qd7,tau1,tau2,tau3,tau4,
 
 
 def write_timed(folder, times, header=TIMED):
-    """Writes a CSV with a header and one row per element of `times`. Returns its path and the other numbers."""
+    """Writes a CSV with a header and one row per element of `times`. Returns the path and the other columns."""
     rows = wpi_rows(len(times))
     lines = [",".join([str(t), *(repr(float(x)) for x in row)]) for t, row in zip(times, rows, strict=True)]
     return write_text(folder, "\n".join([header, *lines]) + "\n"), rows
@@ -123,7 +123,7 @@ def write_timed(folder, times, header=TIMED):
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
 def test_csv_keeps_time_stamps_columns_and_coordinates(tmp_path, coordinates):
-    """Checks one minute at 100 Hz."""
+    """Uses a recording of one minute at 100 Hz."""
     path, rows = write_timed(tmp_path, [0.01 * k for k in range(5999)])
     recording = convert(path, tmp_path / "out.csv", coordinates=coordinates)
     assert recording.coordinates == coordinates
@@ -177,7 +177,7 @@ def test_rate_is_refused_if_the_file_has_time_stamps(tmp_path):
 
 
 def test_converted_csv_is_read_as_wpi_csv_with_times(tmp_path):
-    """Reads a file converted without --arm. Only this format defines the recorded coordinate of the roll of a PSM."""
+    """Reads a CSV converted without --arm. Only the format wpi-csv defines the coordinates of the roll of a PSM."""
     path, rows = write_timed(tmp_path, [0, 0.011, 0.019])
     recording = convert(path, tmp_path / "out.csv", format="wpi-csv")
     assert recording.coordinates == "actuator"

@@ -56,7 +56,7 @@ def test_lcm_reads_logs_of_this_package(tmp_path):
     assert [e.data for e in events] == [s.encode() for s in statuses()]
 
 
-# Damage.
+# Damaged logs.
 
 
 def test_truncated_log_is_read_up_to_its_end(tmp_path):
@@ -251,7 +251,7 @@ def test_convert_refuses_options_of_other_formats(tmp_path):
         convert(tmp_path / "b.csv", tmp_path / "a.csv", format="lcm-log")
 
 
-# Growing files.
+# Files that are written during a recording.
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".log"])

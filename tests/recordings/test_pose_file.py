@@ -74,7 +74,7 @@ def test_random_poses_are_appended_and_depend_on_the_seed(tmp_path):
     assert main([*command, "4", "--seed", "4"]) == 0
     both = load_poses(path, arm)
     np.testing.assert_array_equal(both[:5], first)
-    np.testing.assert_array_equal(both[5:], random_poses(arm, 4, seed=[4, 5]))  # different from those of an empty file
+    np.testing.assert_array_equal(both[5:], random_poses(arm, 4, seed=[4, 5]))  # another seed than for an empty file
     assert main([*command, "0"]) == 2
     np.testing.assert_array_equal(load_poses(path, arm), both)
     assert main([*command, "4", "--seed", "4"]) == 0

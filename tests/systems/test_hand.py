@@ -143,7 +143,7 @@ def test_hand_moves_handle_to_pose_with_any_stiffness(firmer):
 
 
 def test_invalid_arguments_are_refused():
-    with pytest.raises(ArmError, match='MTML: its SDF has no frame "thumb"; it has dh_0'):
+    with pytest.raises(ArmError, match='MTML: the SDF has no frame "thumb"; available frames: dh_0'):
         Hand(ARM, "thumb")
     with pytest.raises(StationError, match=r"grip of the hand: stiffness is nan; allowed: 1e-06\.\."):
         Hand(ARM, grip=Grip(stiffness=np.nan))

@@ -90,7 +90,7 @@ def test_scenario_has_the_same_arm_fields():
         (
             "[0, 9.81, 0]",
             "[0, 981, 0]",
-            r"station\.yaml: gravity \(0, 981, 0\) must be a vector of three numbers with a length up to 30 m/s",
+            r"station\.yaml: gravity \(0, 981, 0\) must be a vector of three numbers with a norm up to 30 m/s",
         ),
         ("seed: 3", "seed: -1", r"seed is -1; allowed: 0\.\."),
         ("[friction]", "[fraction]", "simulated arm: .*fraction"),

@@ -201,7 +201,7 @@ def test_other_invalid_arguments_are_refused():
         Teleoperation(MTM, PSM, period=0.0)
     with pytest.raises(ArmError, match="MTML does not have the kinematics of a PSM"):
         Teleoperation(MTM, MTM)
-    with pytest.raises(ArmError, match='PSM: its SDF has no frame "dh_7"; it has dh_0'):
+    with pytest.raises(ArmError, match='PSM: the SDF has no frame "dh_7"; available frames: dh_0'):
         Teleoperation(PSM, PSM)
     system = Teleoperation(MTM, PSM)
     with pytest.raises(ControllerError, match="input port master_position is not connected"):

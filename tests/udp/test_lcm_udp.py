@@ -234,7 +234,7 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
         for ended in runs:
             lines = [line for line in ended.output().splitlines() if line.startswith("dvrk-drake: error")]
             (line,) = lines
-            assert line.startswith("dvrk-drake: error: MTML took over and holds: ")
+            assert line.startswith("dvrk-drake: error: the guard of MTML holds the arm: ")
             assert line.endswith("Look at the arm, then start again with --reset")
         assert all(map(waits_for_an_operator, observer.received[held:]))
         runs.append(start_run("mtml", *url, "--reset"))
@@ -243,7 +243,7 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
     finally:
         for process in (*runs, arm):
             print(process.end(signal.SIGINT))
-    assert "MTML took over and waits for an operator, who resumes now: " in runs[-1].output()
+    assert "the guard of MTML held the arm, and the operator resumes now: " in runs[-1].output()
 
 
 @inside

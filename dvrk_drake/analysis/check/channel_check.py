@@ -17,54 +17,57 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
 #: Smallest gain in log-likelihood at which a hypothesis is accepted. On the unmodified public motions, no exchange of
-#: channels has a positive gain. On damaged motions, the correct hypothesis gains at least 25, in most cases hundreds.
+#: channels has a positive gain. On public motions with one added error, the correct hypothesis has a gain of at least
+#: 25, and in most cases of more than 100.
 MIN_GAIN = 20.0
-#: Smallest gain at which inverted channels are accepted. An arm is almost symmetric under reflection, so inverted
-#: channels gain up to 46 on the unmodified public motions.
+#: Smallest gain at which inverted channels are accepted. An arm is almost symmetric under reflection. Inverted channels
+#: therefore have gains of up to 46 on the unmodified public motions.
 MIN_MIRROR_GAIN = 100.0
-#: Smallest gains for poses at rest, where friction disturbs the efforts: for exchanged channels, and for inverted or
-#: scaled efforts. On the unmodified public poses, exchanges gain up to 10, inversions 31 and scales 19.
+#: Smallest gains for poses at rest. The first number is for exchanged channels, the second number is for inverted or
+#: scaled efforts. Friction disturbs the efforts at rest. On the unmodified public poses, the largest gains are 10 for
+#: exchanges, 31 for inversions and 19 for scales.
 MIN_GAIN_AT_REST, MIN_EFFORT_GAIN_AT_REST = 30.0, 40.0
 #: Hypotheses with a gain within this distance of the largest gain are reported as alternatives.
 SIMILAR_GAIN = 10.0
-#: Multiples of the recorded effort that are tested.
+#: Factors by which the recorded effort is multiplied for a test of the scale.
 SCALES = (0.5, 2.0)
 #: Largest ratio between the dissipated friction power and the friction power expected from the arm file. The public
 #: recordings of one PSM on two days have ratios between 0.96 and 1.54.
 FRICTION_FACTOR = 1.7
-#: Smallest reported position offset [rad], [m], and its smallest ratio to its standard error.
+#: Smallest reported position offset [rad], [m], and smallest ratio of a reported offset to its standard error.
 MIN_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
 #: The offset of a joint is checked only if an offset of this size would be significant [rad], [m].
 MAX_UNDETECTED_OFFSET = 0.1, 0.01
 #: Largest duration of a segment [s]. Longer motions are divided into equal segments, which bounds the memory of a fit.
 MAX_SEGMENT_DURATION = 120.0
-#: Distance by which exchanged or inverted channels may exceed the joint limits further than recorded [rad], [m].
+#: Largest increase of the excess beyond a joint limit due to exchanged or inverted channels [rad], [m]. With a larger
+#: increase, the hypothesis is impossible.
 LIMIT_MARGIN = 0.02, 0.002
 
 
 def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
-    """Refits a recording under hypotheses about its channels and reports those that fit clearly better.
+    """Tests hypotheses about the channels of a recording and reports those that fit the recording clearly better.
 
     The hypotheses are:
 
     - The efforts of two channels are exchanged.
     - All signals of two channels are exchanged.
-    - The effort of a channel, or all its signals, are inverted.
+    - The effort of a channel is inverted, or all signals of a channel are inverted.
     - The effort of an actuator is a multiple of the true effort.
     - The position of a channel has an offset.
 
     Each hypothesis is tested by a maximum-a-posteriori fit (`ChannelFit`), and the fits are compared by their
     log-likelihood. In a motion, a wrong scale is detected from the dissipated friction power. Offsets and inverted
-    positions are not detected in poses at rest. A long motion is fitted in segments, and their log-likelihoods are
-    added. A warning is reported if it occurs in at least half of the segments.
+    positions are not detected in poses at rest. A long motion is fitted in segments, and the log-likelihoods of all
+    segments are added. A warning is reported if it occurs in at least half of the segments.
 
     Args:
         recording: Motion or poses at rest, with efforts, in joint or actuator coordinates.
         arm: Arm that was recorded.
 
     Returns:
-        One refusal for exchanged or inverted channels. Without a refusal: warnings for scales and offsets, and a note
-        with the joints whose position offset is not identifiable from the recording.
+        One refusal for exchanged or inverted channels. Otherwise, warnings for scales and offsets, and notes with the
+        joints whose effort scale or position offset is not identifiable from the recording.
 
     Raises:
         RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too coarsely.
@@ -102,7 +105,7 @@ def _segments(recording: Recording) -> list[Recording]:
 
 
 def _hypotheses(fit: ChannelFit) -> list[Finding]:
-    """Returns the hypotheses of exchanged and inverted channels, each with its gain in log-likelihood as its size."""
+    """Returns the hypotheses of exchanged and inverted channels. The size of each is its gain in log-likelihood."""
     findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
     return [*findings, *_full_inversions(fit)] if fit.moves else findings
 
@@ -173,7 +176,7 @@ def _effort_exchanges(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields the exchanges of all signals of two channels. The gain is -inf if one violates the joint limits."""
+    """Yields the exchanges of all signals of two channels. The gain is -inf for positions beyond the joint limits."""
     recording, arm = fit.recording, fit.arm
     allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i, j in combinations(map(int, fit.used), 2):
@@ -191,7 +194,7 @@ def _exchanged(n: int, i: int, j: int) -> NDArray[np.int_]:
 
 
 def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
-    """Returns the largest excess (l,) beyond each joint limit and coupled limit [rad, m], 0 within the limit."""
+    """Returns the largest excess (l,) beyond each joint limit and coupled limit [rad, m], 0 if no row exceeds it."""
     A, lower, upper = arm.limit_matrix()
     values = recording.in_joint_coordinates(arm).q @ A.T
     return np.asarray(np.max(np.maximum(np.maximum(lower - values, values - upper), 0.0), axis=0))
@@ -199,7 +202,7 @@ def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
 
 def _exchange(arm: Arm, channels: tuple[int, ...], which: str, gain: float) -> Finding:
     names = " and ".join(arm.joint_names[k] for k in channels)
-    what = f"{which} are exchanged. The arm model fits the recording much better without the exchange"
+    what = f"{which} are exchanged. The arm model fits the recording much better if they are swapped"
     advice = "Correct the columns of the file and check it again."
     return Finding("refusal", "exchanged channels", names, what, advice, channels, gain)
 
@@ -215,7 +218,7 @@ def _inversions(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields the inversions of all signals of a channel. The gain is -inf if one violates the joint limits."""
+    """Yields the inversions of all signals of a channel. The gain is -inf for positions beyond the joint limits."""
     recording, arm = fit.recording, fit.arm
     allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i in map(int, fit.used):
@@ -231,7 +234,7 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
 def _gain_of(other: Recording, fit: ChannelFit) -> float:
     """Returns the gain in log-likelihood of a recording with exchanged, inverted or shifted channels.
 
-    In actuator coordinates, the times of `fit` are reused.
+    If the recording is in actuator coordinates, the times of `fit` are used again.
     """
     clock = fit.clock if fit.recording.coordinates == "actuator" else None
     return ChannelFit(other, fit.arm, clock).log_likelihood - fit.log_likelihood
@@ -271,7 +274,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields a wrong scale for the effort of each actuator at rest, with its gain in log-likelihood as its size."""
+    """Yields a wrong effort scale for each actuator at rest. The size of each is its gain in log-likelihood."""
     for i in map(int, fit.used):
         scale, gain = _best_scale(fit, i)
         what = f"tau{i + 1} is about {1 / scale:g} times the effort expected from gravity"
@@ -280,7 +283,7 @@ def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _best_scale(fit: ChannelFit, channel: int) -> tuple[float, float]:
-    """Returns the scale from `SCALES` with the largest gain for an effort, and that gain."""
+    """Returns the scale from `SCALES` with the largest gain in log-likelihood for an effort, and this gain."""
     gains = {
         s: fit.gain(fit.in_actuators(np.diag(np.where(np.arange(fit.arm.num_joints) == channel, s, 1.0))))
         for s in SCALES
@@ -300,10 +303,10 @@ def _uncertain_scale(arm: Arm, joints: list[int]) -> Iterator[Finding]:
 
 
 def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
-    """Returns the allowed ratio (n,) of the dissipated friction power to the expected one for each actuator.
+    """Returns the largest accepted ratio (n,) of dissipated to expected friction power for each actuator.
 
-    In joint coordinates, the ratio includes the gear ratio of an actuator that moves one joint. Reason: the friction of
-    the PSM's roll was identified from a recording that may contain the roll of the disc or of the joint.
+    In joint coordinates, the result includes the gear ratio of an actuator that moves only one joint. Reason: the roll
+    position in the recording that identified the PSM's friction may be that of the instrument disc or of the joint.
     """
     if fit.recording.coordinates == "actuator":
         return np.full(fit.arm.num_joints, FRICTION_FACTOR)
@@ -313,9 +316,9 @@ def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
 
 
 def _offsets(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields the most likely position offset, and a note with the joints whose offset is not identifiable.
+    """Yields a warning of the most likely position offset, and a note with the joints whose offset is not identifiable.
 
-    Offsets of joints with parallel axes have similar effects, so the warning also lists less likely joints.
+    Offsets of joints with parallel axes have similar effects, so the warning also lists the other possible joints.
     """
     arm, undetectable, found = fit.arm, [], {}
     min_offset, max_undetected = arm.per_joint(*MIN_OFFSET), arm.per_joint(*MAX_UNDETECTED_OFFSET)
@@ -343,7 +346,9 @@ def _undetectable(arm: Arm, joints: list[int]) -> Iterator[Finding]:
     if joints:
         angle, length = MAX_UNDETECTED_OFFSET
         what = f"position offsets of {angle} rad ({length} m) cannot be detected in this recording"
-        advice = "They have the same effect as other centres of mass of the links. Check the encoder offsets."
+        advice = (
+            "Such offsets have the same effect as different centres of mass of the links. Check the encoder offsets."
+        )
         names = ", ".join(arm.joint_names[i] for i in joints)
         yield Finding("note", "undetectable offset", names, what, advice, tuple(joints))
 

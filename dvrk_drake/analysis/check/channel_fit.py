@@ -22,7 +22,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of their size.
+#: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of the size of each
+#: parameter or coefficient.
 LINK_DEVIATION, EFFECT_DEVIATION = 0.3, 0.5
 #: Prior standard deviation of additional effects, as a share of the RMS effort: for viscous and Coulomb friction, and
 #: for offsets, springs and cables without a coefficient in the arm file.
@@ -31,18 +32,18 @@ FRICTION_DEVIATION, POSITION_DEVIATION = 0.1, 1.0
 TILT_DEVIATION, OFFSET_DEVIATION = 0.05, (0.1, 0.01)
 #: Smallest prior standard deviation of a rotor inertia [kg m^2; kg].
 MIN_ROTOR_DEVIATION = 3e-6
-#: Samples of the fit per period of the effort's cut-off frequency.
+#: Number of samples of the fit per period of the effort's cut-off frequency.
 OVERSAMPLING = 2.5
 #: Duration that is excluded at each end because of filter transients [s].
 ENDS = 1.0
-#: Largest assumed number of independent measurements of an effort, because model errors do not average out.
+#: Largest assumed number of independent measurements of an effort. More measurements do not average out model errors.
 MAX_INDEPENDENT = 220.0
-#: Smallest assumed error of an actuator as a share of its RMS effort.
+#: Smallest assumed RMS residual of an actuator's effort, as a share of the RMS effort.
 MIN_ERROR = 0.02
-#: Smallest range of an actuator over poses at rest for its effort to be used [rad], [m].
+#: In poses at rest, an actuator counts as moving if the range of its positions exceeds this value [rad], [m].
 MIN_RANGE = 0.1, 0.01
-#: Smallest information about a direction in the space of rigid-body parameters: squared relative change of the efforts
-#: for one prior standard deviation. Directions with less information are excluded.
+#: Smallest information about a direction in the space of rigid-body parameters. The information is the squared relative
+#: change of the efforts for one prior standard deviation. Directions with less information are excluded.
 MIN_INFORMATION = 1e-6
 #: Step of the numerical derivative with respect to a position [rad, m].
 _STEP = 1e-3
@@ -61,7 +62,8 @@ class ChannelFit:
         clock: True times of the rows of a motion, None for poses at rest.
         moves: True for a motion, False for poses at rest.
         used: Indices (k,) of the actuators that move and have an effort. The model is fitted to these efforts.
-        resting: Indices (l,) of the actuators that have an effort and do not move. Constants fit these efforts.
+        resting: Indices (l,) of the actuators that have an effort and do not move. These efforts are modelled as
+            constants.
         log_likelihood: Log-likelihood of the unmodified recording, up to a constant.
     """
 
@@ -120,7 +122,7 @@ class ChannelFit:
         return self._fit(self._tau @ transform.T)[0] + volume - self.log_likelihood
 
     def position_offset(self, channel: int) -> tuple[float, float]:
-        """Returns the estimated offset of a position channel of the recording and its standard error [rad, m]."""
+        """Returns the estimated offset of a recorded position channel and its standard error, in rad or m."""
         deviation = float(self.arm.per_joint(*OFFSET_DEVIATION)[channel])
         _, x, precision = self._fit(self._tau, deviation * self._offset_column(channel))
         return deviation * float(x[-1]), deviation * float(np.sqrt(np.linalg.inv(precision)[-1, -1]))
@@ -194,7 +196,7 @@ class ChannelFit:
     def _fit(
         self, tau: NDArray[np.float64], column: NDArray[np.float64] | None = None
     ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """Fits efforts tau (r, n), optionally with an additional `column` (r, n) with a prior deviation of 1.
+        """Fits the model to efforts tau (r, n). An additional `column` (r, n) has a coefficient with prior deviation 1.
 
         Returns:
             Log-likelihood, coefficients x (k,) and their precision (k, k).
@@ -209,7 +211,7 @@ class ChannelFit:
                 for i, (own, X) in zip(self.used, columns, strict=True)
             ]
         total = NormalEquations.of(columns, size, (tau - self._nominal)[:, self.used]).total
-        # The prior means are an additional measurement of all unknowns.
+        # The prior means act as additional measurements of the unknowns.
         prior = np.zeros((size + 1, size + 1))
         prior[:-1, -1] = prior[-1, :-1] = precision * mean
         efforts = np.sum(tau[:, self.used] ** 2, axis=0)
@@ -247,7 +249,7 @@ class ChannelFit:
         return np.asarray(change / _STEP)
 
     def _unit_gravity_efforts(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the holding efforts (r, n, 2) under a gravity of 1 m/s^2 along the x- and y-axis of the base."""
+        """Returns the holding efforts (r, n, 2) for gravity of 1 m/s^2 along the x- and y-axis of the base."""
         efforts, zero = [], np.zeros_like(q)
         for regressor in self._tilted:
             torque = regressor.torque(q, zero, zero, regressor.values)
@@ -255,11 +257,11 @@ class ChannelFit:
         return np.stack(efforts, axis=2)
 
     def _sampled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns x, given on the grid of the motion, at the samples of the fit."""
+        """Selects the values of x at the samples of the fit. x is given on the grid of the motion."""
         return self._inner(x[:: self._half_step]) if self.moves else x
 
     def _filtered(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Filters x (m, ...), given at twice the rate of the fit, and returns it at the samples of the fit."""
+        """Filters x (m, ...) at twice the rate of the fit and returns the values at the samples of the fit."""
         if not self.moves:
             return x
         flat = low_pass(x.reshape(len(x), -1), GRID_RATE / self._half_step, self._cut_off)

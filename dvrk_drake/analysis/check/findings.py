@@ -15,13 +15,14 @@ class Finding:
     """Finding about a recording.
 
     Attributes:
-        severity: "note" for information, "warning" if results will be less accurate, "refusal" if they would be wrong.
+        severity: "note" for information, "warning" if results will be less accurate, "refusal" if results would be
+            wrong.
         kind: Short, stable name of the finding, e.g. "repeated rows".
         where: Affected joints, channels or rows.
         what: Description of the problem with numbers, without a final period.
         advice: Sentences with the consequence and the recommended action, or "".
         joints: Indices of the affected joints, starting at 0.
-        size: Numerical value of the finding in SI units, nan if there is none.
+        size: Numerical value of the finding in SI units, nan if the finding has no value.
     """
 
     severity: Severity
@@ -47,13 +48,13 @@ class JointSignals:
         range: Range of the positions [rad, m].
         coverage: Range of the positions as a share of the range between the limits [1].
         speed: RMS velocity [rad/s, m/s].
-        acceleration: RMS acceleration below the velocity's cut-off frequency [rad/s^2, m/s^2].
+        acceleration: RMS acceleration, low-pass filtered at 20 Hz [rad/s^2, m/s^2].
         effort: RMS effort [N m, N].
         peak_effort: Largest effort divided by the joint's effort limit [1].
         velocity_gain: Gain of qd relative to dq/dt [1].
         velocity_lag: Lag of qd relative to dq/dt [s].
-        effort_lag: Lag of tau relative to the motion [s], None if it is not significant.
-        work: Mean of tau v divided by rms(tau) rms(v) [1]. Friction makes it positive.
+        effort_lag: Lag of tau relative to the motion [s], None if the lag is not significant.
+        work: Mean of tau v divided by rms(tau) rms(v) [1]. Friction increases this value.
         effort_cut_off: Frequency above which noise exceeds the effort signal [Hz].
         velocity_cut_off: Frequency above which noise exceeds the velocity signal [Hz].
         floor: Repeatability of the effort: relative RMS difference between periods [1].
@@ -77,7 +78,9 @@ class JointSignals:
 
 @dataclass(frozen=True)
 class RecordingReport:
-    """Result of `check_recording`.
+    """Result of `check` and `check_recording`.
+
+    The attributes from `rate` to `floor_cut_off` are None if they do not apply, for example to poses.
 
     Attributes:
         source: Source of the recording.
@@ -88,9 +91,10 @@ class RecordingReport:
         findings: Refusals first, then warnings, then notes.
         rate: Median sampling rate of a motion [Hz].
         duration: Duration of a motion [s].
-        jitter: Standard deviation of true minus recorded intervals, divided by the mean interval [1].
+        jitter: Standard deviation of the differences between true and recorded intervals, divided by the mean interval
+            [1].
         repeated: Share of rows that repeat the previous row [1].
-        period: Period of a periodic motion [s].
+        period: Period of a motion that repeats [s].
         floor_cut_off: Cut-off frequency of the low-pass filter for `floor` [Hz].
     """
 

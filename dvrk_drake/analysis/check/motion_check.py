@@ -1,4 +1,4 @@
-"""Checks the times, noise and repetition of a motion, and the consistency of its channels."""
+"""Checks the times, noise and repetition of a motion, and the consistency of its positions, velocities and efforts."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
 
 #: Smallest reported share of repeated rows. Smaller shares can occur by chance.
 MIN_REPEATED = 0.005
-#: Smallest additional share of repeated rows for reporting that q, qd or tau comes from a slower topic.
+#: Smallest additional share of repeated rows of q, qd or tau for a warning that this signal comes from a slower topic.
 MIN_EXTRA = 0.05
-#: Smallest gap between two rows in median intervals, and in [s].
+#: An interval between two rows is a gap if it exceeds both values: the first in median intervals, the second in s.
 GAP, MIN_GAP = 5.0, MAX_PERIOD
 #: Smallest reported jitter as a share of the mean interval.
 MIN_JITTER = 0.05
 #: An effort has the wrong sign in two cases: its Coulomb friction is more than the first number of standard errors
-#: below 0, or it is negative and the relative work of the motor is below minus the second number.
+#: below 0, or its Coulomb friction is negative and the relative work of the motor is below minus the second number.
 MIN_SIGN_ERRORS, MIN_NEGATIVE_WORK = 5.0, 0.05
-#: Joints are hardly identifiable separately if the correlation of their velocities exceeds this value.
+#: The parameters of two joints are hardly identifiable separately if the correlation of the joint velocities exceeds
+#: this value.
 MIN_CORRELATION = 0.95
 #: Smallest duration of a motion for the estimation of lags, signs and noise [s].
 MIN_DURATION = 10.0
@@ -63,7 +64,9 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
         report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
     )
     if duration < MIN_DURATION or rate < 2 / MAX_PERIOD:
-        what = f"the motion has {duration:.3g} s at {rate:.3g} Hz, so lags, signs, noise and repetition are not checked"
+        what = (
+            f"the motion lasts {duration:.3g} s at {rate:.3g} Hz, so lags, signs, noise and repetition are not checked"
+        )
         advice = f"Record at least {MIN_DURATION:g} s at {2 / MAX_PERIOD:g} Hz or more."
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
     signals = motion_signals(actuators, 20.0, rate=min(rate, GRID_RATE))
@@ -106,7 +109,7 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
     if all_signals > MIN_REPEATED:
         shares = ", ".join(f"{name} {100 * share:.1f} %" for name, share in blocks.items())
         what = f"{100 * all_signals:.1f} % of the rows repeat the previous row ({shares})"
-        advice = "Repeated rows are not used. They occur if a topic is polled too fast: record each message once."
+        advice = "Repeated rows are not used. They occur if a topic is polled too fast. Record each message once."
         findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=all_signals))
     for name, share in blocks.items():
         # Constant channels are reported by another check.
@@ -150,7 +153,9 @@ def _gap_findings(recording: Recording, gaps: NDArray[np.int_]) -> list[Finding]
     largest = int(gaps[np.argmax(intervals[gaps])])
     gap = f"{intervals[largest]:.3g} s before {recording.where(largest + 1)}"
     what = f"the times have a gap of {gap}" if len(gaps) == 1 else f"the times have {len(gaps)} gaps, the largest {gap}"
-    advice = "Split the recording at each gap, where the motion is unknown. Only the longest segment is checked."
+    advice = (
+        "Split the recording at each gap, because the motion in a gap is unknown. Only the longest segment is checked."
+    )
     return [Finding("warning", "gaps", "t", what, advice, size=float(intervals[largest]))]
 
 
@@ -209,7 +214,7 @@ def _correlated_joints(signals: MotionSignals, moving: NDArray[np.bool_], names:
 
 
 def _work(signals: MotionSignals) -> NDArray[np.float64]:
-    """Returns the mean power (n,) of each actuator divided by rms(tau) rms(v), nan where either is 0."""
+    """Returns the mean power (n,) of each actuator divided by rms(tau) rms(v), nan if tau or v is always 0."""
     size = np.sqrt(np.mean(signals.tau**2, axis=0) * np.mean(signals.v**2, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.mean(signals.tau * signals.v, axis=0) / size)
@@ -218,7 +223,7 @@ def _work(signals: MotionSignals) -> NDArray[np.float64]:
 def _wrong_signs(work: NDArray[np.float64], lags: EffortLag, arm: Arm) -> list[Finding]:
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = lags.coulomb / lags.coulomb_error
-    # Work alone is not sufficient, because gravity and inertia may transfer power from other joints.
+    # Negative work alone is not sufficient, because gravity and inertia may transfer power from other joints.
     wrong = (errors < -MIN_SIGN_ERRORS) | ((work < -MIN_NEGATIVE_WORK) & (errors < 0))
     findings = []
     for j in np.flatnonzero(wrong):
@@ -253,7 +258,7 @@ def _noise(
     if period is None:
         what = "the motion does not repeat, so the repeatability of the efforts cannot be computed"
         advice = (
-            "Run an excitation motion at least twice. Repeatability is about the smallest error that a model can have."
+            "Run an excitation motion at least twice. Repeatability is about the smallest possible error of a model."
         )
         return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
     floor = repeatability_floor(tau, rate, period, arm.identification.effort_cut_off)
@@ -261,7 +266,7 @@ def _noise(
     what = f"the period is {period:.4f} s ({1 / period:.4f} Hz), and the recording has {len(tau) / rate / period:.1f}"
     what += " periods"
     advice = (
-        "Compare the period with the commanded period. Repeatability is about the smallest error that a model can have."
+        "Compare the period with the commanded period. Repeatability is about the smallest possible error of a model."
     )
     findings = [Finding("note", "repetition", "motion", what, advice, size=period)]
     for j, name in enumerate(arm.joint_names):

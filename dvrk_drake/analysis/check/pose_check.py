@@ -15,10 +15,10 @@ from dvrk_drake.recordings.recording import Recording
 #: Largest number of poses at which efforts are compared with the gravity of the SDF model.
 MAX_COMPARED = 500
 #: Smallest RMS gravity effort of the SDF model [N m], [N], and its smallest share of the measured RMS effort, for a
-#: check of the sign. A cable can exceed a smaller gravity effort.
+#: check of the sign. The torque of a cable can exceed a smaller gravity effort.
 MIN_GRAVITY, GRAVITY_SHARE = (0.1, 1.0), 0.5
 #: An effort has the wrong sign if its regression coefficient on gravity is more than the first number of standard
-#: errors below 0, and if their correlation is below minus the second number.
+#: errors below 0, and if the correlation of effort and gravity is below minus the second number.
 MIN_SIGN_ERRORS, MIN_OPPOSITE_CORRELATION = 5.0, 0.7
 
 
@@ -46,8 +46,8 @@ def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
 def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool_], arm: Arm) -> list[Finding]:
     """Returns a refusal for each effort with the wrong sign.
 
-    Efforts are compared in the coordinates of the recording, because there a wrong sign affects one channel only.
-    `usable` (m, n) is False for measurements at a joint stop or beyond an effort limit.
+    Efforts are compared in the coordinates of the recording, because a wrong sign affects only one channel in these
+    coordinates. `usable` (m, n) is False for measurements at a joint stop or beyond an effort limit.
     """
     rows = np.linspace(0, len(joints) - 1, min(len(joints), MAX_COMPARED)).astype(int)
     gravity, tau = holding_torques(arm, joints.q[rows]), recording.measured_effort()[rows]
@@ -71,7 +71,7 @@ def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool
 def _significant_correlation(gravity: NDArray[np.float64], tau: NDArray[np.float64]) -> float:
     """Returns the correlation of efforts (m,) with gravity efforts (m,), or 0 if it is not significant.
 
-    It is not significant if gravity is a small share of the efforts, or if an offset can explain it.
+    The correlation is not significant if gravity is a small share of the efforts, or if an offset can explain it.
     """
     sizes = float(np.linalg.norm(gravity)), float(np.linalg.norm(tau))
     if sizes[0] < GRAVITY_SHARE * sizes[1] or sizes[1] == 0:

@@ -22,7 +22,7 @@ from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 
 #: Smallest range of the positions of a joint that moves [rad], [m].
 MIN_RANGE = 0.02, 0.002
-#: Smallest share of the range between the limits for a joint's parameters to be well identifiable.
+#: Smallest share of the range between its limits that a joint must cover for accurate estimates of its parameters.
 MIN_COVERAGE = 0.1
 #: Smallest reported excess of a position beyond a limit [rad], [m].
 LIMIT_MARGIN = 0.005, 0.0005
@@ -32,7 +32,7 @@ IMPOSSIBLE_EFFORT = 5.0
 IMPOSSIBLE_EXCESS = 0.3
 #: Smallest number of consecutive rows at the extreme effort, and smallest share of all rows, for a saturated effort.
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
-#: Largest relative error of the times compared with q and qd. A larger error indicates a wrong unit or rate.
+#: Largest relative error of the recorded times, estimated from q and qd. A larger error indicates a wrong unit or rate.
 TIME_TOLERANCE = 0.05
 #: Number of rows between two compared positions.
 BLOCK = 20
@@ -43,7 +43,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     """Checks poses or a motion, without testing for exchanged channels.
 
     Limits are checked in joint coordinates. Sensors, motors and friction are checked in actuator coordinates. Problems
-    of the recording are returned as findings and never raised.
+    of the recording are returned as findings. They are never raised as errors.
 
     Args:
         recording: Recording without preprocessing, in joint or actuator coordinates.
@@ -100,9 +100,9 @@ def _positions(joints: Recording, arm: Arm, joint_signals: tuple[JointSignals, .
         row = int(np.argmax(excess[:, i]))
         unit = "m" if i < arm.num_joints and arm.prismatic[i] else "rad"
         what = (
-            f"outside its limits {lower[i]:.4g}..{upper[i]:.4g} {unit} in "
-            f"{100 * np.mean(excess[:, i] > margins[i]):.1f} % of the rows, furthest {values[row, i]:.4g} {unit} at "
-            f"{joints.where(row)}"
+            f"the position is outside the limits {lower[i]:.4g}..{upper[i]:.4g} {unit} in "
+            f"{100 * np.mean(excess[:, i] > margins[i]):.1f} % of the rows, with the largest excess at "
+            f"{values[row, i]:.4g} {unit} ({joints.where(row)})"
         )
         advice = (
             "Efforts measured at a joint stop are not valid. Check the encoder offset and the limits of the arm file."
@@ -151,7 +151,7 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
             advice = "Usual causes: clipped efforts, or spikes of the current measurement."
             severity: Severity = "note"
             if kind == "motion" and most > IMPOSSIBLE_EFFORT:
-                # Such poses are excluded later. In a motion, a few such rows make the whole fit wrong.
+                # Poses with such efforts are excluded later. In a motion, a few such rows make the whole fit wrong.
                 severity = "refusal"
                 advice = (
                     "The motor cannot produce this effort. Remove the spikes, or correct the limit in the arm file."
@@ -175,7 +175,7 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
 
 
 def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
-    """Returns the share of the rows in runs of at least `FLAT_ROWS` rows at an extreme."""
+    """Returns the share of rows that are in runs of at least `FLAT_ROWS` rows at the extreme value."""
     at = np.abs(values - extreme) <= 1e-6 * max(abs(extreme), float(np.ptp(values)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
     lengths = np.diff(edges.reshape(-1, 2), axis=1).ravel()
@@ -210,14 +210,14 @@ def _time(recording: Recording, kind: str) -> list[Finding]:
 
 
 def _time_factor(recording: Recording) -> float | None:
-    """Returns the ratio of recorded to true time, or None if it is not identifiable.
+    """Returns the ratio of recorded to true time, or None if the ratio is not identifiable.
 
-    At least two joints must move, and the ratios of most of them must agree within 10 %.
+    At least two joints must move, and the ratios of most of these joints must agree within 10 %.
     """
     t, q, qd = recording.t, recording.q, recording.qd
     if t is None or qd is None or len(t) < MIN_ROWS:
         return None
-    # Differences over several rows cancel jitter and repeated rows.
+    # Differences over several rows reduce the effects of jitter and repeated rows.
     integrals = np.diff(
         np.vstack([q[:1] * 0, np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(t)[:, None], axis=0)])[::BLOCK], axis=0
     )
@@ -244,16 +244,18 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     """Checks a recording for faults before identification, as `dvrk-drake check` does.
 
     Examples of faults are wrong units or signs, exchanged channels, saturated efforts, decreasing times, late or
-    repeated signals, and joints that do not move. Faults are not raised but returned as findings of the report.
+    repeated signals, and joints that do not move. Faults are returned as findings of the report. They are not raised as
+    errors.
 
     Args:
         recording: Poses or motion with efforts (m, n), in joint or actuator coordinates, without preprocessing.
         arm: Arm that was recorded.
-        progress: Callback that receives the step, "checking the recording", and its finished share, 0 to 1.
+        progress: Callback that receives the name of the step ("checking the recording") and the finished share of the
+            step (0 to 1).
 
     Returns:
-        Report with `findings`; `refusals` and `warnings` are the findings of these severities. `joints` has the
-        statistics of each joint. `identify` rejects a recording with refusals.
+        Report with all `findings`. Its attributes `refusals` and `warnings` are the findings of these severities, and
+        `joints` contains the statistics of each joint. `identify` rejects a recording with refusals.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -271,7 +273,7 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     if report.refusals:
         return report
     refusals = _refusals_of_identify(recording, arm)
-    # The refusal repeats the warning of too few poses.
+    # A refusal of identify makes the warning of too few poses redundant.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
 
@@ -289,7 +291,8 @@ def require_usable(
     Args:
         recording: Recording, see `check_recording`.
         arm: Arm that was recorded.
-        progress: Callback that receives the step, "checking the recording", and its finished share, 0 to 1.
+        progress: Callback that receives the name of the step ("checking the recording") and the finished share of the
+            step (0 to 1).
         channels: True to check the channels too, see `check_with_channels`.
         ignored_kind: Kind of the findings that are ignored, or "".
 
@@ -316,7 +319,7 @@ def require_usable(
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     """Checks a recording with `check_recording`, and its channels with `check_channels` if there are no other refusals.
 
-    Exchanged channels have a similar effect as efforts of wrong sign. A refusal for exchanged channels therefore
+    Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels therefore
     replaces the refusals for wrong signs.
     """
     report = check_recording(recording, arm)
@@ -346,5 +349,5 @@ def _refusals_of_identify(recording: Recording, arm: Arm) -> tuple[Finding, ...]
     except (RecordingError, IdentificationError) as error:
         what, advice = _what_and_advice(error, recording.source or "recording")
         return (Finding("refusal", "identify refuses", "identify", f"rejects the recording: {what}", advice),)
-    # For a motion with static segments, only those are used for identification.
+    # If static poses were extracted from a motion, only these poses are used for identification.
     return () if found.recording is recording else check_recording(found.recording, arm).refusals

@@ -1,4 +1,4 @@
-"""Builds the low-pass filtered regressor columns of a motion: rigid-body parameters and joint effects."""
+"""Computes the low-pass filtered regressor columns of a motion, for rigid-body parameters and effects."""
 
 from __future__ import annotations
 
@@ -24,30 +24,37 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 
-#: Widths of the smoothed sign function, as shares of the standard deviation of the coordinate's speed.
+#: Widths of the smoothed sign function of Coulomb friction, divided by the standard deviation of the coordinate's
+#: velocity [1].
 COULOMB_WIDTHS = (0.03, 0.1, 0.4)
-#: Width of the smoothed sign function for asymmetric and Stribeck friction.
+#: Width of the smoothed sign function of asymmetric, Stribeck and load-dependent friction, divided by the same standard
+#: deviation [1].
 DIRECTION_WIDTH = 0.1
 ASYMMETRIC = "asymmetric friction"
-#: Names of effects in an arm file, with the number of periods per revolution of their sine and cosine.
+#: Name of an effect in an arm file -> number of periods of its sine and cosine per revolution. The number is 0 for an
+#: effect without sine and cosine.
 NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicColumns:
-    """Columns of the linear model tau = rigid (base phi) + effects c of each actuator, at r filtered rows.
+    """Low-pass filtered regressor columns and efforts of a motion at r rows.
+
+    For actuator i, tau[:, i] = rigid[:, i] (base phi) + E_i c. Here phi are the rigid-body parameters, and c are the
+    coefficients of the effects. The effect columns are E_i = shapes[i] * rows[:, i].
 
     Attributes:
-        tau: Measured efforts (r, n) of the actuators [N m, N].
-        base: Matrix (b, p) that maps all p rigid-body parameters to the base parameters for any gravity direction.
-            The links come first, then one rotor per actuator.
-        rigid: Columns (r, n, b) of the base parameters.
-        tilts: Derivatives (2, r, n, b) of `rigid` with respect to the x and y components of gravity [s^2/m]. Empty if
-            the base may not tilt.
+        tau: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
+        base: Matrix (b, p) that maps the p rigid-body parameters to the base parameters. If the arm file allows a base
+            tilt, the matrix is valid for every gravity direction. The rigid-body parameters are those of the links,
+            then one rotor inertia per actuator.
+        rigid: Regressor columns (r, n, b) of the base parameters for the nominal gravity vector.
+        tilts: Derivatives (2, r, n, b) of `rigid` with respect to the x and y components of gravity [s^2/m]. The array
+            is empty if the arm file does not allow a base tilt.
         effects: Effects, in the order of their columns.
-        shapes: Shape functions (r, e) of the effects along their coordinates, for each actuator.
-        rows: Coordinates (e, n) of the effects: motion of the coordinate per unit motion of each actuator. The columns
-            of actuator i are shapes[i] * rows[:, i].
+        shapes: Filtered efforts (r, e) of the e effects along their coordinates for coefficients of 1, one array per
+            actuator. The arrays differ if the effort delays of the actuators differ.
+        rows: Ratios (e, n) of the velocity along the coordinate of each effect to the velocity of each actuator.
     """
 
     tau: NDArray[np.float64]
@@ -62,11 +69,12 @@ class DynamicColumns:
 def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     """Returns the mandatory effects of the model.
 
-    These are an offset of every actuator, viscous, Coulomb and presliding friction of every coordinate, and the effects
-    of the arm file (`motion.known_effects`).
+    These are the offset of every actuator and the viscous friction along every coordinate. For every coordinate that
+    moves, Coulomb and presliding friction and the effects in the arm file (`motion.known_effects`) are also mandatory.
 
     Raises:
-        ArmError: The arm file contains an unknown coordinate or an unknown effect.
+        ArmError: The arm file contains an unknown coordinate, an unknown effect, or a cable effect of a prismatic
+            coordinate.
     """
     known = arm.identification.known_effects
     if unknown := set(known) - set(distinct_coordinates(arm)):
@@ -87,7 +95,10 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 
 
 def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
-    """Returns the springs and cables of the arm file (`motion.known_effects`) for joint positions q (m, n)."""
+    """Returns the spring and cable effects that the arm file lists in `motion.known_effects`.
+
+    The linear range of a spring exceeds the positions of its coordinate at the joint positions q (m, n) [rad, m].
+    """
     effects = []
     for name, kinds in arm.identification.known_effects.items():
         x = position_along(arm, name, q)
@@ -96,7 +107,7 @@ def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
 
 
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """Returns the candidate effects: springs, cables and asymmetric, Stribeck and load-dependent friction."""
+    """Returns the candidate effects: springs, cables, and asymmetric, Stribeck and load-dependent friction."""
     effects = []
     for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
@@ -105,8 +116,9 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
         effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
         known = arm.identification.known_effects.get(name, [])
         for which in NAMED_EFFECTS:
-            # A coordinate with known position-dependent torques gets no others. They are redundant within the range of
-            # the motion and diverge outside of it.
+            # If the arm file lists a spring or a cable for a coordinate, this coordinate gets no candidate springs or
+            # cables. An additional spring or cable would be redundant within the range of the motion, and would diverge
+            # outside this range.
             by_position = which != ASYMMETRIC
             if which in known or (by_position and set(known) - {ASYMMETRIC}):
                 continue
@@ -118,7 +130,7 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 def _named(
     arm: Arm, coordinate: str, which: str, x: NDArray[np.float64], v: NDArray[np.float64]
 ) -> list[ActuatorEffect]:
-    """Returns the effects with the name `which` of an arm file, scaled for positions x (m,) and velocities v (m,)."""
+    """Returns the effects named `which` in an arm file, scaled for positions x (m,) and velocities v (m,)."""
     where = f"{arm.source}: motion.known_effects.{coordinate}"
     if which not in NAMED_EFFECTS:
         raise ArmError(f'{where}: unknown effect "{which}". Allowed: {", ".join(NAMED_EFFECTS)}.')
@@ -135,16 +147,17 @@ def _named(
 def dynamic_columns(
     grid: MotionGrid, tau: NDArray[np.float64], regressor: DynamicRegressor, effects: Sequence[ActuatorEffect]
 ) -> DynamicColumns:
-    """Computes the columns of all parameters and effects.
+    """Computes the regressor columns of all rigid-body parameters and effects for a motion.
 
     Args:
         grid: Resampled motion.
         tau: Measured efforts (m, n) of the actuators at the rows of the recording [N m, N].
-        regressor: Regressor of the arm with its nominal mounting.
+        regressor: Regressor of the arm with its nominal gravity vector.
         effects: Effects of the model.
     """
     arm = grid.arm
-    # Efforts are linear in gravity. The efforts at rest under unit gravity are therefore the derivative.
+    # Efforts are linear in gravity. The derivative of the efforts with respect to a component of gravity is therefore
+    # the efforts at rest for a unit gravity vector along this component.
     tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
     columns = base_columns([regressor, *tilted])
     rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), columns)
@@ -176,8 +189,8 @@ class BaseColumns(NamedTuple):
 
     Attributes:
         independent: Indices (b,) of the independent columns.
-        base: Matrix (b, p) that maps all parameters to the base parameters.
-        moves: Mask (n, b) of the columns that are not 0 for a joint.
+        base: Matrix (b, p) that maps the rigid-body parameters to the base parameters.
+        moves: Mask (n, b), True where an independent column has nonzero elements for a joint.
     """
 
     independent: NDArray[np.int_]
@@ -191,7 +204,7 @@ class BaseColumns(NamedTuple):
 
         Args:
             Y: Regressor (m, n, p) of the joints.
-            drives: Motion (n,) of each joint per unit motion of the actuator.
+            drives: Velocity (n,) of each joint per unit velocity of the actuator.
         """
         joints = np.flatnonzero(drives)
         own = np.flatnonzero(np.any(self.moves[joints], axis=0))
@@ -199,9 +212,10 @@ class BaseColumns(NamedTuple):
 
 
 def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
-    """Returns the independent columns of one arm for the gravities of all regressors.
+    """Returns the independent columns of the stacked regressors of one arm.
 
-    Coupled rotors are not included, see `rotor_inertias`.
+    The regressors differ only in their gravity vectors. Columns of rotor terms that couple two actuators are omitted
+    (see `rotor_inertias`).
     """
     arm, p = regressors[0].arm, len(regressors[0].values)
     generator = np.random.default_rng(0)
@@ -213,7 +227,7 @@ def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
 
 
 def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) -> NDArray[np.float64]:
-    """Returns the filtered independent columns (r, n, b) of the actuators for a joint regressor (m, n, p)."""
+    """Returns the filtered independent columns (r, n, b) of the actuators for a regressor (m, n, p) of the joints."""
     out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(columns.independent)))
     for i, drives in enumerate(grid.arm.transmission.inverse.matrix.T):
         own, of_actuator = columns.of_actuator(Y, drives)
@@ -222,7 +236,7 @@ def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) ->
 
 
 def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
-    """Returns name, position (m,) and velocity (m,) of each coordinate of the drives."""
+    """Returns name, position (m,) and velocity (m,) of each coordinate in `distinct_coordinates`."""
     rows, a_dot = arm.effect_coordinates, arm.transmission.velocity(grid.v)
     names = distinct_coordinates(arm)
     return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]

@@ -29,20 +29,24 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Smallest coefficient of an effect in the model, in units of its prior standard deviation.
+#: Smallest absolute coefficient of an effect that the model contains, in units of the prior standard deviation of this
+#: coefficient.
 MIN_EFFECT = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class DynamicIdentification(Identification):
-    """Model identified from a motion. The model has `dynamics`, and base parameters computed from the links.
+    """Model identified from a motion.
+
+    The model contains `dynamics`. The base parameters of gravity are computed from the identified links.
 
     Attributes:
         grid: Resampled motion.
-        period: Period of the motion [s], or None if it does not repeat.
-        measured: Measured efforts (r, n) of the actuators after low-pass filtering, without the ends [N m, N].
-        predicted: Predicted efforts (r, n) of the actuators at the same rows, after the same filter [N m, N].
-        dry_friction: Sum of Coulomb and presliding friction of each coordinate, with its standard error [N m, N].
+        period: Period of the motion [s], or None if the motion does not repeat.
+        measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N]. One second at each end of
+            the motion is omitted.
+        predicted: Predicted efforts (r, n) of the actuators at the same rows, after the same low-pass filter [N m, N].
+        dry_friction: Coordinate -> sum of its Coulomb and presliding friction, and standard error of this sum [N m, N].
         nominal_mass: Total mass of the links in the SDF [kg].
     """
 
@@ -59,24 +63,24 @@ def identify_dynamic(
 ) -> DynamicIdentification:
     """Identifies the dynamics of `arm` from a motion.
 
-    Measured efforts and regressor columns are filtered with the same low-pass filter. Every actuator has an offset.
-    Actuators, and joints that share actuators, have viscous, smoothed Coulomb and presliding friction. Springs, cables
-    and asymmetric friction are included if the arm file lists them. Further effects are selected by cross-validation
-    over the phase of the motion.
+    Measured efforts and regressor columns are filtered with the same low-pass filter. The model includes the mandatory
+    effects of `drive_effects`. These are an offset of every actuator, friction along every drive coordinate, and the
+    springs, cables and asymmetric friction that the arm file lists. The friction model consists of viscous, smoothed
+    Coulomb and presliding friction. Additional effects are selected by cross-validation over the phase of the motion.
 
-    The link parameters are physically consistent. Parameters that the recording cannot identify keep the values of the
-    SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a base tilt. The
-    cross-validated errors are prediction errors on held-out phases (`cross_validate`).
+    The link parameters are physically consistent. For parameters that the recording does not identify, the estimates
+    are the values of the SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a
+    base tilt. The cross-validated errors are prediction errors on held-out phases (`cross_validate`).
 
     Args:
         recording: Motion with t and tau, in joint or actuator coordinates.
         arm: Arm that was recorded.
-        progress: Callback that receives the finished share, 0 to 1.
+        progress: Callback that receives the completed fraction, 0 to 1.
 
     Raises:
-        RecordingError: The recording does not fit the arm, or is not a motion.
-        IdentificationError: The solver for consistent parameters did not converge, or the cross-validated error of a
-            moving actuator exceeds its effort.
+        RecordingError: The recording does not match the arm, has no efforts, or is not a motion.
+        IdentificationError: The solver for consistent parameters did not converge, or the cross-validated RMS error of
+            a moving actuator exceeds the RMS effort of this actuator.
     """
     grid = motion_grid(recording, arm, default_settings(arm))
     tau = recording.in_actuator_coordinates(arm).measured_effort()
@@ -116,7 +120,7 @@ def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDAr
     """Raises IdentificationError if the cross-validated relative error of a moving actuator exceeds 1.
 
     Args:
-        recording: Recording that the model was identified from, for the message.
+        recording: Recording that the error message names.
         grid: Resampled motion.
         errors: Cross-validated relative errors (n,) of the actuators [1].
     """
@@ -125,8 +129,8 @@ def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDAr
     if len(bad := np.flatnonzero(moves & (errors > 1))):
         joints = ", ".join(f"{arm.joint_names[i]} ({100 * errors[i]:.0f} %)" for i in bad)
         raise IdentificationError(
-            f"{recording.source or 'recording'}: no model was identified, because the cross-validated error exceeds "
-            f"the effort itself on {joints}. Check the arm, the coordinates, and the order, signs and units of the "
+            f"{recording.source or 'recording'}: no model was identified, because the cross-validated relative error "
+            f"exceeds 100 % for {joints}. Check the arm, the coordinates, and the order, signs and units of the "
             "columns (dvrk-drake check)."
         )
 
@@ -139,9 +143,9 @@ def motion_problem(
     Args:
         grid: Resampled motion.
         tau: Measured efforts (m, n) of the actuators at the rows of the recording [N m, N].
-        period: Period of the motion [s], or None if it does not repeat.
-        effects: Effects of the model, all mandatory. None selects the drive effects as mandatory effects and the
-            optional effects as candidates.
+        period: Period of the motion [s], or None if the motion does not repeat.
+        effects: Effects of the model, all of which are mandatory. If None, the effects of `drive_effects` are mandatory
+            and those of `optional_effects` are candidates.
     """
     mandatory = effects if effects is not None else drive_effects(grid.arm, grid)
     candidates = [] if effects is not None else optional_effects(grid.arm, grid)
@@ -149,19 +153,21 @@ def motion_problem(
     columns = dynamic_columns(grid, tau, regressor, [*mandatory, *candidates])
     fold, edge = phase_folds(grid, period)
     # A low-pass filtered effort has two independent values per period of the cut-off frequency. Repetitions of the
-    # motion add none.
+    # motion do not add independent values.
     duration = len(columns.tau) / grid.rate
     independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
     return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(mandatory))
 
 
 def residuals(problem: DynamicProblem, effects: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
-    """Returns the effort residuals (r, n) of a fit on the rows of `problem`, which need not be the rows of the fit.
+    """Returns the effort residuals (r, n) of a fit at the rows of `problem` [N m, N].
+
+    The fit can be based on other rows.
 
     Args:
-        problem: Problem with the rows.
+        problem: Problem that contains the rows.
         effects: Indices (e,) of the effects in the fit.
-        fit: Fit with these effects.
+        fit: Fit that includes these effects.
     """
     columns, p = problem.columns, problem.num_rigid
     drive = np.column_stack(

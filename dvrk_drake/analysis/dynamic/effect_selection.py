@@ -1,4 +1,4 @@
-"""Selects joint effects and estimates the base tilt by cross-validation over the phase of a motion."""
+"""Selects effects by cross-validation over the phase of a motion, and estimates the base tilt."""
 
 from __future__ import annotations
 
@@ -12,20 +12,23 @@ from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.dynamic.problem import ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 
-#: Alternations between estimating the base tilt and the link parameters. A third changes errors by less than 0.01 %.
+#: Number of iterations that estimate the base tilt. Each iteration uses the link parameters of the previous iteration.
+#: A third iteration changes the errors by less than 0.01 %.
 NUM_TILT_ITERATIONS = 2
-#: Number of adjacent folds that `cross_validate` holds out together. Long segments are more similar to another motion.
+#: Number of adjacent folds that `cross_validate` holds out together. Long held-out segments are more similar to another
+#: motion than short ones.
 NUM_HELD_OUT_FOLDS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class EffectSelection:
-    """Result of selecting joint effects for one motion.
+    """Result of the selection of effects for one motion.
 
     Attributes:
         problem: Regression problem with the estimated gravity direction.
-        selection: Stepwise selection on all phases. If the base may tilt, the last two unknowns are the tilt.
-        mandatory: Indices (s,) of the effects that are always included, then of the tilt.
+        selection: Stepwise selection that uses all phases. If the base may tilt, the last two unknowns are the
+            components of the tilt.
+        mandatory: Indices (s,) of the mandatory effects and of the tilt, in this order.
         selected: Indices (f,) of all included effects and of the tilt, in ascending order.
         coefficients: Estimates (k,) of all unknowns of `selection`, 0 for effects that are not included.
     """
@@ -43,21 +46,24 @@ class EffectSelection:
 
     @property
     def weights(self) -> NDArray[np.float64]:
-        """Reciprocal residual variances (n,) of the actuators."""
+        """Weights (n,) of the squared errors of the actuators."""
         return self.selection.weights
 
 
 def select_effects(problem: DynamicProblem, progress: Callable[[float], object] = lambda _: None) -> EffectSelection:
-    """Estimates the direction of gravity with the mandatory effects, then adds effects that reduce the error.
+    """Estimates the direction of gravity with the mandatory effects, then selects candidate effects.
+
+    A candidate is added if it reduces the cross-validated error.
 
     Args:
         problem: Regression problem of the motion.
-        progress: Callback that receives the finished share, 0 to 1.
+        progress: Callback that receives the completed fraction, 0 to 1.
     """
     tilts = len(problem.columns.tilts)
     mandatory = np.append(np.arange(problem.num_mandatory), problem.num_effects + np.arange(tilts))
     phi = problem.prior
-    # The tilt multiplies the link parameters, so the problem is not linear in both.
+    # The efforts contain products of the tilt and the link parameters. Each iteration is linear, because it uses the
+    # previous link parameters in these products.
     for iteration in range(NUM_TILT_ITERATIONS if tilts else 0):
         progress(0.5 * iteration / NUM_TILT_ITERATIONS)
         x = problem.selection(phi, folds=False).fit(mandatory)
@@ -72,15 +78,15 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
 def cross_validate(
     selection: EffectSelection, phi: NDArray[np.float64], progress: Callable[[float], object] = lambda _: None
 ) -> NDArray[np.float64]:
-    """Returns the squared prediction error (n,) of each actuator, summed over held-out phases.
+    """Returns the sums of squared prediction errors (n,) of the actuators over all held-out phases.
 
-    Groups of `NUM_HELD_OUT_FOLDS` adjacent folds are held out. The effects, the direction of gravity and the physically
-    consistent parameters are estimated anew without the held-out phases.
+    One group of `NUM_HELD_OUT_FOLDS` adjacent folds is held out at a time. The effects are selected again without the
+    held-out phases. The direction of gravity and the physically consistent parameters are also estimated again.
 
     Args:
-        selection: Selection on all phases.
-        phi: Rigid-body parameters (p,) about which the tilt is linearised.
-        progress: Callback that receives the finished share, 0 to 1.
+        selection: Selection that uses all phases.
+        phi: Rigid-body parameters (p,) that are used in the products with the tilt.
+        progress: Callback that receives the completed fraction, 0 to 1.
 
     Raises:
         IdentificationError: The solver did not converge.
@@ -99,7 +105,8 @@ def cross_validate(
     errors = np.zeros(len(problem.efforts))
     for first, (effects, weights, tilt) in zip(firsts, results, strict=True):
         progress(0.4 + 0.6 * first / equations.folds)
-        # Correct the efforts for the tilt that is estimated without the held-out phases.
+        # Correct the efforts for the difference between the tilt of all phases and the tilt without the held-out
+        # phases.
         T = np.zeros((size + 1, problem.num_rigid + len(effects) + 1))
         T[:b, : problem.num_rigid] = problem.columns.base
         T[b + np.searchsorted(used, effects), problem.num_rigid + np.arange(len(effects))] = 1.0
@@ -113,7 +120,7 @@ def cross_validate(
 def _select_without(
     whole: EffectSelection, first: int
 ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
-    """Returns effect indices, actuator weights and tilt, estimated without the folds that begin at `first`."""
+    """Returns effect indices, actuator weights and tilt, estimated without the held-out folds that start at `first`."""
     problem = whole.problem
     selection = whole.selection.without(first, NUM_HELD_OUT_FOLDS)
     selected = selection.select(whole.mandatory, problem.candidates)

@@ -1,4 +1,4 @@
-"""Identified parameters with standard errors and correlations."""
+"""Computes the standard errors and correlations of identified parameters."""
 
 from __future__ import annotations
 
@@ -64,17 +64,19 @@ class ParameterUncertainty:
         return cls(tuple(names), spread, covariance / np.outer(spread, spread))
 
     def strong_correlations(self, limit: float = STRONG_CORRELATION) -> list[StrongCorrelation]:
-        """Returns the pairs whose absolute correlation exceeds `limit`, in descending order."""
+        """Returns the pairs whose absolute correlation exceeds `limit`, in descending order of this correlation."""
         size = np.abs(np.triu(self.correlation, 1))
         pairs = sorted(np.argwhere(size > limit).tolist(), key=lambda pair: -size[tuple(pair)])
         return [StrongCorrelation(self.names[i], self.names[k], float(self.correlation[i, k])) for i, k in pairs]
 
 
-#: Largest time lag of correlated effort errors, in addition to whole periods [s].
+#: Largest time lag at which effort errors are assumed to be correlated [s]. If the motion repeats, errors at lags near
+#: whole periods are also correlated.
 CORRELATION_TIME = 1.0
-#: Ratio of the sampling rate of the used rows to the rate that the cut-off of the low-pass filter requires.
+#: Ratio of the sampling rate of the rows that are used to twice the cut-off frequency of the low-pass filter.
 _OVERSAMPLING = 2.0
-#: Smallest overlap of two periods, as a share of the motion, for estimating the repeating error.
+#: Smallest overlap of a motion with the same motion shifted by one period, as a share of the duration of the motion.
+#: With a smaller overlap, the errors that repeat are not estimated.
 _MIN_OVERLAP = 0.2
 
 
@@ -86,18 +88,20 @@ def parameter_covariance(
     cut_off: float,
     period: float | None,
 ) -> NDArray[np.float64]:
-    """Returns the covariance (p + e, p + e) of `fit.x`, for fixed effects and without inequality constraints.
+    """Returns the covariance (p + e, p + e) of `fit.x`, for a fixed set of effects and without inequality constraints.
 
-    With the inverse Hessian of the cost A = (X'WX + P)^-1, the covariance is
+    The inverse Hessian of the cost is A = (X'WX + P)^-1. The covariance is
 
         A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
 
-    where P is the precision of the priors and Omega_i is the covariance of the error of actuator i over time. Omega_i
-    is estimated from the residuals. Slowly varying errors, for example of the friction model, therefore count as few
-    measurements. Errors that repeat in every period count once, independent of the number of periods.
+    where P is the Hessian of the priors, and X_i are the columns and w_i the weight of actuator i. Omega_i (r, r) is
+    the covariance matrix of the errors of actuator i at the rows. It is estimated from the residuals. Therefore slowly
+    varying errors, for example of the friction model, count as few measurements. Errors that repeat in every period
+    count once, regardless of the number of periods.
 
-    Residuals of a fit, (1 - H) e with the hat matrix H, are smaller than the errors. Residuals of held-out phases,
-    e / (1 - H), are larger by the same factor. Products of both are unbiased (MacKinnon and White, "Some
+    For errors e and the hat matrix H, the residuals of a fit are (1 - H) e, which is smaller than e. The residuals of
+    held-out phases are (1 - H)^-1 e, which is larger by the same factor. The covariance is therefore estimated without
+    bias from products of a fit residual and a held-out residual (MacKinnon and White, "Some
     heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
 
     Args:
@@ -106,7 +110,7 @@ def parameter_covariance(
         residuals: Effort residuals (r, n) of the fit [N m, N].
         rate: Rate of the rows [Hz].
         cut_off: Cut-off of the low-pass filter of the efforts [Hz].
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
     """
     step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
     rows = slice(None, None, step)
@@ -128,9 +132,9 @@ def _held_out_residuals(
     columns: Sequence[OwnColumns],
     to_base: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Returns the residuals (r, n) of the rows of each fold for a fit to the other folds.
+    """Returns the held-out residuals (r, n). The rows of each fold are predicted by a fit to the other folds.
 
-    One Newton step gives the exact fit if the active inequality constraints do not change.
+    This fit is one Newton step from `fit`, without a change of the parameters that are at their lower bounds.
     """
     held_out = residuals.copy()
     free = np.flatnonzero(fit.x > fit.lower)
@@ -150,14 +154,15 @@ def error_covariance(
 ) -> NDArray[np.float64]:
     """Returns the autocovariance (r,) of an actuator's error, for lags of 0 to r - 1 rows.
 
-    Up to a lag of `CORRELATION_TIME`, it is the covariance of the error, tapered with a Parzen window. Around whole
-    periods, it is the covariance of the repeating part of the error, estimated at a lag of one period.
+    Up to a lag of `CORRELATION_TIME`, the result is the sample autocovariance of the error, multiplied by a Parzen
+    window. For lags near whole periods, the result is the sample autocovariance for lags near one period. This part is
+    due to errors that repeat in every period.
 
     Args:
         fitted: Residuals (r,) of a fit to all rows.
-        held_out: Residuals (r,) of fits to other folds.
+        held_out: Held-out residuals (r,), each for a fit to the other folds.
         rate: Rate of the rows [Hz].
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
     """
     count = len(fitted)
     products = correlation(fitted, held_out)
@@ -182,7 +187,7 @@ def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _nearest_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the nearest covariance with a nonnegative spectrum."""
+    """Returns the nearest autocovariance with a nonnegative spectrum."""
     circulant = np.concatenate([covariance, covariance[-1:0:-1]])
     spectrum = np.maximum(np.fft.rfft(circulant).real, 0.0)
     return np.asarray(np.fft.irfft(spectrum, len(circulant))[: len(covariance)], dtype=np.float64)
@@ -193,7 +198,7 @@ def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale), dtype=np.float64)
 
 
-#: Smallest identifiability of an identifiable base parameter: 1 - variance / prior variance.
+#: Smallest identifiability (1 - variance / prior variance) at which a base parameter counts as identifiable.
 MIN_IDENTIFIABILITY = 0.5
 #: Effect kinds that are dry friction.
 DRY_KINDS = ("coulomb", "presliding")
@@ -227,13 +232,17 @@ class DynamicEstimates:
         return estimates
 
     def base_parameters(self) -> tuple[list[MotionParameterEstimate], list[CorrelatedEstimates]]:
-        """Returns the base parameters, and their strong correlations with each other and with effects."""
+        """Returns the base parameters, and the pairs of estimates that are not identifiable separately.
+
+        A pair is two base parameters, or a base parameter and an effect. Pairs whose first parameter has an
+        identifiability below `MIN_IDENTIFIABILITY` are omitted.
+        """
         problem, p = self._problem, self._problem.num_rigid
         base = derive_base_parameters(problem.regressor, coupled_rotors=False)
         B = base.combination
         values = B @ self._fit.x[:p]
         prior_variances = np.einsum("bp,pq,bq->b", B, self._prior[:p, :p], B)
-        # Effects at their lower bound, 0, are not included.
+        # Effects with coefficient 0, which is their lower bound, are omitted.
         nonzero = p + np.flatnonzero(self._fit.x[p:] != 0)
         to_all = np.zeros((len(B) + len(nonzero), len(self._fit.x)))
         to_all[: len(B), :p] = B
@@ -255,7 +264,7 @@ class DynamicEstimates:
         ]
 
     def dry_friction(self) -> dict[str, tuple[float, float]]:
-        """Returns the dry friction (Coulomb and presliding) of each coordinate with its standard error."""
+        """Returns coordinate -> sum of Coulomb and presliding friction, and standard error of this sum [N m, N]."""
         p = self._problem.num_rigid
         friction = {}
         for name in dict.fromkeys(effect.coordinate for effect in self._effects):
@@ -277,12 +286,12 @@ def _identifiability(variance: float, prior_variance: float) -> float:
 def base_parameter_estimates(
     arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]
 ) -> list[BaseParameterEstimate]:
-    """Returns the base parameters of the section's links with standard errors.
+    """Returns the base parameters of gravity with standard errors, computed from the links of `section`.
 
     Args:
         arm: Arm with the gravity direction of the section.
         section: Identified dynamics.
-        covariance: Covariance of the parameters, starting with the link parameters.
+        covariance: Covariance of all identified parameters. The link parameters come first.
     """
     gravity = gravity_parameters(arm)
     B = gravity.combination_of([link.link for link in section.links])

@@ -1,4 +1,4 @@
-"""Normal equations of a motion, accumulated per fold, and non-negative least squares on them."""
+"""Accumulates the normal equations of a motion per fold, and solves non-negative least-squares problems."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-#: Largest number of iterations that exchange unknowns between the positive set and the zero set.
+#: Maximum number of iterations in which unknowns change between the positive set and the zero set.
 MAX_EXCHANGES = 10
-#: Indices of the nonzero columns of an actuator, and these columns (r, c).
+#: Indices (c,) of the nonzero regressor columns of one actuator, and the values (r, c) of these columns.
 OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, eq=False)
 class SquareSums:
-    """Products [X tau]'[X tau] of every actuator, summed over some rows.
+    """Products [X tau]'[X tau] of every actuator, summed over a set of rows.
+
+    X (r, k) contains the regressor columns, and tau (r,) contains the efforts of the actuator at these rows.
 
     Attributes:
         size: Number k + 1 of columns. The last column is the measured effort.
-        own: Indices (c,) of the nonzero columns of each actuator, including the effort.
+        own: Indices (c,) of the nonzero columns of each actuator, including the column of the effort.
         blocks: Sums of products (c, c) of these columns, for each actuator.
     """
 
@@ -33,19 +35,19 @@ class SquareSums:
     blocks: tuple[NDArray[np.float64], ...]
 
     def weighted(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the sum (k + 1, k + 1) over the actuators with their weights (n,)."""
+        """Returns the weighted sum (k + 1, k + 1) of the products of all actuators, for weights (n,)."""
         sums = np.zeros((self.size, self.size))
         for weight, own, block in zip(weights, self.own, self.blocks, strict=True):
             sums[own[:, None], own] += weight * block
         return sums
 
     def squares(self, combination: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the sum of squares (n,) of a linear combination (k + 1,) of the columns and the effort."""
+        """Returns the sums of squares (n,) of a linear combination of all columns, for coefficients (k + 1,)."""
         coefficients = [combination[own] for own in self.own]
         return np.array([max(x @ block @ x, 0.0) for x, block in zip(coefficients, self.blocks, strict=True)])
 
     def squared_errors(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the sum of squared residuals (n,) for x (k,)."""
+        """Returns the sums of squared residuals (n,) of the actuators for unknowns x (k,)."""
         return self.squares(np.append(-x, 1.0))
 
     def dense(self) -> NDArray[np.float64]:
@@ -60,7 +62,8 @@ class NormalEquations:
     Attributes:
         size: Number of columns, see `SquareSums`.
         own: Indices of the nonzero columns of each actuator, see `SquareSums`.
-        products: Products (folds, 3, c, c) for each actuator, for the start, the middle and the end of each fold.
+        products: Products (folds, 3, c, c) of each actuator. The second index selects the start, the middle or the end
+            of a fold.
     """
 
     size: int
@@ -76,14 +79,14 @@ class NormalEquations:
         fold: NDArray[np.int_] | None = None,
         edge: NDArray[np.bool_] | None = None,
     ) -> NormalEquations:
-        """Accumulates the products.
+        """Accumulates the products of all rows.
 
         Args:
-            columns: Nonzero columns of each of the n actuators.
-            size: Number k of all columns.
+            columns: Indices and values of the nonzero columns, for each of the n actuators.
+            size: Number k of regressor columns.
             tau: Measured efforts (r, n).
-            fold: Fold (r,) of each row. None means one fold.
-            edge: Masks (r, 2) of the rows at the start and at the end of their fold. None means no row.
+            fold: Index (r,) of the fold of each row. If None, all rows are in one fold.
+            edge: Masks (r, 2) of the rows at the start and at the end of their fold. If None, no row is marked.
         """
         fold = np.zeros(len(tau), dtype=int) if fold is None else fold
         edge = np.zeros((len(tau), 2), dtype=bool) if edge is None else edge
@@ -105,11 +108,17 @@ class NormalEquations:
         return self.products[0].shape[0]
 
     def others(self, first: int, count: int) -> NDArray[np.int_]:
-        """Returns the indices (folds - count,) of the other folds, starting after the `count` folds from `first`."""
+        """Returns the indices of all folds except `count` adjacent folds that start with `first`.
+
+        The result (folds - count,) is in cyclic order and starts with the fold after the excluded folds.
+        """
         return np.arange(first + count, first + self.folds) % self.folds
 
     def without(self, first: int, count: int) -> NormalEquations:
-        """Returns the normal equations without `count` folds from `first`, and without the rows next to these folds."""
+        """Returns the normal equations without `count` adjacent folds that start with `first`.
+
+        The rows next to these folds, at the edges of the neighbouring folds, are also excluded.
+        """
         products = tuple(p[self.others(first, count)] for p in self.products)
         for p in products:
             p[0, 0] = 0.0
@@ -122,12 +131,15 @@ class NormalEquations:
         return self._sums(p.sum(axis=(0, 1)) for p in self.products)
 
     def of_fold(self, fold: int, count: int = 1) -> SquareSums:
-        """Returns the sums over `count` adjacent folds, starting with `fold`."""
+        """Returns the sums over the rows of `count` adjacent folds that start with `fold`."""
         folds = np.arange(fold, fold + count) % self.folds
         return self._sums(p[folds].sum(axis=(0, 1)) for p in self.products)
 
     def without_fold(self, fold: int, count: int = 1) -> SquareSums:
-        """Returns the sums over all rows, excluding `count` folds from `fold` and the rows next to these folds."""
+        """Returns the sums over all rows except those of `count` adjacent folds that start with `fold`.
+
+        The rows next to these folds, at the edges of the neighbouring folds, are also excluded.
+        """
         before, after = (fold - 1) % self.folds, (fold + count) % self.folds
         excluded = self.of_fold(fold, count).blocks
         blocks = zip(self.total.blocks, excluded, self.products, strict=True)
@@ -140,10 +152,10 @@ class NormalEquations:
 class NonNegativeFit:
     """Weighted non-negative least squares for a set of unknowns, optionally with one additional unknown.
 
-    The solution x (k,) minimises |y|^2 - 2 y' X x + x' (X' X + diag(precision)) x. Unknowns without a sign constraint
-    are eliminated first, which leaves the Schur complement of the constrained unknowns. An additional unknown adds one
-    row to the complement if it is constrained, otherwise one elimination step. The result is a small non-negative
-    least-squares problem.
+    The solution x (k,) minimises |y|^2 - 2 y' X x + x' (X' X + diag(precision)) x for weighted efforts y and columns X.
+    Unknowns without a sign constraint are eliminated first. The Schur complement of the constrained unknowns remains.
+    An additional unknown with a sign constraint adds one row to this complement. An additional unknown without a sign
+    constraint is also eliminated. The remaining problem is a small non-negative least-squares problem.
     """
 
     def __init__(
@@ -158,10 +170,10 @@ class NonNegativeFit:
 
         Args:
             sums: Weighted sums of products (k + 1, k + 1). The last column is the measured effort.
-            precision: Reciprocal prior variances (k,) of the unknowns about 0, positive.
+            precision: Reciprocals (k,) of the prior variances of the unknowns, greater than 0. The prior means are 0.
             non_negative: Mask (k,) of the unknowns that must not be negative.
             used: Indices of the unknowns in the fit. The remaining elements of x are 0.
-            candidates: Indices of the unknowns that `solve` may add, or None.
+            candidates: Indices of the unknowns that `solve` may add. If None, `solve` cannot add an unknown.
         """
         self._scale = np.append(1 / np.sqrt(np.diag(sums)[:-1] + precision), 1.0)
         self._free, constrained = used[~non_negative[used]], used[non_negative[used]]
@@ -184,7 +196,7 @@ class NonNegativeFit:
         self._positive = self._minimum(self._schur, self._constrained) > 0
 
     def solve(self, added: int | None = None) -> NDArray[np.float64]:
-        """Returns x (k,), with the candidate `added` in the fit unless it is None."""
+        """Returns x (k,). If `added` is not None, the fit includes this candidate."""
         S, constrained = self._schur, self._constrained
         y = np.zeros(len(self._remaining))
         if added is not None:
@@ -205,10 +217,11 @@ class NonNegativeFit:
         return (x * self._scale)[:-1]
 
     def _minimum(self, S: NDArray[np.float64], constrained: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns y >= 0 that minimises y' S y / 2 - b' y, starting from the current positive set.
+        """Returns y >= 0 that minimises y' H y / 2 - b' y. H and b are the elements of S for `constrained`.
 
-        In each iteration, all unknowns with a wrong sign, or with a wrong slope at 0, change to the other set
-        (Portugal, Judice and Vicente, 1994). If this does not converge, the method of Lawson and Hanson is used.
+        The iteration starts from the current positive set. In each iteration, positive unknowns with y <= 0 and zero
+        unknowns with a negative gradient change to the other set (Portugal, Judice and Vicente, 1994). If the iteration
+        does not converge, the method of Lawson and Hanson is used.
         """
         H, b = S[constrained[:, None], constrained], S[constrained, -1]
         positive = np.append(self._positive, np.ones(len(b) - len(self._positive), dtype=bool))

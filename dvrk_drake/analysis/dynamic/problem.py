@@ -1,4 +1,4 @@
-"""Least-squares problem of dynamic identification: unknowns, their priors, and the fit."""
+"""Defines the least-squares problem of dynamic identification: its unknowns, their priors and the fit."""
 
 from __future__ import annotations
 
@@ -23,36 +23,41 @@ from dvrk_drake.dynamics.physical_consistency import (
     log_det_curvature,
 )
 
-#: Prior deviation of an inertial parameter from the SDF, as a share of the link's scale. Selected by cross-validation.
+#: Prior standard deviation of an inertial parameter about its value in the SDF, as a share of the scale of the
+#: parameter (`LinkScale`). The share was selected by cross-validation.
 LINK_DEVIATION = 0.3
-#: Smallest prior deviation of a rotor inertia [kg m^2], and its smallest value as a share of the value in the SDF.
+#: Smallest prior standard deviation of a rotor inertia [kg m^2], and lower bound of a rotor inertia as a share of its
+#: value in the SDF.
 MIN_ROTOR_DEVIATION, MIN_ROTOR_SHARE = 3e-6, 0.1
-#: Prior deviations of an effect about 0, as shares of the RMS effort: for friction, which is a sum of several effects;
-#: for known position-dependent torques, which may balance gravity; and for all other effects.
+#: Prior standard deviations of the torque of an effect about 0, as shares of the RMS effort. The first applies to
+#: friction, which is a sum of several effects. The second applies to known position-dependent torques, which may
+#: balance gravity. The third applies to all other effects.
 FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
-#: Prior deviation of the direction of gravity [rad], from the accuracy of levelling a base.
+#: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
 TILT_DEVIATION = 0.05
 #: Smallest information about a direction in parameter space, relative to the prior. Along directions with less
-#: information, the parameters keep the values of the SDF.
+#: information, the estimates are the values of the SDF.
 _MIN_INFORMATION = 1e-2
-#: Prior deviation of the first moments of rotors that the SDF models as links, relative to other links. Rotors are
-#: balanced.
+#: Factor of the prior standard deviation of the first moments, for rotors that the SDF models as links. The factor is
+#: small because rotors are balanced.
 _BALANCE = 1e-6
-#: Relative error of the efforts that determines the weights before the first fit.
+#: Assumed relative error of the efforts, which determines the weights before the first fit.
 _INITIAL_ERROR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicProblem:
-    """Regression problem of one motion: columns, and priors of all unknowns.
+    """Regression problem of one motion, with the regressor columns and the priors of all unknowns.
 
     Attributes:
-        columns: Filtered columns of the rigid-body parameters and of all effects.
-        regressor: Regressor of the arm. Its SDF values are the prior means.
-        tilt: Change (2,) of the x and y components of gravity that is included in the columns [m/s^2].
+        columns: Filtered regressor columns of the rigid-body parameters and of all effects.
+        regressor: Regressor of the arm. The parameters of the SDF (`regressor.values`) are the prior means.
+        tilt: Change (2,) of the x and y components of gravity [m/s^2]. The change is included in `rigid`, but not in
+            `columns`.
         fold: Fold (r,) of each row, see `phase_folds`.
-        edge: Masks (r, 2) of the edges of the folds, see `phase_folds`.
-        independent: Number of rows that are independent measurements of an effort.
+        edge: Masks (r, 2) of the rows at the edges of the folds, see `phase_folds`.
+        independent: Effective number of independent rows. It can be less than r, because filtered and repeated efforts
+            are correlated.
         num_mandatory: Number of mandatory effects, which come first. The remaining effects are candidates.
     """
 
@@ -86,7 +91,7 @@ class DynamicProblem:
 
     @cached_property
     def rigid(self) -> NDArray[np.float64]:
-        """Columns (r, n, b) of the rigid-body base parameters, including the effect of the tilt."""
+        """Regressor columns (r, n, b) of the base parameters for gravity including the change `tilt`."""
         tilts = self.columns.tilts
         return self.columns.rigid + np.tensordot(self.tilt[: len(tilts)], tilts, axes=(0, 0))
 
@@ -113,7 +118,7 @@ class DynamicProblem:
 
     @cached_property
     def effect_precision(self) -> NDArray[np.float64]:
-        """Reciprocal prior variances (e,) of the effect coefficients about 0."""
+        """Reciprocals (e,) of the prior variances of the effect coefficients. The prior means are 0."""
         size = sum(
             np.mean((self.columns.shapes[i] * self.columns.rows[:, i]) ** 2, axis=0) / (self.efforts[i] / self.num_rows)
             for i in range(len(self.efforts))
@@ -135,9 +140,9 @@ class DynamicProblem:
         """Returns the stepwise selection of effects, with rigid-body unknowns in identifiable directions only.
 
         Args:
-            phi: Parameters (p,) about which the tilt is linearised. If the base may tilt, the tilt adds two unknowns
-                after the effects. None means a constant tilt.
-            folds: False uses a single fold, for fits to the whole motion only.
+            phi: Rigid-body parameters (p,) that are used in the products with the tilt. If the base may tilt, the two
+                components of the tilt are unknowns after the effects. If `phi` is None, the tilt is constant.
+            folds: If False, all rows are in one fold. This is sufficient for fits to the whole motion.
         """
         base, tilts = self.columns.base, len(self.columns.tilts) if phi is not None else 0
         residual = self.columns.tau - self.rigid @ (base @ self.prior)
@@ -165,7 +170,7 @@ class DynamicProblem:
     def _own_columns(
         self, i: int, rigid: NDArray[np.float64], effects: NDArray[np.int_], tilt_efforts: NDArray[np.float64]
     ) -> OwnColumns:
-        """Returns the nonzero columns of actuator i: rigid body (r, k), effects, and tilts from efforts (t, r, n)."""
+        """Returns the nonzero columns of actuator i, in the order rigid body (r, k), effects (e), tilts (t)."""
         nonzero = np.flatnonzero(np.any(rigid, axis=0))
         acting = np.flatnonzero(self.columns.rows[effects, i])
         of_effects = self.columns.shapes[i][:, effects[acting]] * self.columns.rows[effects[acting], i]
@@ -181,7 +186,8 @@ class DynamicProblem:
         Args:
             i: Index of the actuator.
             effects: Indices (e,) of the effects.
-            tilt_efforts: Derivatives (t, r, n) of the efforts with respect to the tilts. None means no tilts.
+            tilt_efforts: Derivatives (t, r, n) of the efforts with respect to the tilts. If None, the columns of the
+                tilts are omitted.
         """
         return self._own_columns(
             i,
@@ -191,16 +197,16 @@ class DynamicProblem:
         )
 
     def to_base(self, num_effects: int) -> NDArray[np.float64]:
-        """Returns the matrix (b + e, p + e) that maps parameters and effects to base parameters and effects."""
+        """Returns the matrix (b + e, p + e) that maps x (p + e,) to base parameters and effect coefficients."""
         return scipy.linalg.block_diag(self.columns.base, np.eye(num_effects))
 
     def rigid_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the rigid-body parameters phi (p,) for the unknowns x (k,) of a selection."""
+        """Returns the rigid-body parameters phi (p,) for the unknowns x (k,) of a `StepwiseSelection`."""
         V = self._identifiable
         return self.prior + self.deviation * (V @ x[: V.shape[1]])
 
     def subset(self, rows: NDArray[np.bool_]) -> DynamicProblem:
-        """Returns the problem for a subset of the rows (r,), with the folds renumbered."""
+        """Returns the problem for the rows in the mask `rows` (r,). The folds are renumbered."""
         c = self.columns
         shapes = tuple(shape[rows] for shape in c.shapes)
         columns = replace(c, tau=c.tau[rows], rigid=c.rigid[rows], tilts=c.tilts[:, rows], shapes=shapes)
@@ -209,7 +215,7 @@ class DynamicProblem:
         return replace(self, columns=columns, fold=fold, edge=self.edge[rows], independent=independent)
 
     def consistent(self, effects: NDArray[np.int_], weights: NDArray[np.float64]) -> ConsistentFit:
-        """Returns the physically consistent fit with the effects (e,) and the weights (n,) of the actuators.
+        """Returns the physically consistent fit for effect indices (e,) and actuator weights (n,).
 
         Raises:
             IdentificationError: The solver did not converge.
@@ -218,7 +224,7 @@ class DynamicProblem:
 
     @cached_property
     def _identifiable(self) -> NDArray[np.float64]:
-        """Identifiable orthonormal directions (p, k) of the rigid-body parameters, scaled by their prior deviations."""
+        """Orthonormal identifiable directions (p, k) of the rigid-body parameters divided by their deviations."""
         weights = self.independent / self.num_rows / (self.efforts / self.num_rows * _INITIAL_ERROR**2)
         H = sum(weight * self.rigid[:, i].T @ self.rigid[:, i] for i, weight in enumerate(weights))
         scaled = self.columns.base * self.deviation
@@ -235,8 +241,8 @@ class ConsistentFit:
         x: Rigid-body parameters and effect coefficients (p + e,).
         lower: Lower bounds (p + e,) of x, -inf if there is none.
         errors: Sums of squared residuals (n,) of the actuators.
-        information: Weighted sum (p + e, p + e) of X' X.
-        prior_precision: Hessian (p + e, p + e) of both priors at x.
+        information: Weighted sum (p + e, p + e) of X' X over the actuators.
+        prior_precision: Hessian (p + e, p + e) of the Gaussian prior plus the log-det prior at x.
     """
 
     def __init__(self, problem: DynamicProblem, effects: NDArray[np.int_], weights: NDArray[np.float64]) -> None:
@@ -258,7 +264,7 @@ class ConsistentProgram:
     """Convex program for the physically consistent fit of one problem with given effects.
 
     Attributes:
-        precision: Reciprocal prior variances (p + e,) of the parameters and effects.
+        precision: Reciprocals (p + e,) of the Gaussian prior variances of the parameters and effects.
         lower: Lower bounds (p + e,) of the parameters and effects, -inf if there is none.
     """
 
@@ -274,8 +280,9 @@ class ConsistentProgram:
     def solve(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns x (p + e,) for weighted sums of products (p + e + 1, p + e + 1), whose last column is the effort.
 
-        The sums are reduced to a triangular matrix by a Cholesky decomposition in units of the prior deviation. In
-        these units no eigenvalue is below 1, so the result is as accurate as a QR decomposition of the rows.
+        The sums are scaled to units of the prior standard deviations. A Cholesky decomposition then reduces them to a
+        triangular matrix. In these units, no eigenvalue is below 1. Therefore the result is as accurate as that of a QR
+        decomposition of the rows.
 
         Raises:
             IdentificationError: The solver did not converge.

@@ -1,4 +1,4 @@
-"""Stepwise selection of joint effects by cross-validation over the folds of a motion."""
+"""Stepwise selection of effects (friction, cables, springs) by cross-validation over the folds of a motion."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 
-#: Smallest reduction of the cross-validated relative error, averaged over the actuators, for adding an effect. Smaller
-#: gains are due to chance: on the public motions, they add other effects in other phases and increase the errors on
-#: held-out phases.
+#: Smallest reduction of the cross-validated relative error for which an effect is added. The error is averaged over the
+#: actuators. Smaller reductions are due to chance. On the public motions, a lower threshold adds different effects for
+#: different held-out phases, and increases the errors on these phases.
 MIN_GAIN = 0.005
 #: Number of candidate effects that are cross-validated in each step.
 NUM_TRIALS = 8
-#: Smallest relative error of an actuator that the weights assume.
+#: Lower limit of the relative error of an actuator in the computation of the weights.
 MIN_ERROR = 0.02
 
 
 @dataclass
 class StepwiseSelection:
-    """Stepwise selection of effects on one motion, in unknowns with prior mean 0.
+    """Stepwise selection of effects for one motion. All k unknowns have prior mean 0.
 
     Attributes:
-        equations: Normal equations with columns for the rigid-body unknowns, the effects and the tilt. The efforts are
-            measured minus nominal efforts.
+        equations: Normal equations with columns for the rigid-body unknowns, the effects and the tilt. The efforts in
+            these equations are the measured efforts minus the efforts of the SDF.
         efforts: Sums of squares (folds, n) of the measured efforts.
-        rows: Numbers of rows (folds,).
+        rows: Number of rows (folds,) in each fold.
         num_rigid: Number of rigid-body unknowns.
-        precision: Reciprocal prior variances (k,) of all unknowns.
+        precision: Reciprocals (k,) of the prior variances of all unknowns.
         non_negative: Mask (k,) of the unknowns that must not be negative.
-        independent: Share of the rows that are independent measurements of an effort.
+        independent: Effective number of independent rows, divided by the number of rows.
         weights: Weights (n,) of the squared errors of the actuators, updated by `fit`.
     """
 
@@ -54,14 +54,14 @@ class StepwiseSelection:
         self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
 
     def without(self, first: int, count: int) -> StepwiseSelection:
-        """Returns the selection without the `count` folds that begin at `first`."""
+        """Returns the selection without `count` adjacent folds that start with `first`."""
         kept = self.equations.others(first, count)
         return replace(
             self, equations=self.equations.without(first, count), efforts=self.efforts[kept], rows=self.rows[kept]
         )
 
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns the estimates (k,) of all unknowns, 0 for excluded effects, and updates `weights`."""
+        """Returns the estimates (k,) of all unknowns, with 0 for excluded effects, and updates `weights`."""
         for _ in range(3):
             x = self._fit_to(self._total.weighted(self.weights), effects).solve()
             self.weights = self._weights(self._total.squared_errors(x) / self._efforts)
@@ -72,9 +72,10 @@ class StepwiseSelection:
         return np.asarray(np.sqrt(self._total.squared_errors(x) / self._efforts))
 
     def cross_validated(self, effects: NDArray[np.int_], candidates: Sequence[int] = ()) -> tuple[float, list[float]]:
-        """Returns the cross-validated relative error with `effects`, and the errors with one candidate added.
+        """Returns the cross-validated relative error with `effects`, and the errors with one more effect.
 
-        The errors are means over the actuators, for the current weights.
+        The second result contains one error per candidate, with this candidate as the additional effect. Each error is
+        a mean over the actuators. All fits use the current weights.
         """
         squares = np.zeros((1 + len(candidates), len(self._efforts)))
         added = [None, *(self.num_rigid + k for k in candidates)]
@@ -90,12 +91,14 @@ class StepwiseSelection:
         candidates: NDArray[np.int_],
         progress: Callable[[float], object] = lambda _: None,
     ) -> NDArray[np.int_]:
-        """Adds candidates while the gain is at least `MIN_GAIN`, then removes candidates with a small gain.
+        """Adds candidates that reduce the error by at least `MIN_GAIN`, then removes unnecessary candidates.
+
+        A candidate is unnecessary if its removal increases the error by less than half of `MIN_GAIN`.
 
         Args:
-            mandatory: Indices of the effects that are always included, starting at 0.
-            candidates: Indices of the effects that may be added, starting at 0.
-            progress: Callback that receives the estimated finished share, 0 to 1.
+            mandatory: Indices of the effects that are always included. Index 0 is the first effect.
+            candidates: Indices of the effects that may be added. Index 0 is the first effect.
+            progress: Callback that receives the estimated completed fraction, 0 to 1.
 
         Returns:
             Indices (f,) of the mandatory and the added effects.
@@ -117,7 +120,10 @@ class StepwiseSelection:
         return selected
 
     def _best_candidates(self, selected: NDArray[np.int_], candidates: NDArray[np.int_]) -> NDArray[np.int_]:
-        """Returns the `NUM_TRIALS` candidates that reduce the sum of squares most, without sign constraints."""
+        """Returns the `NUM_TRIALS` candidates that most reduce the weighted sum of squared errors.
+
+        Sign constraints of the candidates are ignored.
+        """
         used, new = self._index(selected), self.num_rigid + candidates
         sums = self._total.weighted(self.weights)
         x = self._fit_to(sums, selected).solve()
@@ -138,6 +144,6 @@ class StepwiseSelection:
         return NonNegativeFit(sums, self.precision, self.non_negative, self._index(effects), new)
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the weights (n,) of the actuators for their squared relative errors (n,)."""
+        """Returns the weights (n,) of the actuators for squared relative errors (n,)."""
         variance = np.maximum(squared, MIN_ERROR**2) * self._efforts / np.sum(self.rows)
         return np.asarray(self.independent / variance)

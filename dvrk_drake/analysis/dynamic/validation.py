@@ -1,4 +1,4 @@
-"""Validates a dynamic model on a motion and divides its error into causes."""
+"""Validates a dynamic model on a motion, and divides the error into parts with different causes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Width of the smoothed sign function of the friction-like error, as a share of the RMS velocity.
 _FRICTION_WIDTH = 0.1
-#: Number of harmonics of the actuator position in the position-dependent error.
+#: Number of frequencies of the sine and cosine functions in the position-dependent error.
 _HARMONICS = 2
 
 
@@ -29,12 +29,14 @@ class ActuatorError:
         name: Name of the joint of the actuator.
         rms_effort: RMS measured effort [N m, N if prismatic].
         rms_error: RMS of measured minus predicted effort [N m, N if prismatic].
-        relative_error: rms_error / rms_effort [1], None if the effort is 0.
+        relative_error: rms_error / rms_effort [1], None if rms_effort is 0.
         bias: Share of rms_error^2 due to the mean error.
-        friction_like: Additional share that is explained by viscous and Coulomb friction in the actuator.
-        position_dependent: Additional share that is explained by two harmonics of the position over its range.
-        other: Remaining share.
-        repeatability: Relative RMS difference of the efforts between periods [1], None if the motion does not repeat.
+        friction_like: Additional share of rms_error^2 that viscous and Coulomb friction in the actuator explain.
+        position_dependent: Additional share of rms_error^2 that sine and cosine functions of the position explain. The
+            functions have half a period and one period over the range of the position.
+        other: Remaining share of rms_error^2.
+        repeatability: Relative RMS difference of the efforts between periods (see `repeatability_floor`) [1], or None
+            if the motion does not repeat.
         verdict: Verdict on the actuator, see `judge`.
     """
 
@@ -74,7 +76,7 @@ class DynamicValidation(Validation):
 
     @property
     def mean_relative_error(self) -> float:
-        """Mean relative error over the actuators with measured efforts."""
+        """Mean relative error over the actuators whose measured effort is not 0."""
         errors = [a.relative_error for a in self.actuators if a.relative_error is not None]
         return float(np.mean(errors)) if errors else float("nan")
 
@@ -85,7 +87,7 @@ class DynamicValidation(Validation):
 
     @property
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each actuator after low-pass filtering [1], None if nothing was measured."""
+        """RMS error / RMS effort of each actuator after low-pass filtering [1], None if its measured effort is 0."""
         return {actuator.name: actuator.relative_error for actuator in self.actuators}
 
     def as_dict(self) -> dict:
@@ -104,7 +106,7 @@ def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
     """Returns the predicted efforts (m, n) of the actuators at all rows of a motion, after the low-pass filter.
 
     Raises:
-        RecordingError: The recording does not fit the arm, or is not a motion.
+        RecordingError: The recording does not match the arm, or is not a motion.
         ModelError: The model has no dynamics.
     """
     dynamics = model.dynamic_model
@@ -113,13 +115,14 @@ def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
 
 
 def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicValidation:
-    """Compares the model's efforts with those of a motion, in actuator coordinates.
+    """Compares predicted and measured efforts of a motion, in actuator coordinates.
 
-    The error of an actuator is |tau_f - tau_hat| / |tau_f|, where both are filtered with the zero-phase low-pass filter
-    and one second at each end is omitted. This is the metric of Wang et al. (RA-L 2019).
+    The relative error of an actuator is |tau_f - tau_hat| / |tau_f|, with the measured effort tau_f and the predicted
+    effort tau_hat. Both efforts are filtered with the zero-phase low-pass filter, and one second at each end is
+    omitted. Wang et al. (RA-L 2019) use the same metric.
 
     Raises:
-        RecordingError: The recording does not fit the arm, has no efforts, or is not a motion.
+        RecordingError: The recording does not match the arm, has no efforts, or is not a motion.
         ModelError: The model has no dynamics.
     """
     dynamics = model.dynamic_model

@@ -21,12 +21,12 @@ from dvrk_drake.recordings.recording import Recording
 class Whitening:
     """Whitening filter x[t] - sum_k coefficients[k - 1] x[t - k step] for each channel.
 
-    The step is half a period of the cut-off frequency of the low-pass filter. Sampling at this interval contains the
-    full bandwidth of the filtered rows.
+    The step is half a period of the cut-off frequency of the low-pass filter. Samples at this interval contain the full
+    bandwidth of the filtered signals.
 
     Attributes:
         coefficients: Coefficients (n, order) of the channels.
-        step: Number of rows between the values that are combined.
+        step: Number of rows between two values that the filter combines.
     """
 
     coefficients: NDArray[np.float64]
@@ -39,7 +39,7 @@ class Whitening:
 
     @classmethod
     def of(cls, residual: NDArray[np.float64], order: int, rate: float, cut_off: float) -> Whitening:
-        """Fits an autoregression to residuals.
+        """Creates the whitening filter from an autoregression of residuals.
 
         Args:
             residual: Residuals (r, n), low-pass filtered.
@@ -56,7 +56,7 @@ class Whitening:
 
     @property
     def num_removed(self) -> int:
-        """Number of rows at the start that the filter removes, because they have no preceding rows."""
+        """Number of rows at the start that the filter removes, because they have too few preceding rows."""
         return self.coefficients.shape[1] * self.step
 
     def __call__(self, x: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
@@ -72,10 +72,11 @@ MAX_SHIFT = 5.0
 #: Smallest duration of the motion that both recordings must contain [s].
 MIN_OVERLAP = 5.0
 #: Largest cut-off frequency of the low-pass filter of the difference [Hz]. Efforts of a payload have the frequencies of
-#: the motion, which are lower.
+#: the motion, which are below this value.
 CUT_OFF = 5.0
-#: Expected change of position-dependent torques as a share of an actuator's RMS effort. Between two days of a PSM
-#: without payload, the RMS over the actuators is 5.6 % (psm_one and psm_one_no_weight of docs/public_recordings.md).
+#: Expected change of position-dependent torques as a share of an actuator's RMS effort. Between recordings of a PSM
+#: without payload on two days, the RMS change over the actuators is 5.6 % (psm_one and psm_one_no_weight of
+#: docs/public_recordings.md).
 DRIFT = 0.06
 #: Number of linear segments of a position-dependent torque over an actuator's range. Many segments are necessary,
 #: because joint stops and cables have local effects.
@@ -84,21 +85,21 @@ NUM_SEGMENTS = 8
 CORRELATION_LENGTH = 0.25
 #: Number of columns of `changes` without prior: offset, dry friction and viscous friction.
 _NUM_WITHOUT_PRIOR = 3
-#: Step of the search before refinement [s].
+#: Step of the search for the time shift before refinement [s].
 _STEP = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class MotionDifference:
-    """Difference of the efforts of two recordings of the same motion, a second recording minus a reference.
+    """Difference of the efforts of two recordings of the same motion: second recording minus reference.
 
     Attributes:
         grid: Resampled motion of the second recording.
         rows: Mask (r,) of the inner rows of `grid` that the reference also contains. It selects k rows.
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
         shift: Time shift [s]. Time t of the second recording corresponds to time t + shift of the reference.
-        tau: Low-pass filtered difference (k, n) of the actuator efforts [N m, N]. The model predicts the effect of the
-            small differences of the two motions, which is subtracted.
+        tau: Low-pass filtered difference (k, n) of the actuator efforts [N m, N]. The effect of small differences
+            between the two motions is predicted by the model and subtracted.
         changes: Columns (k, n, c) for possible changes of each drive: an offset, dry and viscous friction, and
             piecewise linear position-dependent torques (cables, springs, joint stops).
         deviation: Prior standard deviations (n, c) of the changes as RMS efforts [N m, N], inf if there is no prior.
@@ -114,12 +115,12 @@ class MotionDifference:
 
 
 def motion_difference(reference: Recording, other: Recording, model: DynamicModel) -> MotionDifference:
-    """Aligns two recordings of one motion and subtracts the reference.
+    """Aligns two recordings of one motion in time and subtracts the efforts of the reference.
 
     Args:
-        reference: Recording of the motion before the change, in joint or actuator coordinates.
-        other: Recording of the same motion after the change, in joint or actuator coordinates.
-        model: Model of the arm before the change. It predicts the effect of small differences of the two motions.
+        reference: Recording of the motion without payload, in joint or actuator coordinates.
+        other: Recording of the same motion with the payload, in joint or actuator coordinates.
+        model: Model of the arm without payload. It predicts the effect of small differences between the two motions.
 
     Raises:
         RecordingError: A recording is not a motion of this arm, an effort has the wrong sign, or the recordings are not
@@ -169,8 +170,8 @@ def _changes(model: DynamicModel, grid: MotionGrid, expected: DriveEfforts) -> N
 def _shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns basis functions (m, NUM_SEGMENTS + 1) at positions (m,).
 
-    For independent coefficients, their sum is a Gaussian process over the range with a squared-exponential kernel,
-    interpolated linearly between knots.
+    With independent standard normal coefficients, the sum of the functions is a Gaussian process over the range. Its
+    kernel is squared-exponential at the knots, with linear interpolation between the knots.
     """
     scaled = (x - np.min(x)) / max(float(np.ptp(x)), np.finfo(float).tiny)
     knots = np.linspace(0.0, 1.0, NUM_SEGMENTS + 1)
@@ -186,7 +187,7 @@ def _interpolate(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[
 
 
 def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recording: Recording) -> float:
-    """Returns the time shift [s] with the smallest difference of the positions, scaled by their standard deviations."""
+    """Returns the time shift [s] with the smallest difference of the positions in units of standard deviations."""
     deviation = np.std(other.q, axis=0)
     moving = deviation > 1e-3
     x, y = (grid.q[:, moving] / deviation[moving] for grid in (reference, other))
@@ -194,7 +195,7 @@ def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recor
     start = other.t[0] - reference.t[0]
 
     def distance(shift: int) -> float:
-        """Returns half the mean squared difference between x[i + shift] and y[i]."""
+        """Returns half the mean squared difference between x[i + shift] and y[i], inf if the overlap is too short."""
         first, last = max(0, -shift), min(len(y), len(x) - shift)
         if last - first < MIN_OVERLAP * GRID_RATE:
             return np.inf

@@ -28,13 +28,14 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Confidence level of the reported intervals.
 CONFIDENCE = 0.95
-#: Largest ratio of cross-validated errors of links that explain the change equally well.
+#: Largest ratio of the cross-validated errors of two links that explain the change of the efforts equally well.
 SAME_ERROR = 1.05
 #: Smallest relative RMS difference between the efforts of two different recordings.
 MIN_DIFFERENCE = 1e-6
-#: Order of the autoregression that whitens the errors, and number of times that it is fitted.
+#: Order of the autoregression that whitens the errors, and number of fits of the autoregression.
 AUTOREGRESSION_ORDER, NUM_WHITENING_ITERATIONS = 2, 2
-#: Smallest RMS effort of the payload on an actuator that it loads, as a share of the RMS difference of the efforts.
+#: Smallest RMS effort of the payload on an actuator, as a share of the RMS difference of the efforts. At smaller
+#: values, the payload does not load the actuator.
 MIN_LOAD = 1e-6
 
 
@@ -44,10 +45,10 @@ class PayloadActuator:
 
     Attributes:
         name: Name of the joint of the actuator.
-        change: Difference between the recordings.
+        change: Difference between the efforts of the recordings.
         payload: Effort of the payload.
         left: Residual after subtracting the payload and the changes of the drive.
-        explained: 1 - left^2 / change^2 [1], or None if the payload does not load the actuator.
+        explained: Explained share 1 - left^2 / change^2 [1], or None if the payload does not load the actuator.
     """
 
     name: str
@@ -62,15 +63,15 @@ class Payload:
     """Estimate of a payload, modelled as a point mass on a link.
 
     Attributes:
-        link: Name of the link that carries the payload.
+        link: Name of the link to which the payload is attached.
         body: Mass [kg] and position in the link frame [m].
         mass_error: Standard error of the mass [kg].
         position_error: Standard errors (3,) of the position [m], nan for coordinates that are not identifiable.
         quantile: Half-width of the confidence interval (`CONFIDENCE`), in standard errors.
-        largest_at_com: Upper end of the confidence interval of a mass at the link's own centre of mass [kg].
-        position_in_base: Position (3,) in the base frame with all joints at 0 [m].
-        relative_error: Cross-validated RMS error over the phase of the motion, divided by the error without a payload
-            [1]. Geometric mean over the actuators.
+        largest_at_com: Upper end of the confidence interval for a mass at the link's own centre of mass [kg].
+        position_in_base: Position (3,) of the payload in the base frame, with all joint positions at 0 [m].
+        relative_error: Cross-validated RMS error with the payload divided by the error without a payload [1], as the
+            geometric mean over the actuators. The folds are parts of the phase of the motion.
         actuators: Efforts of the actuators, in the arm's order.
         shift: Time shift between the two recordings [s].
     """
@@ -92,11 +93,11 @@ class Payload:
         return self.body.mass > self.quantile * self.mass_error
 
     def as_dict(self, estimates: Sequence[Payload] = ()) -> dict:
-        """Returns the data of `payload --json`, with None for coordinates that are not identifiable.
+        """Returns the output of `payload --json` for this link. Coordinates that are not identifiable are None.
 
         Args:
-            estimates: Payloads on all links, for comparison. If no payload was found on this link and a payload on
-                another link explains the change, "largest_at_com" is None.
+            estimates: Payloads on all links, for comparison. The entry "largest_at_com" is None if no payload was found
+                on this link and a payload on another link may explain the change of the efforts.
         """
         determined = self.body.determined
         contradicted = bool(contradicting_links(self, estimates))
@@ -128,17 +129,17 @@ def estimate_payload(
     links: Sequence[str] | None = None,
     progress: Callable[[float], object] = lambda _: None,
 ) -> list[Payload]:
-    """Estimates a point mass on each link from the change of the efforts, best link first.
+    """Estimates a point mass on each link from the change of the efforts. The best link is first.
 
     The model of the change of an actuator's effort has two parts: the ten regressor columns of the link with the
     parameters of a point mass, and possible changes of the drives (`MotionDifference.changes`). The payload is assumed
     to be small compared with its distance from the joint axes. This assumption separates mass and position on a link
-    that rotates about a fixed point, where only m p and the inertia m p p' are identifiable.
+    that rotates about a fixed point. For such a link, only m p and the inertia m p p' are identifiable.
 
     The residual of each actuator is whitened (`Whitening`), because errors of offsets, friction and cables vary slowly,
-    whereas inertia affects the fast parts of a motion. The standard errors are a delete-one jackknife over the folds of
-    `phase_folds`, because errors that repeat with the motion do not average out over its periods. They are at least
-    the standard errors for independent rows.
+    whereas inertia affects the high frequencies. The standard errors are computed by a delete-one jackknife over the
+    folds of `phase_folds`, because errors that repeat with the motion do not average out over the periods. They are at
+    least the standard errors for independent rows.
 
     Args:
         reference: Motion with efforts, without the payload.
@@ -149,8 +150,8 @@ def estimate_payload(
         progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
-        RecordingError: A recording is not a motion of this arm, the recordings are not of the same motion, or they are
-            identical.
+        RecordingError: A recording is not a motion of this arm, the recordings are not of the same motion, or their
+            efforts are identical.
         ModelError: A link does not exist.
     """
     regressor = model.regressor
@@ -181,7 +182,7 @@ class PayloadIdentification:
     """Result of `payload`.
 
     Attributes:
-        payload: Payload on the given link, or else on the link that explains the change best.
+        payload: Payload on the given link. Without a given link: payload on the link that explains the change best.
         estimates: Payload on each moving link, best first.
         model: Model of the arm without the payload.
         warnings: Findings about links that explain the change better, and about the recordings.
@@ -195,7 +196,7 @@ class PayloadIdentification:
     link: str | None = None
 
     def as_dicts(self) -> list[dict]:
-        """Returns the data of `payload --json`: the payload on the given link, or else on every link."""
+        """Returns the output of `payload --json`: payload on the given link, or on every link if none is given."""
         payloads = self.estimates if self.link is None else [self.payload]
         return [payload.as_dict(self.estimates) for payload in payloads]
 
@@ -215,16 +216,17 @@ def payload(
         loaded: The same motion with the payload.
         model: Model identified from a motion of the arm without the payload. If an arm is given instead, the model is
             identified from `reference`.
-        link: SDF link that carries the payload. None selects the link that explains the change best.
-        progress: Callback that receives the step, "checking the recording", "identifying" or "estimating", and its
-            finished share, 0 to 1.
+        link: SDF link to which the payload is attached. None: the link that explains the change best.
+        progress: Callback that receives the name of the step ("checking the recording", "identifying" or "estimating")
+            and the finished share of the step (0 to 1).
 
     Returns:
         Result with mass [kg], position [m] and standard errors as `payload`, the estimates on all links as `estimates`,
         and `warnings`.
 
     Raises:
-        RecordingError: `check` rejects a recording, or the two motions differ. See `findings` of the error.
+        RecordingError: `check` rejects a recording, or the two motions differ. The attribute `findings` of the error
+            contains the reasons.
         ModelError: The model has no dynamics, or the link does not exist.
         IdentificationError: The model of the arm is not identifiable from `reference`.
 
@@ -267,7 +269,7 @@ def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
 
 
 def equally_good_links(estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the payloads on links that explain the change as well as the best link."""
+    """Returns the payloads on links that explain the change about as well as the best link."""
     return [payload for payload in estimates if payload.relative_error <= SAME_ERROR * estimates[0].relative_error]
 
 
@@ -285,7 +287,7 @@ def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tupl
     same = [other.link for other in equally_good_links(estimates)]
     mass = f" ({first.body.mass:.3g} +- {first.mass_error:.2g} kg)" if first.found else ""
     what = (
-        f"a payload on {' or '.join(same)}{mass} explains the change better (cross-validated error "
+        f"a payload on {' or '.join(same)}{mass} explains the change of the efforts better (cross-validated error "
         f"{100 * first.relative_error:.1f} % instead of {100 * payload.relative_error:.1f} %)"
     )
     advice = f"Unless the payload is certainly on {payload.link}, run again with --link {first.link}."
@@ -295,7 +297,8 @@ def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tupl
 def contradicting_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
     """Returns the payloads on other links that may explain the change, best first.
 
-    These links explain the change clearly better, or a payload was found on them and reduces the cross-validated error.
+    A link is listed if a payload on it explains the change clearly better. It is also listed if a payload was found on
+    it and reduces the cross-validated error.
     """
     better = better_links(payload, estimates)
     return [
@@ -340,7 +343,7 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
 
 
 def _jackknife(estimates: list[list[float]], min_errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the standard errors (k,), at least `min_errors`, from estimates (folds, k) that exclude one fold each."""
+    """Returns the standard errors (k,), at least `min_errors`. Each row of `estimates` (folds, k) excludes one fold."""
     return np.maximum(np.sqrt((len(estimates) - 1) * np.var(np.array(estimates), axis=0)), min_errors)
 
 
@@ -360,7 +363,10 @@ class _Problems:
 
     @classmethod
     def of(cls, link: LinkInertia, columns: NDArray[np.float64], difference: MotionDifference) -> _Problems:
-        """Creates the problems for the ten regressor columns (m, n, 10) of the link on the grid of the motion."""
+        """Creates the least-squares problems of the link from its ten regressor columns (m, n, 10).
+
+        The columns are sampled on the grid of the motion.
+        """
         grid, n = difference.grid, difference.grid.arm.num_joints
         at_rows = np.stack([grid.at_rows(columns[:, i], i) for i in range(n)], axis=1)
         filtered = grid.filter_efforts(at_rows)[difference.rows]
@@ -398,7 +404,7 @@ def _problem(
 
 
 def _in_base(arm: Arm, link: str, position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the position (3,) in the base frame of a point in the link frame, with all joints at 0 [m]."""
+    """Transforms a position (3,) from the link frame to the base frame, with all joint positions at 0 [m]."""
     plant = shared_plant(arm)
     context = plant.CreateDefaultContext()
     for name, x in zip(arm.tree_joint_names, arm.linkage.position(np.zeros(arm.num_joints)), strict=True):

@@ -1,4 +1,4 @@
-"""Fits a point mass on a link to a difference of efforts, using the normal equations."""
+"""Fits a point mass on a link to the difference of the efforts of two recordings."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from scipy.optimize import least_squares
 
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 
-#: Largest distance from the link's own centre of mass along each axis [m]. No arm is longer.
+#: Largest distance of the point mass from the link's own centre of mass along each axis [m]. All arms are shorter.
 MAX_DISTANCE = 1.0
-#: Largest mass [kg].
+#: Largest mass of the point mass [kg].
 MAX_MASS = 10.0
 #: Largest standard error of an identifiable coordinate [m].
 MAX_STANDARD_ERROR = 0.5
-#: Distances of the initial positions from the link's own centre of mass [m]. The centre is also an initial position.
+#: Distances of the initial positions from the link's own centre of mass [m]. The centre of mass is also an initial
+#: position.
 _INITIAL_DISTANCES = (0.15, 0.4)
 #: Number of inertial parameters of a rigid body.
 _RIGID = 10
@@ -31,7 +32,8 @@ class PointMass:
     Attributes:
         mass: Mass [kg].
         position: Position (3,) in the link frame [m].
-        determined: Mask (3,) of the identifiable coordinates. The others are set to the link's centre of mass.
+        determined: Mask (3,) of the identifiable coordinates. All other coordinates are those of the link's centre of
+            mass.
     """
 
     mass: float
@@ -59,7 +61,9 @@ def point_mass_parameters(mass: float, position: NDArray[np.float64]) -> NDArray
 class PointMassProblem:
     """Regression tau_i = Y_i phi(m, p) + N_i x_i for every actuator i.
 
-    The nuisance parameters x_i are changes of the drives, with normal priors about 0.
+    tau_i is the difference of the efforts, Y_i is the regressor of the link, and phi(m, p) are the inertial parameters
+    of the point mass. The nuisance parameters x_i are the coefficients of possible changes of the drive N_i, with
+    normal priors of mean 0.
 
     Attributes:
         equations: Normal equations. The ten columns of the link come first, then the nuisance parameters.
@@ -78,7 +82,7 @@ class PointMassProblem:
 
         Args:
             equations: Normal equations. The ten columns of the link come first, then the nuisance parameters.
-            independent: Share of the rows that are independent measurements.
+            independent: Ratio of the number of independent measurements to the number of rows.
             com: Centre of mass (3,) of the link in the link frame [m].
             precision: Reciprocal prior variances (n, k) of the nuisance parameters, 0 if there is no prior.
             rows: Number of rows.
@@ -90,15 +94,15 @@ class PointMassProblem:
     def fit(self, start: PointMass | None = None) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
         """Fits the point mass.
 
-        Each actuator is weighted by its residual variance. Coordinates that are not identifiable are set to the link's
-        centre of mass, one after another.
+        Each actuator is weighted by the reciprocal of its residual variance. Position coordinates that are not
+        identifiable are set to those of the link's centre of mass, one after another.
 
         Args:
-            start: Initial value. None tries several values, because the cost has several local minima.
+            start: Initial value. None: several initial values are used, because the cost has several local minima.
 
         Returns:
-            Point mass, weights (n,) of the actuators, and standard errors (4,) of mass and position for independent
-            noise.
+            Point mass, weights (n,) of the actuators, and standard errors (4,) of mass and position, assuming
+            independent noise.
         """
         weights = self._count / np.maximum(self._total[:, -1, -1], _TINY)
         determined = np.ones(3, dtype=bool) if start is None else start.determined
@@ -109,7 +113,7 @@ class PointMassProblem:
                 body = self._refine(reduced, weights, body)
                 weights = self._count / np.maximum(_squared_residuals(reduced, body), _TINY)
             errors = self._standard_errors(self._reduced(self._total, weights), weights, body)
-            # A coordinate at the boundary of the search is not identifiable.
+            # A coordinate at the boundary of the search region is not identifiable.
             position_errors = np.where(np.abs(body.position - self.com) > MAX_DISTANCE - 1e-6, np.inf, errors[1:])
             worst = int(np.argmax(np.where(determined, position_errors, 0.0)))
             if not determined[worst] or not position_errors[worst] > MAX_STANDARD_ERROR:
@@ -122,7 +126,9 @@ class PointMassProblem:
         return self._refine(self._reduced(others, weights), weights, start)
 
     def mass_at_com(self, weights: NDArray[np.float64], fold: int | None = None) -> tuple[float, float]:
-        """Returns the mass at the link's centre of mass and its standard error for independent noise [kg].
+        """Returns the estimated mass of a payload at the link's centre of mass and the standard error [kg].
+
+        The standard error is valid for independent noise.
 
         Args:
             weights: Weights (n,) of the actuators.
@@ -135,13 +141,14 @@ class PointMassProblem:
         return float(unit @ b) / information, information**-0.5
 
     def nuisances(self, body: PointMass, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the nuisance parameters (n, k) for a point mass."""
+        """Returns the nuisance parameters (n, k) that are fitted together with a given point mass."""
         return np.array([self._own_nuisances(i, self._total[i], body.parameters, weights) for i in range(len(weights))])
 
     def fold_errors(self, fold: int, weights: NDArray[np.float64], start: PointMass | None) -> NDArray[np.float64]:
-        """Returns the sum of squared prediction errors (n,) of one held-out fold.
+        """Returns the sums of squared prediction errors (n,) of one held-out fold.
 
-        The point mass is fitted to the other folds with the initial value `start`. None means no point mass.
+        The point mass is fitted to the other folds with the initial value `start`. If `start` is None, the prediction
+        has no point mass.
         """
         others, own = self.equations.without_fold(fold).dense(), self.equations.of_fold(fold).dense()
         phi = np.zeros(_RIGID)
@@ -177,12 +184,15 @@ class PointMassProblem:
     def _own_nuisances(
         self, i: int, H: NDArray[np.float64], phi: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Returns the nuisance parameters (k,) of actuator i for phi (10,), from sums of products H."""
+        """Returns the nuisance parameters (k,) of actuator i for phi (10,), computed from the sums of products H."""
         right = H[_RIGID:-1, -1] - H[_RIGID:-1, :_RIGID] @ phi
         return _pseudo_solve(H[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i]), right)
 
     def _reduced(self, products: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the products (n, 11, 11) of the link's columns and the effort, without nuisance parameters."""
+        """Returns the products (n, 11, 11) of the link's columns and the effort.
+
+        The nuisance parameters are eliminated.
+        """
         keep = np.append(np.arange(_RIGID), products.shape[-1] - 1)
         reduced = np.empty((len(products), _RIGID + 1, _RIGID + 1))
         for i, full in enumerate(products):
@@ -194,7 +204,7 @@ class PointMassProblem:
     def _search(
         self, reduced: NDArray[np.float64], weights: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> PointMass:
-        """Returns the best fit of several initial values."""
+        """Returns the best of several fits with different initial values."""
         offsets = [np.zeros(3)] + [
             s * d * axis for d in _INITIAL_DISTANCES for axis in np.eye(3)[determined] for s in (1, -1)
         ]
@@ -236,7 +246,8 @@ class PointMassProblem:
     ) -> NDArray[np.float64]:
         """Returns the standard errors (4,) of mass and position.
 
-        A standard error is infinite if the quantity is not identifiable, and 0 if it is not estimated.
+        A standard error is very large if the mass or coordinate is not identifiable, and 0 if the coordinate is not
+        estimated.
         """
         A, _ = _rows(reduced, weights)
         jacobian = A @ _derivatives(body.mass, body.position)
@@ -251,13 +262,13 @@ class PointMassProblem:
 
 
 def _squared_residuals(reduced: NDArray[np.float64], body: PointMass) -> NDArray[np.float64]:
-    """Returns the sums of squared residuals (n,) of a point mass, with fitted nuisance parameters."""
+    """Returns the sums of squared residuals (n,) for a point mass and fitted nuisance parameters."""
     residual = np.append(-body.parameters, 1.0)
     return np.maximum(np.einsum("a,nab,b->n", residual, reduced, residual), 0.0)
 
 
 def _derivatives(mass: float, position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the derivatives (10, 4) of the parameters with respect to mass and position.
+    """Returns the derivatives (10, 4) of the inertial parameters with respect to mass and position.
 
     Central differences are exact because the parameters are quadratic in the position.
     """
@@ -269,7 +280,7 @@ def _derivatives(mass: float, position: NDArray[np.float64]) -> NDArray[np.float
 
 
 def _pseudo_solve(H: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns H^+ b for a symmetric positive semidefinite H whose columns are scaled to equal size."""
+    """Returns H^+ b for a symmetric positive semidefinite H, which is scaled to a unit diagonal."""
     scale = 1 / np.sqrt(np.maximum(np.diag(H), _TINY))
     inverse = np.linalg.pinv(H * np.outer(scale, scale), rcond=_NEGLIGIBLE, hermitian=True)
     return np.asarray((inverse * np.outer(scale, scale)) @ b)
@@ -285,7 +296,7 @@ def _weighted(
 def _rows(
     reduced: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns A (k, 10) and b (k,) such that |A phi - b|^2 is the weighted cost, up to a constant."""
+    """Returns A (k, 10) and b (k,) for which |A phi - b|^2 is the weighted cost up to a constant."""
     H, b = _weighted(reduced, weights)
     scale = 1 / np.sqrt(np.maximum(np.diag(H), _TINY))
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))

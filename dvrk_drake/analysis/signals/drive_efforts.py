@@ -1,4 +1,4 @@
-"""Predicts the efforts of a motion with a model, with friction separated from all other efforts."""
+"""Predicts the efforts of a motion and separates friction from all other efforts."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
 FrictionPart = Literal["dry", "viscous"]
-#: Part of the friction, dry or viscous, for each friction kind. The kinds of one part change together, for example with
-#: temperature or lubrication.
+#: Part of the friction, dry or viscous, for each kind of friction effect. All kinds of one part change together, for
+#: example with temperature or lubrication.
 FRICTION_PARTS: dict[str, FrictionPart] = {
     **dict.fromkeys(("coulomb", "load coulomb", "stribeck", "presliding"), "dry"),
     "viscous": "viscous",
@@ -24,22 +24,22 @@ FRICTION_PARTS: dict[str, FrictionPart] = {
 
 @dataclass(frozen=True, eq=False)
 class DriveEfforts:
-    """Predicted actuator efforts at the rows of a motion, after low-pass filtering and without the ends.
+    """Predicted actuator efforts at the inner rows of a motion (`MotionGrid.inner`), after low-pass filtering.
 
     Attributes:
         other: Efforts (r, n) of the rigid bodies and of all effects except friction [N m, N].
-        friction: Actuator efforts (r, n) for each coordinate and part of the friction [N m, N].
+        friction: Actuator efforts (r, n) of the dry or viscous friction at each coordinate [N m, N].
     """
 
     other: NDArray[np.float64]
     friction: dict[tuple[str, FrictionPart], NDArray[np.float64]]
 
     def total(self) -> NDArray[np.float64]:
-        """Returns the sum (r, n) of all efforts."""
+        """Returns the sum (r, n) of friction and all other efforts."""
         return self.other + sum(self.friction.values(), np.zeros_like(self.other))
 
     def friction_part(self, part: FrictionPart) -> NDArray[np.float64]:
-        """Returns the actuator efforts (r, n) of one part of the friction, summed over all coordinates."""
+        """Returns the actuator efforts (r, n) of the dry or viscous friction, summed over all coordinates."""
         return sum((x for (_, own), x in self.friction.items() if own == part), np.zeros_like(self.other))
 
 
@@ -71,7 +71,7 @@ MAX_OPPOSITE_CORRELATION = -0.3
 def refuse_opposite_efforts(
     recording: Recording, names: tuple[str, ...], tau: NDArray[np.float64], expected: NDArray[np.float64]
 ) -> None:
-    """Rejects measured efforts with the opposite sign of the predicted efforts, ignoring offsets.
+    """Rejects measured efforts whose sign is opposite to the sign of the predicted efforts. Offsets are ignored.
 
     Args:
         recording: Recording of the efforts, for the message.
@@ -86,8 +86,8 @@ def refuse_opposite_efforts(
     size = np.sqrt(np.sum(x**2, axis=0) * np.sum(y**2, axis=0))
     correlation = np.sum(x * y, axis=0) / np.maximum(size, np.finfo(float).tiny)
     if len(wrong := np.flatnonzero(correlation < MAX_OPPOSITE_CORRELATION)):
-        which = ", ".join(f"{names[j]} ({correlation[j]:.2f})" for j in wrong)
+        which = ", ".join(f"{names[j]} (correlation {correlation[j]:.2f})" for j in wrong)
         raise RecordingError(
-            f"{recording.source or 'recording'}: efforts are opposite to the efforts of the model (correlation): "
-            f"{which}. Check the signs of tau and q (efforts are positive in the direction of +q), and check the arm."
+            f"{recording.source or 'recording'}: measured efforts are opposite to the efforts of the model: {which}. "
+            "Check the signs of tau and q (efforts are positive in the direction of +q), and check the arm."
         )

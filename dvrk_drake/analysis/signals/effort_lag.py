@@ -1,4 +1,4 @@
-"""Estimates the delay of the efforts relative to the motion, and the sign of their friction."""
+"""Estimates the delay of the efforts relative to the motion, and the Coulomb friction of the actuators."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ ENDS = 1.0
 SMOOTHING = 0.1
 #: Number of segments of the motion from which the standard errors are estimated.
 NUM_SEGMENTS = 5
-#: Smallest ratio of the residual variances without and with a significant delay, and smallest ratio of the delay to its
-#: standard error.
+#: A delay is significant if two ratios exceed these numbers: the ratio of the residual variances without and with the
+#: delay, and the ratio of the delay to its standard error.
 MIN_GAIN, MIN_ERRORS = 1.12, 5.0
 
 
@@ -29,8 +29,8 @@ class EffortLag(NamedTuple):
     """Delay of tau relative to the motion, and Coulomb friction. All arrays have shape (n,).
 
     Attributes:
-        lag: Delay with the smallest residual variance [s], at most `MAX_LAG`; nan if the joint or its effort is
-            constant.
+        lag: Delay with the smallest residual variance [s], between -`MAX_LAG` and `MAX_LAG`. nan if the actuator does
+            not move or its effort is always 0.
         standard_error: Standard error of the delay, from `NUM_SEGMENTS` segments of the motion [s].
         gain: Ratio of the residual variances without and with the delay [1].
         determined: True if the delay is significant, see `MIN_GAIN` and `MIN_ERRORS`.
@@ -50,8 +50,9 @@ class EffortLag(NamedTuple):
 def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
     """Estimates the delay of each effort by fits with delays between -`MAX_LAG` and `MAX_LAG`.
 
-    The regressors are the actuator's Coulomb and viscous friction, all accelerations, and sine and cosine of all
-    positions. Presliding friction has a similar effect as a delay and is not identifiable separately in one motion.
+    The regressors are the actuator's Coulomb and viscous friction, the accelerations, the sines and cosines of the
+    positions, and an offset. The accelerations and positions of all moving actuators are used. Presliding friction has
+    a similar effect to a delay, so the two are not identifiable separately from one motion.
 
     Args:
         signals: Signals in actuator coordinates.
@@ -77,7 +78,7 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
 
 
 def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[float, float]:
-    """Returns the coefficient of the first column (Coulomb friction) and its standard error."""
+    """Returns the coefficient of the first column (Coulomb friction) and the standard error of the coefficient."""
     segments = zip(np.array_split(columns, NUM_SEGMENTS), np.array_split(tau, NUM_SEGMENTS), strict=True)
     estimates = [np.linalg.lstsq(A, b, rcond=None)[0][0] for A, b in segments]
     coefficient = np.linalg.lstsq(columns, tau, rcond=None)[0][0]
@@ -85,7 +86,7 @@ def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[fl
 
 
 def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: float) -> tuple[float, float, float]:
-    """Returns the lag [s], its standard error [s] and its gain, for regressors with orthonormal basis Q."""
+    """Returns the delay [s], its standard error [s] and its gain, for regressors with the orthonormal basis Q."""
     step = max(round(LAG_STEP * rate), 1)
     shifts = np.arange(-(inner.start // step), inner.start // step + 1) * step
     shifts = shifts[np.abs(shifts) <= MAX_LAG * rate]
@@ -98,7 +99,7 @@ def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: f
 
 
 def _minimiser(x: NDArray[np.int_], values: NDArray[np.float64]) -> float:
-    """Returns the minimiser of a curve with values at equidistant x, with parabolic interpolation."""
+    """Returns the minimiser of a curve with given values at equidistant x, from parabolic interpolation."""
     i = int(np.clip(np.argmin(values), 1, len(values) - 2))
     before, minimum, after = values[i - 1 : i + 2]
     curvature = before - 2 * minimum + after

@@ -12,7 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: Order of the Butterworth low-pass filter. It runs forwards and backwards, which halves the amplitude at the cut-off.
+#: Order of the Butterworth low-pass filter. The filter runs forwards and backwards, which halves the amplitude at the
+#: cut-off frequency.
 ORDER = 6
 
 
@@ -22,8 +23,8 @@ def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int
     Args:
         x: Samples (m,) or (m, n) at a constant rate.
         rate: Sampling rate [Hz].
-        cut_off: Frequency at which the amplitude is halved [Hz], a scalar or one value (n,) per column. A column with a
-            cut-off of half the sampling rate or more is not changed.
+        cut_off: Frequency at which the amplitude is halved [Hz], a scalar or one value (n,) per column. If it is at
+            least half the sampling rate, the column is not changed.
         order: Order of the filter in each direction, even.
     """
     columns = np.asarray(x, dtype=np.float64).reshape(len(x), -1)
@@ -36,7 +37,7 @@ def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int
 
 
 def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) -> NDArray[np.float64]:
-    """Filters columns (m, k), extended at both ends by point reflection. `cut_off` is a share of the sampling rate."""
+    """Filters columns (m, k) after point reflection at both ends. `cut_off` is a share of the sampling rate."""
     if cut_off >= 0.5:
         return x
     sos = butterworth(order, cut_off)
@@ -44,7 +45,7 @@ def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) 
     if len(x) <= edge:
         raise ValueError(f"the filter requires more than {edge} rows, got {len(x)}")
     y = np.concatenate([2 * x[0] - x[edge:0:-1], x, 2 * x[-1] - x[-2 : -edge - 2 : -1]])
-    # Steady state (s, 2, 1) of each section for a constant input of 1, which has the constant output 1.
+    # Steady state (s, 2, 1) of each section, at which a constant input of 1 gives a constant output of 1.
     steady_state = np.stack([1 - sos[:, 0], sos[:, 2] - sos[:, 5]], axis=1)[:, :, None]
     for _ in ("forwards", "backwards"):
         _filter(sos, steady_state * y[0], y)
@@ -54,7 +55,7 @@ def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) 
 
 @lru_cache(64)
 def butterworth(order: int, cut_off: float) -> NDArray[np.float64]:
-    """Returns second-order sections (s, 6) [b0 b1 b2 1 a1 a2] of a Butterworth low-pass, by the bilinear transform.
+    """Returns second-order sections (s, 6) [b0 b1 b2 1 a1 a2] of a Butterworth filter from the bilinear transform.
 
     Args:
         order: Order of the filter, even.
@@ -69,7 +70,7 @@ def butterworth(order: int, cut_off: float) -> NDArray[np.float64]:
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def _filter(sos, state, x):  # pragma: no cover - compiled
-    """Runs second-order sections (s, 6) with state (s, 2, k) over the rows of x (m, k), in place."""
+    """Filters x (m, k) along axis 0 by second-order sections (s, 6) with state (s, 2, k). Changes x and the state."""
     for row in range(len(x)):
         for s in range(len(sos)):
             b0, b1, b2, a1, a2 = sos[s, 0], sos[s, 1], sos[s, 2], sos[s, 4], sos[s, 5]
@@ -90,14 +91,14 @@ def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def central_difference(x: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
-    """Computes the derivative of x (m, ...) along axis 0 per second, one-sided at both ends."""
+    """Computes the time derivative of x (m, ...) along axis 0, with one-sided differences at both ends."""
     return np.asarray(np.gradient(x, 1 / rate, axis=0), dtype=float)
 
 
 def resample(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Interpolates x (m, ...), given at increasing times t (m,), at `times` (k,).
+    """Interpolates x (m, ...) from increasing times t (m,) to new `times` (k,).
 
-    The interpolation is piecewise cubic without overshoot (PCHIP).
+    The interpolation is piecewise cubic without overshoot (PCHIP). Outside t, the first or last value is used.
     """
     from scipy.interpolate import PchipInterpolator
 

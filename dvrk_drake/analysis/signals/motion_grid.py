@@ -14,7 +14,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
-#: Rate of the grid [Hz], high enough to resolve hysteresis when a joint reverses its direction.
+#: Rate of the time grid [Hz], high enough to resolve hysteresis when a joint reverses its direction.
 GRID_RATE = 400.0
 #: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
@@ -134,7 +134,7 @@ class MotionGrid:
         return flat.reshape(x.shape)[self.inner]
 
     def efforts_at_rows(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Interpolates efforts (m, n) of the actuators from the grid to the rows (r, n), with their delays."""
+        """Interpolates efforts (m, n) of the actuators from the grid to the rows (r, n), with the effort delays."""
         return np.column_stack([self.at_rows(tau[:, i], i) for i in range(tau.shape[1])])
 
 
@@ -158,7 +158,7 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
         recording: Motion with t and efforts, in joint or actuator coordinates.
         arm: Arm that was recorded.
         settings: Cut-offs of the filters and delays of the efforts.
-        clock: Result of `true_time` for the recording in actuator coordinates. None computes it.
+        clock: Result of `true_time` for the recording in actuator coordinates. None: computed by this function.
 
     Raises:
         RecordingError: The recording does not match the arm, has no times, is too short, or its rate is too low.
@@ -170,7 +170,7 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
     rate = (len(recording) - 1) / duration
     if duration < MIN_DURATION or rate < MIN_RATE:
         raise RecordingError(
-            f"{recording.source or 'recording'}: the motion has {duration:.1f} s at {rate:.0f} Hz. A dynamic model "
+            f"{recording.source or 'recording'}: the motion lasts {duration:.1f} s at {rate:.0f} Hz. A dynamic model "
             f"requires at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         )
     t = _even_times(clock, GRID_RATE)

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-#: Duration of the segments for averaged periodograms [s]. The frequency resolution [Hz] is its reciprocal.
+#: Duration of the segments for averaged periodograms [s]. The frequency resolution [Hz] is the reciprocal of this
+#: duration.
 SEGMENT_DURATION = 2.56
 #: Smallest cut-off frequency [Hz].
 MIN_CUT_OFF = 2.0
-#: Smallest ratio of the peak of a narrow band to the median noise below and above the band.
+#: Smallest ratio of the peak noise in a narrow band to the median noise below and above the band.
 PEAK = 4.0
-#: Noise at the edges of a narrow band as a share of its peak, and largest width of a narrow band [octaves].
+#: Noise at the edges of a narrow band as a share of the peak noise, and largest width of a narrow band [octaves].
 EDGE, MAX_OCTAVES = 0.15, 2.0
 #: Smallest reported RMS of a narrow band, as a share of the RMS of signal and noise.
 MIN_SHARE = 0.03
@@ -25,7 +26,7 @@ class Spectra(NamedTuple):
 
     Attributes:
         frequency: Frequencies (k,) [Hz].
-        signal: Power spectral densities (k, n) of the repeating part.
+        signal: Power spectral densities (k, n) of the signal without noise.
         noise: Power spectral densities (k, n) of the noise.
     """
 
@@ -51,13 +52,14 @@ class Band(NamedTuple):
 def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectra:
     """Computes the spectra of signal and noise.
 
-    For a period T, the noise is (x(t) - x(t + T)) / sqrt(2), and the signal is the remaining power of x. Without a
-    period, white noise is assumed. Its density is the median above a quarter of the sampling rate.
+    For a period T, the noise is (x(t) - x(t + T)) / sqrt(2). Without a period, white noise is assumed. Its density is
+    then the median density of x above a quarter of the sampling rate. The spectrum of the signal is the spectrum of x
+    minus the spectrum of the noise.
 
     Args:
         x: Samples (m, n) at a constant rate.
         rate: Sampling rate [Hz].
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
     """
     from scipy.signal import welch  # takes 0.3 s, see `low_pass`
 

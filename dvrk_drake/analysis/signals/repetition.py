@@ -8,24 +8,24 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.analysis.signals.low_pass import correlation, low_pass
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
 
-#: Largest difference of the positions one period later if the motion repeats, as a share of their standard deviation
-#: (RMS over the joints that move).
+#: Largest difference D(T) of the positions of a motion that repeats after the period T, see `find_period`.
 SAME_MOTION = 0.1
-#: Smallest duration of the second period, as a share of the period.
+#: Smallest recorded part of the second period, as a share of the period.
 MIN_OVERLAP = 0.25
 #: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
 
 
 def find_period(q: NDArray[np.float64], rate: float) -> float | None:
-    """Returns the period of a motion [s], or None if it does not repeat.
+    """Returns the period of a motion [s], or None if the motion does not repeat.
 
-    The period is the smallest local minimum, at most `SAME_MOTION`, of
+    The difference of the positions after a time T is
 
         D(T)^2 = mean_j mean_t (q_j(t) - q_j(t + T))^2 / (2 var(q_j))
 
-    over the joints j that move, refined by parabolic interpolation. D is 0 for an exact repetition and 1 for
-    uncorrelated positions.
+    for the joints j that move. D is 0 for an exact repetition and 1 for uncorrelated positions. Candidates for the
+    period are the local minima of D below `SAME_MOTION`. Among the candidates near the shortest one, the period is the
+    candidate with the smallest D. Parabolic interpolation refines this period.
 
     Args:
         q: Positions (m, n) at a constant rate [rad, m].
@@ -48,7 +48,7 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     is_minimum = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] < inner[2:]) & (inner[1:-1] < SAME_MOTION**2)
     if not np.any(is_minimum):
         return None
-    # Fast joints cause more minima near the true minimum. The smallest minimum near the shortest candidate is used.
+    # Fast joints cause additional minima near the true one. The smallest minimum near the shortest candidate is used.
     candidates = np.flatnonzero(is_minimum) + 2
     near = candidates[candidates < 1.5 * candidates[0]]
     lag = int(near[np.argmin(difference[near])])
@@ -62,11 +62,10 @@ def repeatability_floor(
 ) -> NDArray[np.float64]:
     """Computes the repeatability of efforts: their relative RMS difference between periods [1].
 
-    It approximates the smallest relative error of a model that is a function of q, v and vd:
-
         floor_j = rms(tau_j(t) - tau_j(t + T)) / sqrt(2) / rms(tau_j)
 
-    The efforts are filtered with a zero-phase low-pass filter, and `ENDS` are omitted.
+    This value approximates the smallest possible relative error of a model that is a function of q, v and vd. The
+    efforts are filtered with a zero-phase low-pass filter, and `ENDS` is omitted at both ends.
 
     Args:
         tau: Efforts (m, n) of the actuators at a constant rate [N m, N].
@@ -88,12 +87,13 @@ def repeatability_floor(
 
 #: Number of folds for cross-validation.
 FOLDS = 12
-#: Duration next to a held-out fold that is not used for fitting, because of the length of the filters [s].
+#: Duration next to a held-out fold that is not used for the fit [s]. Low-pass filtering correlates these rows with the
+#: rows of the held-out fold.
 GAP = 0.1
 
 
 def period_of(grid: MotionGrid) -> float | None:
-    """Returns the period of the motion [s], or None if it does not repeat."""
+    """Returns the period of the motion [s], or None if the motion does not repeat."""
     return find_period(grid.arm.transmission.position(grid.q), GRID_RATE)
 
 
@@ -102,16 +102,18 @@ def phase_folds(
 ) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
     """Assigns each inner row to a fold and marks the rows at the edges of the folds.
 
-    A periodic motion is divided by its phase. Otherwise each fold would be predicted from its own repetition.
+    A periodic motion is divided by its phase, so that the other folds contain no repetitions of a held-out fold. Any
+    other motion is divided by time.
 
     Args:
         grid: Resampled motion.
-        period: Period of the motion [s], or None if it does not repeat.
+        period: Period of the motion [s], or None if the motion does not repeat.
         folds: Number of folds.
 
     Returns:
         fold: Index (r,) of the fold of each row, 0 to folds - 1.
-        edge: Mask (r, 2) of the rows within `GAP` of the preceding fold, and of the following fold.
+        edge: Mask (r, 2) of the rows within `GAP` of the preceding fold (column 0) and of the following fold (column
+            1).
     """
     t = grid.row_times[grid.inner]
     length = period if period is not None else float(t[-1] - t[0]) * (1 + 1e-9)

@@ -23,7 +23,7 @@ MAX_REST_SPEED, MIN_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
 
 
 def static_poses(recording: Recording, arm: Arm) -> Recording | None:
-    """Extracts the static poses of a motion, at which the arm rests for at least `MIN_REST`.
+    """Extracts the static poses of a motion, at which the arm is at rest for at least `MIN_REST`.
 
     Each static segment is averaged over its second half. Segments at the same pose are averaged. A gap in the times
     ends a segment, because the motion in the gap is unknown.
@@ -33,11 +33,11 @@ def static_poses(recording: Recording, arm: Arm) -> Recording | None:
         arm: Arm that was recorded.
 
     Returns:
-        One row per static pose, in joint coordinates and without times. There may be no rows. None if `recording` is
-        not a motion (`Recording.is_motion`), or its times do not increase.
+        Recording with one row per static pose, in joint coordinates and without times. This result may have no rows. It
+        is None if `recording` is not a motion (`Recording.is_motion`), or its times do not increase.
 
     Raises:
-        RecordingError: The recording has no efforts, or is of another arm.
+        RecordingError: The recording has no efforts, or belongs to another arm.
     """
     moving = recording.in_joint_coordinates(arm)
     t = moving.t
@@ -72,9 +72,9 @@ def smooth_velocity(recording: Recording) -> NDArray[np.float64]:
 def stationary_runs(
     still: NDArray[np.bool_], q: NDArray[np.float64], max_distance: NDArray[np.float64], min_rows: int
 ) -> Iterator[NDArray[np.int_]]:
-    """Yields the rows of each segment in which the arm rests.
+    """Yields the row indices of each segment with low speed.
 
-    A segment ends where q leaves its range, and the next segment begins there.
+    A segment ends at the row at which the distance of q exceeds `max_distance`. The next segment begins at this row.
 
     Args:
         still: Mask (m,) of the rows with low speed.
@@ -93,9 +93,10 @@ def stationary_runs(
             start = stop
 
 
-#: Largest speed and acceleration in a low-speed segment, as shares of the joint's largest values.
+#: Largest speed and acceleration in a low-speed segment, as shares of the joint's 99 % quantiles of speed and
+#: acceleration.
 SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2
-#: Smallest interval of the rows [s]. Rows with shorter intervals are averaged.
+#: Largest interval between averaged rows [s]. Rows are averaged in blocks if at least two rows fit into this interval.
 MIN_PERIOD = 0.005
 #: Smallest number of rows of a low-speed segment.
 MIN_SAMPLES = 3
@@ -120,10 +121,10 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     """Extracts the low-speed segments of each joint as static poses, and averages repetitions.
 
     The efforts contain two errors: inertial efforts due to the motion of other joints, and dry friction of either sign.
-    Dynamic identification, or static poses of the whole arm (`static_poses`), are more accurate.
+    A dynamic identification or static poses of the whole arm (`static_poses`) give a more accurate model.
 
     Raises:
-        RecordingError: The recording has no efforts, or is of another arm.
+        RecordingError: The recording has no efforts, or belongs to another arm.
         IdentificationError: The recording has no times or velocities, or no low-speed segments.
     """
     moving = recording.in_joint_coordinates(arm)
@@ -131,7 +132,7 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     where = recording.source or "recording"
     if moving.qd is None or not (moving.is_motion and moving.has_increasing_times):
         raise IdentificationError(
-            f"{where}: the recording is not a motion, so it has no low-speed segments. Low-speed segments require the "
+            f"{where}: the recording has no low-speed segments, because it is not a motion with velocities. Required: "
             f"columns qd1..qd{arm.num_joints}, times t that increase by less than {MAX_PERIOD} s, and at least "
             f"{MIN_ROWS} rows."
         )
@@ -163,7 +164,7 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
 
 
 def _downsampled(recording: Recording) -> Recording:
-    """Averages blocks of rows, to a rate of at most 1 / `MIN_PERIOD`. The low-pass filter removes faster changes."""
+    """Averages blocks of rows to reduce their number. The low-pass filter removes faster changes anyway."""
     t, qd, tau = recording.t, recording.qd, recording.measured_effort()
     if t is None or qd is None:
         return recording
@@ -180,9 +181,9 @@ def _downsampled(recording: Recording) -> Recording:
 
 
 def _longest_of_each_pass(runs: Iterable[NDArray[np.int_]]) -> Iterator[NDArray[np.int_]]:
-    """Yields the longest run of each series of adjacent runs.
+    """Yields the longest run of rows of each series of adjacent runs.
 
-    The friction is the same in all runs of a series. The runs are not independent, so cross-validation uses only one.
+    The friction is the same in all runs of a series. These runs are not independent, so only one of them is used.
     """
     longest: NDArray[np.int_] | None = None
     last = -2
@@ -200,7 +201,7 @@ def _longest_of_each_pass(runs: Iterable[NDArray[np.int_]]) -> Iterator[NDArray[
 def _segments_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Arm) -> list[NDArray[np.int_]]:
     """Returns the rows of each low-speed segment of one joint. Repetitions of a segment are merged.
 
-    All joints stay within `SAME_SEGMENT` in each segment.
+    In each segment, all joints stay within `SAME_SEGMENT` of their positions at the start.
     """
     max_distance = arm.per_joint(*SAME_SEGMENT)
     segments: list[NDArray[np.int_]] = []
@@ -220,8 +221,8 @@ def _segments_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm:
 
 #: Note for models identified from low-speed segments.
 LOW_SPEED_NOTE = (
-    "Low-speed segments are treated as static poses. Their torques contain friction, and other joints may move. Use "
-    "the cross-validated errors or another recording to evaluate the model, not the errors of the fit."
+    "Low-speed segments are treated as static poses. The torques of these segments contain friction, and other joints "
+    "may move. Evaluate the model by the cross-validated errors or on another recording, not by the errors of the fit."
 )
 
 
@@ -230,10 +231,10 @@ class Poses(NamedTuple):
 
     Attributes:
         recording: Recording with one row per extracted pose, or the unchanged recording.
-        measured: Mask (m, n) of the efforts that are holding torques, None if all are.
-        note: Note on how poses were extracted from a motion, or "".
-        moves: True if the recording is a motion without enough static poses, from which a dynamic model can be
-            identified.
+        measured: Mask (m, n) of the efforts that are holding torques, None if all efforts are holding torques.
+        note: Note on how poses were extracted from a motion, "" if no poses were extracted.
+        moves: True if the recording is a motion with too few static poses, which is suitable for dynamic identification
+            only.
     """
 
     recording: Recording
@@ -243,7 +244,7 @@ class Poses(NamedTuple):
 
 
 def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = False) -> Poses:
-    """Extracts the static poses of a motion if it has at least `MIN_POSES`, otherwise returns the recording unchanged.
+    """Extracts the static poses of a motion, or returns the recording unchanged if there are fewer than `MIN_POSES`.
 
     Args:
         recording: Poses or a motion, in joint or actuator coordinates.
@@ -265,7 +266,7 @@ def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = F
 
 
 def _check_times(recording: Recording, arm: Arm) -> None:
-    """Rejects a motion whose times do not increase. Otherwise, it would be treated as poses."""
+    """Rejects a motion whose times do not increase. Without this check, it would be treated as poses."""
     t = recording.t
     if t is None or len(t) < MIN_ROWS or recording.has_increasing_times:
         return

@@ -14,9 +14,10 @@ from dvrk_drake.analysis.signals.low_pass import central_difference, low_pass, r
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
-#: Largest frequency for comparing velocities [Hz]. Motions are slower, and most timing jitter is faster.
+#: Cut-off frequency of the low-pass filter for the comparison of velocities [Hz]. Motions have lower frequencies, and
+#: most timing jitter has higher frequencies.
 CUT_OFF = 10.0
-#: Largest deviation of the gain from 1, and largest lag [s], of velocities that agree.
+#: Largest deviation of the gain from 1, and largest lag [s], of velocities that agree with dq/dt.
 GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
 #: Smallest RMS speed for a comparison [rad/s, m/s].
 MIN_SPEED = 1e-3
@@ -30,7 +31,7 @@ class VelocityAgreement(NamedTuple):
 
     Attributes:
         gain: Gain [1], nan if the joint does not move.
-        lag: Lag of qd [s], nan if the joint does not move.
+        lag: Lag of qd relative to dq/dt [s], nan if the joint does not move.
         mismatch: RMS residual of the fit divided by the RMS of qd [1].
         agrees: True if the gain is within `GAIN_TOLERANCE` of 1 and the lag is within `LAG_TOLERANCE`.
     """
@@ -45,7 +46,7 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
     """Compares qd with the time derivative of q.
 
     Args:
-        q: Positions (m, n) at a constant rate. Jitter of the times averages out below `CUT_OFF`.
+        q: Positions (m, n) at a constant rate. The low-pass filter removes most of the effect of timing jitter.
         qd: Velocities (m, n) at the same rate.
         rate: Sampling rate [Hz].
     """
@@ -58,7 +59,7 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
 
 
 def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple[float, float, float]:
-    """Returns gain, lag [samples] and mismatch of one joint, by Gauss-Newton iterations."""
+    """Returns gain, lag [samples] and mismatch of one joint from Gauss-Newton iterations."""
     size = float(np.sqrt(np.mean(qd[inner] ** 2)))
     if float(np.sqrt(np.mean(v[inner] ** 2))) < MIN_SPEED:
         return np.nan, np.nan, np.nan
@@ -77,11 +78,13 @@ def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple
     return float(gain), lag, float(np.sqrt(np.mean(residual**2))) / size
 
 
-#: Largest difference of equal values, as a share of the channel's RMS, because conversions of coordinates round.
+#: Largest difference between equal values, as a share of the RMS value of the channel. Equal values differ by rounding
+#: errors after a conversion of coordinates.
 SAME_VALUE = 1e-9
-#: Smallest number of rows, and of joints whose qd agrees with dq/dt, for reconstructing times.
+#: Smallest number of rows, and smallest number of joints whose qd agrees with dq/dt, for reconstructing times.
 MIN_ROWS, MIN_JOINTS = 100, 2
-#: Smallest ratio of the residual variances with recorded and reconstructed times for replacing the recorded times.
+#: Smallest ratio of the residual variance with recorded times to the residual variance with reconstructed times. Below
+#: this ratio, the recorded times are kept.
 MIN_VARIANCE_RATIO = 3.0
 #: Frequency below which the reconstructed times follow the recorded times [Hz].
 DRIFT = 0.3
@@ -96,8 +99,8 @@ class TrueTime(NamedTuple):
     Attributes:
         rows: Indices (k,) of the rows that do not repeat the previous row.
         t: Times (k,) of these rows, increasing [s]. Recorded times without significant jitter are kept.
-        jitter: Standard deviation of true minus recorded intervals, divided by the mean interval [1]. 0 if the recorded
-            times are kept.
+        jitter: Standard deviation of the differences between true and recorded intervals, divided by the mean interval
+            [1]. 0 if the recorded times are kept.
         reconstructed: True if t is reconstructed from q and qd.
     """
 
@@ -110,13 +113,15 @@ class TrueTime(NamedTuple):
 def true_time(recording: Recording) -> TrueTime:
     """Returns the times of the distinct rows, reconstructed from q and qd if the recorded times have jitter.
 
-    The model is dq_ij = qd_ij dt_i + noise_j, over the joints j whose qd agrees with dq/dt (`velocity_agreement`). The
-    maximum-a-posteriori interval dt_i between two rows, with the mean interval dt_0 as prior mean, is
+    The model is dq_ij = qd_ij dt_i + noise_j, for interval i and the joints j whose qd agrees with dq/dt
+    (`velocity_agreement`). The maximum-a-posteriori interval dt_i between two rows, with the mean interval dt_0 as
+    prior mean, is
 
         dt_i = (sum_j dq_ij qd_ij / s_j^2 + dt_0 / s^2) / (sum_j qd_ij^2 / s_j^2 + 1 / s^2)
 
-    Here qd_ij is the mean of both rows. The standard deviations s_j of the noise and s of the intervals are estimated
-    together with the intervals. The sum of the intervals is scaled to the recorded duration.
+    Here dq_ij is the position increment and qd_ij the mean velocity of the two rows. The standard deviations s_j of the
+    noise and s of the intervals are estimated together with the intervals. Then all intervals are scaled, so that their
+    sum is the recorded duration.
 
     Raises:
         RecordingError: The recording has no times, or they do not increase.
@@ -128,7 +133,7 @@ def true_time(recording: Recording) -> TrueTime:
         return TrueTime(rows, recorded, 0.0, False)
     q, qd, mean = recording.q[rows], recording.qd[rows], float(np.mean(np.diff(recorded)))
     reconstructed = recorded
-    # With jitter, some joints disagree at first. Their agreement is tested again with the reconstructed times.
+    # With jitter, qd of some joints disagrees with dq/dt at first. The reconstructed times are used for a second test.
     for _ in range(2):
         even = np.linspace(recorded[0], recorded[-1], len(recorded))
         resampled_q, resampled_qd = (resample(reconstructed, x, even) for x in (q, qd))
@@ -150,14 +155,14 @@ def true_time(recording: Recording) -> TrueTime:
 def _without_drift(
     recorded: NDArray[np.float64], reconstructed: NDArray[np.float64], mean: float
 ) -> NDArray[np.float64]:
-    """Removes the drift of the reconstructed times below `DRIFT`, which is caused by small errors of qd."""
+    """Removes the drift (below `DRIFT`) of the reconstructed times. Small errors of qd cause this drift."""
     difference = reconstructed - recorded
     intervals = np.diff(recorded + difference - low_pass(difference, 1 / mean, DRIFT))
     return recorded[0] + np.concatenate([[0.0], np.cumsum(np.maximum(intervals, MIN_INTERVAL * mean))])
 
 
 def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
-    """Returns a mask (m,) of the rows in motion whose q, qd and tau repeat the previous row."""
+    """Returns a mask (m,) of the rows in motion that repeat q, qd and tau of the previous row."""
     blocks = [block for block in (recording.q, recording.qd, recording.tau) if block is not None]
     repeats = np.all([repeated_block(block) for block in blocks], axis=0)
     moves = np.any(np.abs(recording.qd) > 0, axis=1) if recording.qd is not None else np.ones(len(recording), bool)
@@ -182,8 +187,8 @@ def increasing_times(recording: Recording) -> NDArray[np.float64]:
     if len(decreasing):
         row = int(decreasing[0]) + 1
         raise RecordingError(
-            f"{recording.where(row)}: t = {recording.t[row]:g} s does not increase, after {recording.t[row - 1]:g} s "
-            "in the previous row. Sort the rows by time."
+            f"{recording.where(row)}: t = {recording.t[row]:g} s is not greater than {recording.t[row - 1]:g} s in the "
+            "previous row. Sort the rows by time."
         )
     return recording.t
 
@@ -195,7 +200,7 @@ def _intervals(
 
     Args:
         dq: Position increments (k - 1, j) of j joints [rad, m].
-        qd: Mean velocities (k - 1, j) of both rows [rad/s, m/s].
+        qd: Mean velocities (k - 1, j) of the two rows of each interval [rad/s, m/s].
         mean: Mean interval [s].
 
     Returns:
@@ -216,5 +221,5 @@ def _intervals(
 def _residual_variance(
     dq: NDArray[np.float64], qd: NDArray[np.float64], intervals: NDArray[np.float64], noise: NDArray[np.float64]
 ) -> float:
-    """Returns the median over the rows of the squared residual dq - qd dt in units of the noise variance."""
+    """Returns the median over the intervals of sum_j (dq_j - qd_j dt)^2 / noise_j."""
     return float(np.median(np.sum((dq - qd * intervals[:, None]) ** 2 / noise, axis=1)))

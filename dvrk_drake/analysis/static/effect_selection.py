@@ -1,4 +1,4 @@
-"""Selects the joint effects of a static model by cross-validation."""
+"""Selects the effects (offsets, cables and springs) of a static model by cross-validation."""
 
 from __future__ import annotations
 
@@ -22,21 +22,22 @@ from dvrk_drake.models.arm import Arm
 if TYPE_CHECKING:
     from dvrk_drake.dynamics.static_model import StaticModel
 
-#: Prior standard deviation of a base parameter, as a share of the value at which it alone produces the effort limit of
-#: a joint.
+#: Prior standard deviation of a base parameter, as a share of the value at which this parameter alone produces the
+#: effort limit of a joint.
 BASE_PRIOR = 0.25
-#: Prior standard deviation of an effect, as a share of the effort limit along its coordinate. It is small for offsets,
-#: because over a narrow range a large offset would replace gravity and be wrong outside of this range.
+#: Prior standard deviation of the effort of an effect, as a share of the effort limit along the effect's coordinate.
+#: The value for offsets is small: over a narrow range of positions, a large offset would replace gravity in the fit,
+#: and the model would be wrong outside this range.
 EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3, "spring": 0.3}
 #: Smallest standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
-#: Smallest reduction of the sum of squared leave-one-out residuals (in units of sigma^2) per coefficient for adding an
-#: effect. It is about log(poses).
+#: Smallest reduction of the sum of squared leave-one-out residuals [sigma^2] by an added effect, per coefficient. The
+#: value is about the logarithm of the number of poses.
 MIN_GAIN = 4.0
-#: Smallest ratio of the reduction to its standard error for adding an effect.
+#: Smallest ratio of this reduction to its standard error over the poses.
 MIN_SIGNIFICANCE = 1.5
-#: Smallest range of a coordinate for adding a cable or a spring [rad]. Over a smaller range, a sine or a spring would
-#: fit the servo error, and a cosine would equal an offset.
+#: Smallest range of a coordinate for adding a cable or a spring [rad]. Within a smaller range, a sine or a spring would
+#: fit the position errors of the arm's controller, and a cosine would be almost equal to an offset.
 MIN_RANGE = {"cable sine": 0.25, "cable cosine": 1.5, "spring": 0.25}
 
 
@@ -52,7 +53,8 @@ class StaticProblem:
             tau: Joint torques (m, n) [N m, N].
             usable: Mask (m, n) of the measurements that are not excluded.
         """
-        from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
+        # Imported here, because the import of sympy takes 0.3 s and a motion does not need it.
+        from dvrk_drake.dynamics.static_model import compile_static_model
 
         self.arm, self.q, self.tau, self.usable = arm, q, tau, usable
         self.base_model = compile_static_model(arm)
@@ -72,7 +74,7 @@ class StaticProblem:
         return X
 
     def prior_precision(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
-        """Returns the reciprocal prior variances (b + e,) of the coefficients about zero."""
+        """Returns the reciprocal prior variances (b + e,) of base parameters and effects. The prior means are 0."""
         effect_sd = [
             EFFECT_PRIOR[effect.kind] * _effort_limit(self.arm, effect.coordinate) / _largest_shape(effect)
             for effect in effects
@@ -83,16 +85,17 @@ class StaticProblem:
     def fit(
         self, effects: Sequence[ActuatorEffect], iterations: int = 12, start: NDArray[np.float64] | None = None
     ) -> RobustFit:
-        """Returns the robust fit with the priors for the given effects, see `robust_fit` for `start` (n,)."""
+        """Returns the robust fit of base parameters and effects with priors, see `robust_fit` for `start` (n,)."""
         X, prior = self.regressor(effects), self.prior_precision(effects)
         return robust_fit(X, self.tau, self.usable, prior, self.sigma_floor, iterations, start)
 
 
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
-    """Returns the groups of candidate effects that the poses can identify: offset and cable of a joint, or its spring.
+    """Returns the candidate effects in groups: offset and cables of one joint, or the spring of one actuator.
 
-    A spring is a candidate if the arm file lists it for the joint's drive (`motion.known_effects`). Effects at other
-    coordinates of the transmission are not candidates, because they increase the error on other MTM recordings.
+    All candidates are identifiable from the poses. A spring is a candidate if the arm file lists it for the actuator
+    (`motion.known_effects`). Other effects at actuators are not candidates, because they increase the error on MTM
+    recordings that are not used for the fit.
     """
     arm, groups = problem.arm, []
     for joint in arm.joint_names:
@@ -124,9 +127,10 @@ def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
 def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
     """Selects the effects by stepwise reduction of the leave-one-out error.
 
-    Each step adds the effect, or all effects of one group, with the largest reduction. The selection ends if no
-    reduction is significant: at least `MIN_GAIN` per coefficient and `MIN_SIGNIFICANCE` standard errors over poses.
-    Squared errors are limited to nine variances, which limits the influence of a single pose.
+    Each step adds one effect, or all effects of one group, depending on which reduces the error most. A reduction is
+    significant if it is at least `MIN_GAIN` per coefficient and at least `MIN_SIGNIFICANCE` times its standard error
+    over the poses. The selection ends if no reduction is significant. Each squared error is limited to nine times the
+    residual variance, so that no single pose dominates the selection.
     """
     selected: tuple[ActuatorEffect, ...] = ()
     current = problem.fit(selected)
@@ -153,14 +157,14 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
 
 
 def _is_redundant(effect: ActuatorEffect, selected: Sequence[ActuatorEffect]) -> bool:
-    """Returns whether the effect is a spring at a joint with a selected cable, or a cable at a joint with a spring."""
+    """Returns whether the joint already has a selected cable (for a spring) or a selected spring (for a cable)."""
     joint = effect.coordinate.partition(".")[2]
     kinds = {e.kind.partition(" ")[0] for e in selected if e.coordinate.partition(".")[2] == joint}
     return (effect.kind == "spring" and "cable" in kinds) or (effect.kind.startswith("cable") and "spring" in kinds)
 
 
 def _loss(problem: StaticProblem, fit: RobustFit, sigma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the limited squared leave-one-out error (m,) of each pose in units of sigma."""
+    """Returns the limited squared leave-one-out errors (m,) of the poses, summed over the joints [sigma^2]."""
     return (np.minimum((fit.fit.leave_one_out_residuals / sigma) ** 2, 9.0) * problem.usable).sum(axis=1)
 
 
@@ -176,7 +180,7 @@ def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
 
 @cache
 def _is_equal_to_gravity(model: StaticModel, effect: ActuatorEffect) -> bool:
-    """Returns whether the effect is a linear combination of gravity torques, so that it is not identifiable."""
+    """Returns whether the effect is a linear combination of gravity torques and therefore not identifiable."""
     arm = model.gravity.arm
     poses = arm.sample_poses(100, np.random.default_rng(0))
     Y = model.regressor(poses).reshape(-1, len(model.gravity.base.names))

@@ -20,10 +20,10 @@ class ExcludedMeasurement:
     """Efforts of one pose that are excluded.
 
     Attributes:
-        row: Row of the recording.
+        row: Index of the row in the recording, starting at 0.
         joints: Indices of the joints whose efforts are excluded, starting at 0.
         where: File and line of the pose.
-        reason: Reason as text.
+        reason: Reason for the exclusion.
     """
 
     row: int
@@ -37,12 +37,13 @@ def find_excluded(
 ) -> list[ExcludedMeasurement]:
     """Returns the measurements to exclude before any fit: poses at a joint stop and efforts beyond their limit.
 
-    A stop carries part of the load, so the torques of its joints are not holding torques.
+    A joint stop supports part of the load. The torques of the joints at the stop are therefore not holding torques.
 
     Args:
         recording: Recording in joint coordinates, with efforts.
         arm: Arm with the limits.
-        measured: Mask (m, n) of the efforts that are holding torques. Other efforts are not listed. None means all.
+        measured: Mask (m, n) of the efforts that are holding torques. Only these efforts can be excluded. None: all
+            efforts are holding torques.
     """
     excluded = []
     A, lower, upper = arm.limit_matrix()
@@ -75,7 +76,7 @@ def find_excluded(
 
 
 def check_effort_unit(recording: Recording, arm: Arm) -> None:
-    """Rejects efforts that are probably in another unit.
+    """Rejects a recording whose efforts are probably in a wrong unit.
 
     Raises:
         RecordingError: The median absolute effort of a joint exceeds its limit.
@@ -94,7 +95,7 @@ def check_effort_unit(recording: Recording, arm: Arm) -> None:
 def exclude_outliers(
     recording: Recording, arm: Arm, outliers: NDArray[np.bool_], residuals: NDArray[np.float64]
 ) -> list[ExcludedMeasurement]:
-    """Returns the outliers of a robust fit, for a mask (m, n) and residuals (m, n) [N m, N]."""
+    """Returns the outliers of a robust fit as excluded measurements. `outliers` is a mask (m, n)."""
     return [
         ExcludedMeasurement(
             int(row),

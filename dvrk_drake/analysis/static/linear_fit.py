@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: Residuals above these numbers of robust standard deviations get a smaller weight (Huber), and a weight of zero.
+#: Residuals above the first number of robust standard deviations get a smaller weight (Huber). Residuals above the
+#: second number get a weight of zero.
 HUBER_LIMIT, REJECTION_LIMIT = 3.0, 6.0
 
 
@@ -51,7 +52,8 @@ def weighted_fit(
 ) -> LinearFit:
     """Minimizes sum(weights (tau - X theta)^2) + sum(prior_precision theta^2).
 
-    The leave-one-out residuals of pose i are exactly (I - H_i)^-1 e_i, with the hat block H_i = X_i A^-1 X_i' W_i.
+    The leave-one-out residuals of pose i are exactly (I - H_i)^-1 e_i. Here e_i are the residuals of pose i, A^-1 is
+    the covariance of theta, and H_i = X_i A^-1 X_i' W_i is a block of the hat matrix.
 
     Args:
         X: Regressor (m, n, p).
@@ -92,7 +94,7 @@ def robust_fit(
         prior_precision: Inverse prior variances (p,), see `weighted_fit`.
         sigma_floor: Smallest standard deviations (n,) of the joints.
         iterations: Number of reweighting iterations.
-        start: Initial standard deviations (n,). None uses robust standard deviations of tau.
+        start: Initial standard deviations (n,). None: the robust standard deviations of tau.
     """
     sigma = np.maximum(_spread(tau, usable) if start is None else start, sigma_floor)
     weights = usable.astype(float)
@@ -109,15 +111,15 @@ def robust_fit(
 
 
 def rms(values: NDArray[np.float64]) -> float:
-    """Returns the root mean square, 0 for an empty array."""
+    """Returns the root mean square of an array, 0 if the array is empty."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
 
 
 def _spread(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Returns a robust standard deviation (n,) about zero of each column: 1.4826 median |x|, with a lower limit.
+    """Returns the robust standard deviations about zero (n,), one per column: 1.4826 median |x|, with a lower limit.
 
-    The lower limit is half of the estimate from the 90 % quantile. The median alone may be 0, because friction keeps
-    many torques of a wrist near zero.
+    The lower limit is half of the estimate from the 90 % quantile of |x|. Without this limit, the result could be 0,
+    because friction keeps many torques of a wrist near zero.
     """
     masked = np.where(usable, np.abs(values), np.nan)
     enough = usable.sum(axis=0) >= 3

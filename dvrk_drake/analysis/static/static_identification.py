@@ -36,13 +36,15 @@ Method = Literal["robust", "paper"]
 
 #: Smallest number of distinct poses for an identification.
 MIN_POSES = 8
-#: A joint with an RMS torque below the first number, as a share of its effort limit, gets a feedforward only if the
-#: ratio of its leave-one-out error to its RMS torque is at most the second number.
+#: Condition for the feedforward of a joint with a small torque. The torque is small if its RMS value, as a share of the
+#: effort limit, is below the first number. The ratio of the leave-one-out error to the RMS torque must then not exceed
+#: the second number.
 MIN_TORQUE, MAX_SMALL_TORQUE_RATIO = 0.02, 0.5
-#: Smallest covered range of a joint with a feedforward, as a share of the range between its limits. Over a smaller
-#: range, most torques would be extrapolated.
+#: Smallest range of the recorded positions of a joint with a feedforward, as a share of the range between the joint
+#: limits. With a smaller range, most predicted torques would be extrapolated.
 MIN_MOTION = 0.02
-#: Smallest covered range for low-speed segments. Over a smaller range, friction has the same sign in all segments.
+#: Smallest range of the recorded positions for low-speed segments, as a share of the range between the joint limits.
+#: Within a smaller range, friction has the same sign in all segments.
 MIN_SEGMENT_MOTION = 0.05
 #: Largest ratio of the leave-one-out error to the RMS torque for a feedforward scale of 1.
 MAX_ERROR_RATIO = 0.98
@@ -55,9 +57,9 @@ class StaticIdentification(Identification):
     """Model identified from poses.
 
     Attributes:
-        excluded: Excluded measurements, with reasons.
+        excluded: Excluded measurements and the reasons for the exclusion.
         residuals: Measured minus fitted efforts (m, n) [N m; N].
-        leave_one_out_residuals: Measured efforts minus predictions from all other poses (m, n) [N m; N].
+        leave_one_out_residuals: Measured efforts minus predictions (m, n) of a fit to all other poses [N m; N].
         measured: Mask (m, n) of the efforts that are holding torques.
     """
 
@@ -76,27 +78,29 @@ def identify_static(
 ) -> StaticIdentification:
     """Identifies the static model of `arm` from a recording of poses at rest.
 
-    Method "paper" is unweighted least squares on the base parameters, eq. 9-10 of the paper.
+    Method "paper" is unweighted least squares on the base parameters (Rutfield et al., 2015, eq. 9-10).
 
-    Method "robust" (default) weights each joint by its residual variance. It excludes measurements at joint stops and
-    outliers. Effects are selected by leave-one-out cross-validation. A prior from the effort limits shrinks all
-    parameters towards zero. The feedforward scale of a joint is reduced if its leave-one-out error is not smaller than
-    the error of zero torque, or if the joint hardly moved. Repeated samples of one pose are averaged first, because
-    they are not independent.
+    Method "robust" (default) weights each joint by the reciprocal of its residual variance. It excludes measurements at
+    joint stops and outliers. Effects are selected by leave-one-out cross-validation. A prior from the effort limits
+    shrinks all parameters towards zero. The feedforward scale of a joint is reduced if the model's leave-one-out error
+    is not smaller than the error of zero torque, or if the joint hardly moved. Repeated samples of one pose are
+    averaged first, because they are not independent.
 
     Args:
         recording: Poses with efforts, in joint or actuator coordinates.
         arm: Arm that was recorded.
         method: "robust" or "paper".
         progress: Callback that receives the finished share, 0 to 1.
-        measured: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None means all.
+        measured: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None: all efforts are
+            holding torques.
 
     Raises:
         RecordingError: The recording does not match the arm or has no efforts.
-        IdentificationError: There are too few poses, the recording is a motion, or with the method "paper" the base
-            parameters are not identifiable.
+        IdentificationError: The method is unknown, there are too few poses, the recording is a motion, or the base
+            parameters are not identifiable (method "paper").
     """
-    from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
+    # Imported here, because the import of sympy takes 0.3 s and a motion does not need it.
+    from dvrk_drake.dynamics.static_model import compile_static_model
 
     if method not in get_args(Method):
         raise IdentificationError(f'method is "{method}"; allowed: {", ".join(get_args(Method))}')
@@ -169,7 +173,7 @@ def identify_static(
 
 
 def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recording:
-    """Returns the poses in joint coordinates. Repeated poses are averaged if `averaged` is True.
+    """Returns the poses of a recording in joint coordinates. Repeated poses are averaged if `averaged` is True.
 
     Raises:
         RecordingError: The recording does not match the arm or has no efforts.
@@ -186,7 +190,7 @@ def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recor
 
 
 def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
-    """Averages repeated poses to one row per pose. All joints of repeated poses agree within `SAME_POSE`."""
+    """Averages the rows of each repeated pose. Rows are the same pose if all joints agree within `SAME_POSE`."""
     tolerance = arm.per_joint(*SAME_POSE)
     groups: list[list[int]] = []
     for row, q in enumerate(recording.q):
@@ -228,7 +232,9 @@ def _check_poses(recording: Recording, arm: Arm) -> None:
 def _feedforward_scales(
     problem: StaticProblem, leave_one_out: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Returns the feedforward scale (n,) of each joint, below 1 if the model is not better than zero torque.
+    """Returns the feedforward scale (n,) of each joint.
+
+    The scale is below 1 if the model is not better than zero torque, or if the joint hardly moves.
 
     Args:
         problem: Problem with the poses and torques.
@@ -257,8 +263,9 @@ def _segments_support(
     """Returns a mask (n,) of the joints that may get a feedforward from low-speed segments.
 
     Few segments or a small range cannot separate gravity from friction. Leave-one-out cross-validation does not detect
-    this, because neighbouring segments have the same friction. A joint therefore requires `MIN_POSES` segments over
-    `MIN_SEGMENT_MOTION` of its range, and a cross-validated error below the error of zero torque.
+    this problem, because neighbouring segments have the same friction. A feedforward therefore requires at least
+    `MIN_POSES` segments that cover `MIN_SEGMENT_MOTION` of the joint's range. The cross-validated error must also be
+    below the error of zero torque.
     """
     arm = problem.arm
     supported = np.zeros(arm.num_joints, dtype=bool)
@@ -270,7 +277,10 @@ def _segments_support(
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
-    """Returns the residuals (m, n) of a 10-fold cross-validation, with a new selection and fit for each fold."""
+    """Returns the residuals (m, n) of a 10-fold cross-validation.
+
+    For each fold, the effects are selected and the model is fitted again.
+    """
     poses = len(problem.q)
     folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
     residuals = np.empty_like(problem.tau)
@@ -288,7 +298,7 @@ def _cross_validate(problem: StaticProblem, progress: Callable[[float], object])
 
 
 def _scaled(fit: LinearFit, tau: NDArray[np.float64], feedforward_scale: NDArray[np.float64]) -> LinearFit:
-    """Returns the fit with the residuals for predictions multiplied by the feedforward scale (n,)."""
+    """Multiplies the predictions of a fit by the feedforward scale (n,) and returns the fit with the new residuals."""
     return LinearFit(
         fit.theta,
         fit.covariance,

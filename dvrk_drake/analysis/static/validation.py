@@ -29,13 +29,14 @@ class JointError:
 
     Attributes:
         name: Name of the joint.
-        rms_torque: RMS measured torque, which is the error of zero torque [N m, N if prismatic].
+        rms_torque: RMS measured torque [N m, N if prismatic]. It is also the RMS error of zero torque.
         rms_error: RMS of measured minus predicted torque [N m, N if prismatic].
-        relative_error: rms_error / rms_torque [1], None if the torque is 0.
+        relative_error: rms_error / rms_torque [1], None if rms_torque is 0.
         rms_torque_included: RMS measured torque of the included measurements [N m, N if prismatic].
         rms_error_included: RMS error of the included measurements [N m, N if prismatic].
-        relative_error_included: Relative error of the included measurements [1], None if their torque is 0.
-        num_excluded: Number of excluded measurements, at a joint stop or beyond the effort limit.
+        relative_error_included: rms_error_included / rms_torque_included [1], None if rms_torque_included is 0.
+        num_excluded: Number of measurements that are excluded because the joint is at a stop or the effort is beyond
+            its limit.
         verdict: Verdict from the included measurements, see `judge`.
     """
 
@@ -52,13 +53,13 @@ class JointError:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class StaticValidation(Validation):
-    """Errors of a model on poses.
+    """Errors of the holding torques of a model at the poses of a recording.
 
     Attributes:
         joints: Errors of the joints, in the arm's order.
         poses: Number of poses.
         residuals: Measured minus predicted efforts (m, n), in the coordinates of the recording [N m; N].
-        excluded: Measurements that are excluded from the verdicts, with reasons.
+        excluded: Measurements that the verdicts do not use, and the reasons for the exclusion.
         measured: Mask (m, n) of the efforts that are holding torques.
     """
 
@@ -75,11 +76,11 @@ class StaticValidation(Validation):
 
     @property
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each joint without excluded measurements [1]; None if nothing was measured."""
+        """RMS error / RMS effort of each joint without excluded measurements [1], None if the effort is 0."""
         return {joint.name: joint.relative_error_included for joint in self.joints}
 
     def as_dict(self) -> dict:
-        """Returns the data of `validate --json`."""
+        """Returns the output of `validate --json` as a dictionary."""
         return {
             "verdict": self.verdict,
             "rule": rule_text(in_motion=False),
@@ -90,7 +91,7 @@ class StaticValidation(Validation):
 
 
 def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
-    """Returns the predicted holding torques (m, n) at the poses of a recording, in its coordinates [N m, N].
+    """Returns the predicted holding torques (m, n) in the coordinates of a recording, at its poses [N m, N].
 
     Raises:
         RecordingError: The recording does not fit the model's arm.
@@ -112,7 +113,8 @@ def validate_static(
     Args:
         model: Identified model.
         recording: Poses with efforts, in joint or actuator coordinates.
-        measured_joints: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None means all.
+        measured_joints: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None: all
+            efforts are holding torques.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or has no efforts.
@@ -128,7 +130,7 @@ def validate_static(
     excluded = find_excluded(in_joints, arm, measured_joints)
     usable = usable_measurements(measured.shape, excluded) & measured_joints
     if recording.coordinates == "actuator":
-        # An excluded measurement of a joint excludes all actuators that drive the joint.
+        # An excluded measurement of a joint excludes the measurements of all actuators that drive the joint.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
     commanded = np.any(predicted != 0, axis=0)
     errors = _joint_errors(arm, measured, residuals, measured_joints, usable, commanded)

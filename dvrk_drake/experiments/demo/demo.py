@@ -33,7 +33,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 #: Numbers of poses for identification and for validation.
 POSES, FRESH_POSES = 40, 15
-#: Effort noise of one sample, as a share of the effort limit.
+#: Standard deviation of the noise of one effort sample, as a share of the effort limit.
 EFFORT_NOISE = 0.01
 #: Maximum displacement of the ground-truth arm's centres of mass along each axis [m].
 MAX_SHIFT = 0.002
@@ -55,7 +55,7 @@ class DemoPlan:
     """Effects, poses and settings of the demo for one type of arm.
 
     Attributes:
-        effects: Effects of the ground-truth arm that are not in the nominal model [N m].
+        effects: Effects of the ground-truth arm that are not in the nominal model.
         release: Pose (n,) of the release [rad, m].
         step: Start pose (n,) of the step to `home` [rad, m].
         home: Final pose (n,) of the release and of the step [rad, m].
@@ -103,17 +103,18 @@ PLANS = {
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Models, errors and motions of one run; m, k samples of n joints.
+    """Results of one run of the demo for n joints. The release has m samples, and the step has k samples.
 
     Attributes:
         arm: Arm of the demo.
         identification: Identification from the collected poses.
         fresh: Errors of the identified model at new poses, which are not used for identification.
-        fresh_paper: Errors of the paper's least-squares method at these new poses.
+        fresh_paper: Errors at these new poses of the model that the paper's least-squares method identified.
         release_time: Times (m,) of the release [s].
-        released: Positions (m, n) with the identified model [rad, m].
-        released_nominal: Positions (m, n) with the nominal model, which is that of the SDF [rad, m].
-        drift: Largest distance (n,) from the release pose [rad, m], by name of the model: "identified", "nominal".
+        released: Positions (m, n) during the release with the identified model [rad, m].
+        released_nominal: Positions (m, n) during the release with the nominal model [rad, m].
+        drift: Largest distance (n,) of the released arm from the release pose [rad, m], by name of the model:
+            "identified" or "nominal".
         step_time: Times (k,) of the step [s].
         step: Positions (k, n) of the step to the home pose [rad, m].
         step_error: Final distance (n,) from the home pose [rad, m].
@@ -168,7 +169,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
 
     def collect(count: int, step: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)
-        # An operator rotates the platform and the handle (or the roll joint) only within the range of a wrist.
+        # An operator rotates the platform and the handle (PSM: the roll joint) only within the range of a human wrist.
         poses[:, [3, 6]] = np.clip(poses[:, [3, 6]], -1.5, 1.5)
         return collect_static_poses(
             station(),
@@ -224,7 +225,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
 def _closed_loop(
     station: ArmStation, model: IdentifiedModel, q_start: Sequence[float]
 ) -> tuple[Simulator, VectorLogSink, GravityPidController, ConstantVectorSource]:
-    """Returns a simulator of the arm at q_start, the log of its state, its controller, and its desired state."""
+    """Returns a simulator of the arm at q_start, the log of the arm's state, the controller, and the desired state."""
     controller = GravityPidController(model)
     desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()

@@ -22,7 +22,7 @@ from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
-#: Ratio of the motion of the tip to that of the handle.
+#: Ratio of the displacement of the tip to the displacement of the handle.
 SCALE = 0.4
 #: Start poses of the arms [rad, m]: the handle in front of the operator, the instrument in the middle of its range.
 START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
@@ -41,14 +41,14 @@ BLUE, GREEN, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.1, 0.7, 0.2), Rgba(0.55, 0.55,
 class TeleoperationResult:
     """Tracking errors of the tip over all samples (one per `PERIOD`) with a closed clutch.
 
-    The errors compare the measured displacement and rotation of the tip since the clutch closed with the scaled
-    displacement and the rotation of the handle.
+    The position error is the difference between the tip's displacement and the handle's scaled displacement since the
+    clutch closed. The rotation error is the angle between the rotations of tip and handle since then.
 
     Attributes:
         handle_path: Length of the handle's path with a closed clutch [m].
         rms_position_error, max_position_error: RMS and maximum position error [m].
         rms_rotation_error, max_rotation_error: RMS and maximum rotation error [rad].
-        max_motion_held: Maximum motion of the tip while the clutch is open [m].
+        max_motion_held: Maximum displacement of the tip while the clutch is open [m].
     """
 
     handle_path: float
@@ -64,7 +64,7 @@ class _Samples:
     """Samples at every `PERIOD`.
 
     Attributes:
-        following: Whether the follower is active.
+        following: Whether the follower follows the master.
         X_MG: Poses of the handle in the base frame of the master.
         X_FT: Poses of the tip in the base frame of the follower.
     """
@@ -83,7 +83,7 @@ def play_teleoperation(
 
     Args:
         meshcat: Meshcat that shows the arms and their paths, see `start_scene`. None for no animation.
-        duration: Simulated part of the motion [s]. The whole motion takes `DURATION`.
+        duration: Duration of the simulation [s]. The whole motion lasts `DURATION`.
         progress: Function called with the finished share, 0..1.
     """
     builder = DiagramBuilder()
@@ -118,8 +118,8 @@ def play_teleoperation(
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     """Simulates teleoperation in real time with controls for hand, clutch, jaw and scale in Meshcat.
 
-    The simulation ends with the button Stop or after `duration` [s]. A lamp above the master is green while the
-    follower is active.
+    The button Stop ends the simulation, or it ends after `duration` [s]. A sphere above the master is green while the
+    follower follows the master, else grey.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 
@@ -155,7 +155,7 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
 
 
 def start_scene(port: int | None = None) -> Meshcat:
-    """Starts a Meshcat with the bases of both arms in the scene. Uses a free port if `port` is None."""
+    """Starts Meshcat and sets the base poses of both arms. If `port` is None, Meshcat uses a free port."""
     meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
     for name, p_WB in BASE_POSITIONS.items():
         meshcat.SetTransform(name, RigidTransform(np.array(p_WB)))

@@ -39,14 +39,14 @@ class Release:
     """Release of an arm at one pose.
 
     Attributes:
-        arm: Name of the arm in the controller.
+        arm: Name of the arm whose file the controller uses.
         ground_truth_arm: Arm to simulate.
         parts: Names of the simulated effects, see `ArmEffects.only`.
         model: Path of the controller's model file.
         start: Release pose (n,) [rad, m]. Without an approach, the friction is unloaded there.
         with_approach: Whether the arm first moves to the pose from a distance of `APPROACH`, which loads the friction.
         damped: Whether the controller damps the motion in addition to compensating gravity (mode "damped").
-        hysteresis_ratio: Compensated share of the elastic part of the friction, which moves an arm back.
+        hysteresis_ratio: Compensated share of the wide hysteresis, which moves a released arm back.
         duration: Duration [s].
         seed: Seed of the effects' noise.
     """
@@ -64,7 +64,7 @@ class Release:
 
 
 def release(case: Release) -> NDArray[np.float64]:
-    """Simulates a release; returns the true positions (samples, n) [rad, m] after it, one per `SAMPLE_PERIOD`."""
+    """Simulates a release; returns the true positions (samples, n) [rad, m] after it, every `SAMPLE_PERIOD` [s]."""
     arm = load_arm(case.arm)
     name = arm.name.lower()
     effects = case.ground_truth_arm.effects.only(case.parts)
@@ -136,10 +136,10 @@ class Drifts:
 
     @property
     def held(self) -> NDArray[np.bool_]:
-        """Returns whether each joint (cases, n) always stayed within `BAND`."""
+        """Returns a mask (cases, n): True for a joint that always stayed within `BAND` of its release position."""
         return self.largest <= self.arm.per_joint(*BAND)
 
     @property
     def num_held(self) -> int:
-        """Number of cases in which every joint was held."""
+        """Number of cases in which all joints were held."""
         return int(np.count_nonzero(np.all(self.held, axis=1)))

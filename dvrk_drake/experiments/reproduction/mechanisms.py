@@ -13,7 +13,7 @@ from dvrk_drake.experiments.reproduction.published import LENGTHS, TableRow
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 
-#: Number of poses from which the rows are computed.
+#: Number of poses from which the rows of the table are computed.
 POSES = 20
 
 
@@ -21,11 +21,11 @@ def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
     """Computes the DH table from the motion of the plant.
 
     The frames `paper_0..7` are fixed to the links, and the plant determines their relative motion. Therefore a joint
-    whose axis differs from its row causes an error.
+    axis that differs from its row of the table causes an error.
 
     Returns:
-        Table (n, 5) with the columns sign, offset [rad], d [m], alpha [rad], a [m], and the largest error of the
-        entries of its transformation matrices (translations in m).
+        Table (n, 5) with the columns sign, offset [rad], d [m], alpha [rad], a [m], and the largest difference between
+        an entry of the table's transformation matrices and the plant's (translations in m).
     """
     plant = make_arm_plant(arm)
     poses = np.vstack([np.zeros(arm.num_joints), arm.sample_poses(POSES, np.random.default_rng(0))])

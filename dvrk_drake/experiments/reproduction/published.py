@@ -57,7 +57,7 @@ TABLE_1 = (
 #: The twelve parameters [kg m] in the paper's order, identified with g = 9.9 m/s^2 and used with 9.81.
 PARAMETERS = (0.0414, -0.0192, 0.0328, 0.0095, -0.0033, -0.0003, -0.0071, -0.0188, -0.0015, -0.0003, -0.0001, 0.0005)
 #: First moment that each parameter represents: link (from 1), and axis of its frame in Table I. Each parameter also
-#: contains other moments with the same effect.
+#: contains other first moments with the same effect on the torques.
 PARAMETER_COMPONENTS = (
     (2, "x"),
     (2, "y"),
@@ -78,25 +78,26 @@ IDENTIFICATION_GRAVITY, CONTROL_GRAVITY = 9.9, 9.81
 #: Mean squared errors of Fig. 4 over the 72 poses [(N m)^2], J2..J7.
 FIGURE_4_MEANS = (8.14e-3, 7.96e-3, 1.97e-3, 4.62e-4, 3.98e-5, 1.92e-5)
 
-#: Final drift [rad], J2..J7: trials of Fig. 5 and 6, and mean absolute drift over the team's five trials of each.
+#: Final drift [rad], J2..J7: trials of Fig. 5 and 6, and mean absolute drift over the team's five trials of each
+#: figure.
 FIGURE_5 = (0.0102, 0.0051, -0.0138, -0.174, -0.021, 0.0)
 FIGURE_6 = (0.0101, -0.0099, 0.0050, -0.003, -0.316, -0.071)
 FIGURE_5_MEANS = (0.070, 0.020, 0.0085, 1.29, 0.315, 0.730)
 FIGURE_6_MEANS = (0.013, 0.041, 0.038, 0.491, 0.481, 0.742)
 
-#: Fig. 7: start [rad], gains at 100 Hz (N m/rad, N m s/rad, N m/rad per sample), masses of base and links [kg].
+#: Fig. 7: start pose [rad], gains at 100 Hz (N m/rad, N m s/rad, N m/rad per sample), masses of base and links [kg].
 FIGURE_7_START = (0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0)
 FIGURE_7_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
 FIGURE_7_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
 FIGURE_7_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
 FIGURE_7_MASSES = (0.9, 1.0, 0.9, 0.8, 0.4, 0.2, 0.2, 0.1)
-#: Indices of the joints whose damping term used positions instead of velocities.
+#: Indices of the joints whose damping term used positions instead of velocities in the team's controller.
 FIGURE_7_FAULTY = (4, 5, 6)
 #: Values digitised from Fig. 7: period of J2 [s]; |J2| after 59 s, amplitudes of J6 and of J7 (early, late) [rad].
 FIGURE_7_VALUES = {"J2 period": 22.0, "J2 at 59 s": 0.075, "J6": 0.022, "J7 early": 0.0115, "J7 late": 0.0155}
 
 
-#: Number of poses for the conversion to our base parameters, which must exceed the number of parameters.
+#: Number of poses for the conversion to our base parameters. It must exceed the number of parameters.
 _POSES = 40
 
 
@@ -104,8 +105,9 @@ def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETER
     """Computes the torque (m, n) of the paper's twelve parameters [kg m] at poses q (m, n).
 
     This is equation 8 of the paper with g = 9.81 m/s^2. Each parameter is a component of the first moment h of one
-    link in its frame of Table I. Hence P = g sum z . R_i h_i and dP/dq_j = g sum z . (w_j x R_i h_i), where w_j is the
-    angular velocity of link i due to joint j.
+    link in its frame of Table I. R_i is the rotation matrix of this frame, and z points up. Hence the potential energy
+    is P = g sum_i z . R_i h_i. Its derivative is dP/dq_j = g sum_i z . (w_j x R_i h_i), where w_j is the angular
+    velocity of link i per unit velocity of joint j.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
@@ -124,7 +126,7 @@ def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETER
 
 
 def paper_model(arm: Arm) -> IdentifiedModel:
-    """Returns a model whose torque equals `paper_torque`. Our base parameters span the torques of the paper."""
+    """Returns a model whose torque equals `paper_torque`. Our base parameters can represent these torques."""
     q = arm.sample_poses(_POSES, np.random.default_rng(0))
     model = IdentifiedModel.from_arm(arm)
     Y = model.static_model.regressor(q)
@@ -154,13 +156,13 @@ _INSTRUCTIONS = "To create it from the team's repository, see docs/public_record
 
 @dataclass(frozen=True)
 class PaperRecordings:
-    """Files of the paper's recordings in `folder`; None if the files are not available."""
+    """Files of the paper's recordings in `folder`, which is None if the files are not available."""
 
     folder: Path | None
 
     @classmethod
     def find(cls, folder: str | Path | None) -> PaperRecordings:
-        """Finds the files in `folder`. Default: data/mtm_static in the folder of the environment variable `VARIABLE`.
+        """Finds the files in `folder`. None: data/mtm_static in the folder of the environment variable `VARIABLE`.
 
         Raises:
             RecordingError: `folder` was given and does not contain the recording.

@@ -1,4 +1,4 @@
-"""Shared resources of the figures of one run: folder, recordings, workers, and identified arms."""
+"""Resources that the figures of one run share: folder, recordings, workers, and identified arms."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ from dvrk_drake.recordings.recording import Recording, write_recording
 
 @dataclass(frozen=True)
 class SampleSizes:
-    """Sample sizes of the experiments. Tests use smaller ones.
+    """Sample sizes of the experiments. Tests use smaller sizes.
 
     Attributes:
         collected: Number of poses for the identification of an arm.
         releases: Number of random release poses for our model.
-        paper_releases: Number of the first of these poses that are used for the paper's parameters.
-        hand_guided_releases: Number of the first of these poses that are used for our model after an approach.
+        paper_releases: Number of these poses, from the first one, that are also used for the paper's parameters.
+        hand_guided_releases: Number of these poses, from the first one, that are also used for our model after an
+            approach.
         psm_releases: Number of random release poses of the PSM.
         path_poses: Number of poses on the path of an operator.
         duration: Duration of a release [s].
@@ -109,7 +110,7 @@ class ReproductionSession:
     def paper_file(self) -> Path:
         """Path of the model file with the paper's parameters.
 
-        For a perturbed ground-truth arm, the model is identified with the paper's method from the same poses as ours.
+        For a perturbed ground-truth arm, the paper's method identifies this model from the poses of our model.
         """
         mtm, path = self.mtm, self.folder / "paper_model.yaml"
         if mtm.truth.is_paper_arm:

@@ -1,4 +1,4 @@
-"""Step responses of a simulated MTM with the paper's controller and with ours (Fig. 7)."""
+"""Step responses of a simulated MTM with the paper's controller and with our controller (Fig. 7 of the paper)."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-#: Duration of the simulations with the paper's controller and with ours [s].
+#: Duration of the simulations with the paper's controller and with our controller [s].
 DURATION, OUR_DURATION = 60.0, 10.0
 #: Period of the paper's controller and sample period of all results [s].
 PERIOD = 0.01
-#: Inertia of each link about each axis in the paper's model [kg m^2], from its PSM file and the period of J2.
+#: Inertia of each link about each axis in the paper's model [kg m^2], from the team's PSM file and the period of J2.
 LINK_INERTIA = 1.0
 #: Mass [kg] and inertia [kg m^2] of linkage bars and rotors, which the paper's model does not have.
 _NEGLIGIBLE = 1e-6
@@ -62,7 +62,8 @@ def simulate_paper_controller(
     Args:
         arm: Arm of `paper_simulated_arm`.
         duration: Duration [s].
-        faulty: Whether the damping terms of some joints use positions instead of velocities, as in the paper's node.
+        faulty: Whether the damping terms of some joints use positions instead of velocities, as in the team's
+            controller.
         progress: Function called with the finished share, 0..1.
 
     Returns:
@@ -97,7 +98,7 @@ def simulate_paper_controller(
 
 
 def simulate_ours(ground_truth_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
-    """Simulates our controller with all effects except the stops; returns q (samples, n) [rad], one per `PERIOD`."""
+    """Simulates our controller with all effects except stops; returns q (samples, n) [rad], one row per `PERIOD`."""
     arm = load_arm(PAPER_ARM)
     station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects.without("stops"))
     builder = DiagramBuilder()
@@ -123,7 +124,7 @@ def oscillation_modes(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], N
         faulty: See `simulate_paper_controller`.
 
     Returns:
-        Eigenvalues (k,) [1/s] with positive imaginary part, and the joint components (n, k) of their eigenvectors.
+        Eigenvalues (k,) [1/s] with positive imaginary part, and the position components (n, k) of their eigenvectors.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()

@@ -1,6 +1,6 @@
 """Measures of a simulated run: numbers, e.g. settling time, and boolean criteria, e.g. whether the pose is held.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
 import math
@@ -79,7 +79,7 @@ class Measure:
         if kind.time is not None and not 2 * scenario.sample_period <= self._time <= rest + 1e-9:
             raise StudyError(
                 f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s. The "
-                "minimum is two sample periods. The maximum is the time left after the last target and the release "
+                "minimum is two sample periods. The maximum is the duration after the last target and the release "
                 "by the hand."
             )
         if self.kind == "overshoot" and not scenario.targets:
@@ -124,7 +124,7 @@ class _Run(NamedTuple):
         error: Differences (m, k) between the true and the desired positions [rad, m].
         effort_share: Absolute measured efforts (m, k), divided by the effort limits.
         departure: Start time of the motion to the last target [s].
-        arrival: Later of the time of the last target and the time of the release by the hand [s].
+        arrival: Time of the last target or of the release by the hand, whichever is later [s].
         displacement: Displacement (k,) of the motion to the last target [rad, m].
         goal: Final desired positions (k,) [rad, m].
     """
@@ -144,7 +144,7 @@ class _Run(NamedTuple):
 
 
 def _arrival(scenario: Scenario) -> float:
-    """Returns the later of the time of the last target and the time of the release by the hand [s]."""
+    """Returns the time of the last target or of the release by the hand, whichever is later [s]."""
     return max(float(scenario.knots()[0][-1]), *(point.time for point in scenario.hand.path), 0.0)
 
 
@@ -208,15 +208,15 @@ class Kind(NamedTuple):
 
 
 #: Kinds of measures. They are computed from the true positions and the measured efforts of the evaluated joints at the
-#: recorded times. In mode "hold" the desired pose is that of the controller. In other modes it is the pose at the
-#: start, or at the release by the hand, and earlier samples are excluded.
+#: recorded times. In mode "hold" the desired pose is that of the controller. In other modes it is the pose at the start
+#: or, with a hand, at the release. Samples before the release are excluded.
 #:
 #: settling_time: Time from the last target until all joints stay within `band` of the final desired pose; infinite if
 #: they do not settle.
 #: overshoot: Maximum distance beyond the last target, in the direction of the motion to this target.
-#: steady_error: Absolute mean error over the last `time`.
+#: steady_error: Absolute value of the mean error over the last `time`.
 #: drift: Maximum distance, in the last `time`, from the pose at the start of this interval.
-#: drift_rate: Absolute slope of a line fitted to the last `time`.
+#: drift_rate: Absolute slope of a line fitted to the positions in the last `time`.
 #: effort_share: Maximum effort divided by the joint's limit.
 #: held: Whether the arm stays within `band` of the desired pose for `time` after the last target or the release.
 #: ran_away: Whether the distance from the desired pose ever exceeds `band`.

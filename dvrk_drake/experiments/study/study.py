@@ -51,7 +51,8 @@ def run_study(
 
     Raises:
         StudyError: The study or the output is invalid, or workers were lost. After a loss, the output contains the
-            finished cases, and the same call runs the missing cases. The cause of the error is the first loss.
+            finished cases, and the same call runs the missing cases. The `__cause__` of the error is the exception of
+            the first loss.
         ScenarioError, ArmError, ModelError: The scenario or one of its variations is invalid.
     """
     study.check()
@@ -117,7 +118,7 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
     """Runs a study on this computer, see `run_study`. If a worker is killed, a new pool runs the missing cases.
 
     Raises:
-        StudyError: As for `run_study`, or `MAX_POOLS` pools lost a worker.
+        StudyError: `run_study` raises it for another reason than lost workers, or `MAX_POOLS` pools lost a worker.
     """
     for pool in range(MAX_POOLS):
         try:
@@ -133,8 +134,8 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
     """Provides worker processes on this computer, by default one per core.
 
-    The workers end with the block, immediately after an error, and also if this process is killed. They are spawned, so
-    a script that uses this function needs `if __name__ == "__main__":`.
+    The workers end at the end of the block. After an error, they end immediately. They also end if this process is
+    killed. The workers are spawned, so a script that uses this function needs `if __name__ == "__main__":`.
     """
     # Workers read these variables at their start. More BLAS threads per worker would compete for the cores.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -163,7 +164,7 @@ def await_results(futures: Sequence[Future[Result]], progress: Callable[[float],
 def _allocator_environment() -> dict[str, str]:
     """Returns environment variables that select a faster memory allocator for new processes.
 
-    There are none if the user has already selected an allocator, or on systems other than Linux. Drake's solver
+    The dict is empty if the user has already selected an allocator, or on systems other than Linux. Drake's solver
     allocates thousands of small blocks per step. tcmalloc or a larger cache of glibc makes the allocations faster.
     """
     if sys.platform != "linux" or {"LD_PRELOAD", "GLIBC_TUNABLES"} & set(os.environ):
@@ -186,7 +187,8 @@ def dask_executor(address: str) -> Iterator[Executor]:
     disabled.
 
     Raises:
-        StudyError: distributed is not installed, the scheduler does not answer, or it has no suitable workers.
+        StudyError: The package distributed is not installed, the scheduler does not answer, or it has no suitable
+            workers.
     """
     if not re.fullmatch(r"tcp://\S+:\d+", address):
         raise StudyError(f'"{address}" is not the address of a scheduler; allowed: tcp://HOST:PORT')

@@ -1,6 +1,6 @@
 """Schema and reader of study files, and cases of a study.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
 import dataclasses
@@ -96,7 +96,7 @@ class Study:
 
     @cached_property
     def scenarios(self) -> dict[str, Scenario]:
-        """Scenarios by variation, without start pose and seed.
+        """Scenarios by variation, without the start poses and the seeds of the cases.
 
         Raises:
             ScenarioError: A setting of the scenario is invalid.
@@ -134,7 +134,7 @@ class Study:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def scenario_of(self, case: Case) -> Scenario:
-        """Returns the scenario of a case, with which `dvrk-drake simulate` can repeat the case."""
+        """Returns the scenario of a case. `dvrk-drake simulate` can repeat the case with this scenario."""
         scenario = self.scenarios[case.variation]
         controller = scenario.controller
         if controller.model:  # workers may use another working folder
@@ -195,7 +195,7 @@ class Study:
 
 
 def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
-    """Reads a study file, adds settings "key=value" of its scenario, and checks the study.
+    """Reads a study file, adds settings "key=value" for the scenario of the study, and checks the study.
 
     Raises:
         StudyError: The file cannot be read, has an unknown key, or has an invalid value.

@@ -49,7 +49,8 @@ class StudyTable:
         """Opens the table at `path`. The file is new or contains rows of the same study.
 
         Raises:
-            StudyError: The file is of another study, is not the table of a study, or is locked by another process.
+            StudyError: The file contains rows of another study, is not the table of a study, or is locked by another
+                process.
             RecordingError: The file cannot be read or written.
         """
         self._path, self._study = Path(path), study
@@ -74,7 +75,7 @@ class StudyTable:
         self._lock.close()
 
     def append(self, case: Case, row: Row) -> None:
-        """Appends the row of a case without a row.
+        """Appends the row of a case that is not yet in the table.
 
         Raises:
             RecordingError: The row cannot be written. The earlier rows remain complete.
@@ -113,8 +114,8 @@ class StudyTable:
             where = f"{self._path}, line {line}"
             if header != self._header or cells[:1] != [self._study.fingerprint]:
                 raise StudyError(
-                    f"{where}: the results are from a different study. Its files or the installed versions have "
-                    "changed since then. Give another output."
+                    f"{where}: the results are from a different study. The files of the study or "
+                    "the installed versions have changed since then. Give another output."
                 )
             if len(cells) != len(header) or not cells[1].isdigit() or int(cells[1]) >= len(self._study.cases):
                 raise StudyError(f"{where}: the line is not a result of this study. Give another output.")
@@ -171,7 +172,7 @@ except ImportError:
 
 
 class ParquetStudyTable(StudyTable):
-    """Variant of `StudyTable` that writes a Parquet file with the same columns at the end.
+    """Variant of `StudyTable` for a Parquet file with the same columns.
 
     A Parquet file cannot be read before it is complete. Therefore the rows are first written to a CSV file with the
     name of the Parquet file and the suffix `.rows.csv`. When all rows are available, they are converted to the Parquet
@@ -182,7 +183,7 @@ class ParquetStudyTable(StudyTable):
         """Opens the table at `path`. The file is new or contains rows of the same study.
 
         Raises:
-            StudyError: As for a `StudyTable`, or pyarrow is not installed.
+            StudyError: The table cannot be opened (see `StudyTable`), or pyarrow is not installed.
             RecordingError: The file cannot be read or written.
         """
         if pyarrow is None:
@@ -244,7 +245,7 @@ class Share:
 
     @classmethod
     def of(cls, count: int, runs: int) -> Share:
-        """Computes the interval for `count` of `runs`."""
+        """Computes the interval for `count` true values in `runs` runs."""
         from scipy.stats import binomtest  # takes 0.3 s
 
         interval = binomtest(count, runs).proportion_ci(method="wilson")

@@ -41,7 +41,7 @@ def band(arm: Arm) -> NDArray[np.float64]:
 def effort_limits(arm: Arm) -> NDArray[np.float64]:
     """Returns the maximum effort (n,) of each joint [N m, N] with zero effort of the other joints.
 
-    It is the smaller one of the arm's effort limit and the effort that the motors can produce.
+    The maximum effort is the smaller of the arm's effort limit and the effort that the motors can produce.
     """
     motors = per_actuator(arm.effects.saturation, arm.joint_names, np.inf)
     # Actuator efforts per unit of a single joint effort, since tau_joint = J' tau_actuator.
@@ -55,8 +55,9 @@ def ideal_model(arm: Arm) -> IdentifiedModel:
     return IdentifiedModel.from_arm(arm, [*arm.effects.cables, *arm.effects.springs])
 
 
-#: Maximum holding effort in tuning poses, as a share of the motor's maximum effort. In other poses the motor saturates,
-#: whatever the gains are. In a part of the joint box, the wrist spring of an MTM exceeds the effort of its motor.
+#: Maximum holding effort in tuning poses, as a share of the motor's maximum effort. In other poses a motor may saturate
+#: for any gains. For example, in a part of the joint box, the torque of an MTM's wrist spring exceeds the maximum
+#: torque of the motor.
 MAX_HOLDING_SHARE = 0.5
 
 
@@ -80,7 +81,7 @@ def tuning_poses(arm: Arm, count: int, seed: int) -> NDArray[np.float64]:
 
 
 def middle_pose(arm: Arm) -> NDArray[np.float64]:
-    """Returns the tuning pose (n,) nearest to the middle of the joint box. Distances are relative to the ranges."""
+    """Returns the tuning pose (n,) nearest to the middle of the joint box, relative to the joint ranges."""
     poses = tuning_poses(arm, 200, 0)
     width = arm.position_upper - arm.position_lower
     middle = 0.5 * (arm.position_upper + arm.position_lower)
@@ -102,12 +103,13 @@ _PUBLISHED_JOINTS = (
 _PUBLISHED_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
 _PUBLISHED_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
 _PUBLISHED_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
-#: Rate of the published controller [Hz]. It sums the errors of all samples, so its Ki of 1 equals 100 N m/(rad s).
+#: Rate of the published controller [Hz]. This controller sums the errors of all samples, so a published Ki of 1 equals
+#: 100 N m/(rad s).
 _PUBLISHED_RATE = 100.0
 
 
 def published_gains(arm: Arm) -> Gains | None:
-    """Returns the published gains with Ki per second. None for an arm without the joints of an MTM."""
+    """Returns the published gains with Ki in N m/(rad s). Returns None for an arm without the joints of an MTM."""
     if arm.joint_names != _PUBLISHED_JOINTS:
         return None
     return Gains(list(_PUBLISHED_KP), list(_PUBLISHED_KV), [_PUBLISHED_RATE * ki for ki in _PUBLISHED_KI])
@@ -119,13 +121,14 @@ PERIOD = 1e-3
 
 @dataclass(frozen=True)
 class Condition:
-    """Difference between the simulated arm and the model of its controller and tuner.
+    """Difference between the simulated arm and the model that the controller and the tuning methods use.
 
     Attributes:
         name: Name of the condition in tables.
         gravity: Ratio of the true gravity torque to that of the model.
-        inertia: Ratio of all true masses and inertias to those of the model. The gravity model is scaled accordingly.
-        ticks: Additional delay in time steps.
+        inertia: Ratio of all true masses and inertias to those of the model. The gravity torque of the controller's
+            model is scaled by the same ratio.
+        ticks: Additional delay of the measurements in time steps.
     """
 
     name: str
@@ -157,12 +160,16 @@ class Response:
 
 
 class Bench:
-    """Closed loop of an arm with all of its `effects` and a GravityPidController with an exact model."""
+    """Closed loop of an arm with all of its `effects` and a GravityPidController.
+
+    The gravity model of the controller is exact except for the factor `gravity` of the condition.
+    """
 
     def __init__(self, arm: Arm, condition: Condition = NOMINAL) -> None:
         """Builds the loop. The first loop of an arm in a process takes seconds, since it compiles the controller."""
         self.arm = arm
-        # Heavier links increase both gravity and inertia. Scale the model so that its gravity error is only `gravity`.
+        # Heavier links increase both gravity and inertia. Scale the model so that true and modelled gravity have the
+        # ratio `gravity`.
         model_scale = condition.inertia / condition.gravity
         self._station = ArmStation(
             arm,
@@ -229,7 +236,7 @@ def bench_of(arm: str, condition: Condition = NOMINAL) -> Bench:
 
 
 class JointOnBench:
-    """Implementation of `procedure.JointUnderTest`. Its step starts at the distance `step` from the middle pose."""
+    """Implementation of `procedure.JointUnderTest`. Steps start at the distance `step` from the middle pose."""
 
     def __init__(self, bench: Bench, joint: int) -> None:
         """Selects the joint with this index. The other joints are regulated with the gains of the arm's file."""

@@ -19,11 +19,13 @@ from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_pos
 DAMPING_RATIO = 0.8
 #: Minimum phase margin [rad] and minimum gain margin, at the smallest and the largest inertia of the joint.
 PHASE_MARGIN, GAIN_MARGIN = np.pi / 6, 2.0
-#: Maximum effort due to one encoder count, as a share of the maximum effort. Dry friction increases this limit.
+#: Maximum effort due to one encoder count, as a share of the maximum effort. An effort up to the dry friction is always
+#: allowed.
 MAX_COUNT_EFFORT = 0.05
 #: Maximum time until the integral term moves a joint that sticks at the edge of its settling band [s].
 BREAK_AWAY_TIME = 0.25
-#: Assumed gravity error, as a share of the largest gravity torque; upper bound of Ki / (Kp w).
+#: Assumed gravity error, as a share of the largest gravity torque; upper bound of Ki / (Kp w) with the natural
+#: frequency w.
 GRAVITY_ERROR, INTEGRAL_SHARE = 0.2, 0.15
 #: Tested natural frequencies, in descending order [rad/s].
 FREQUENCIES = np.geomspace(300.0, 1.0, 400)
@@ -92,8 +94,9 @@ class ArmDesign:
 def design_arm(arm: Arm) -> ArmDesign:
     """Designs the gains of each joint separately, then checks the stability of all joints together.
 
-    The coupled joints must be stable at all checked poses, with one additional period of delay and 20 % less inertia.
-    While they are unstable, the frequency of the joint with the largest share of the unstable mode is reduced by 10 %.
+    The closed loop of all joints must be stable at all checked poses, with one additional period of delay and 20 % less
+    inertia. While it is unstable, the function reduces the natural frequency of the joint with the largest share of the
+    unstable mode's energy by 10 %.
 
     Raises:
         ControllerError: No gains satisfy the requirements, for one joint or for all joints together.
@@ -129,7 +132,9 @@ def _design_named_joint(arm: Arm, name: str, joint: JointProperties, sampling: S
 
 
 def design_joint(joint: JointProperties, sampling: Sampling, frequency_scale: float = 1.0) -> JointDesign:
-    """Returns the gains with the highest frequency that satisfies all requirements, times `frequency_scale`.
+    """Returns the gains for the highest natural frequency that satisfies all requirements.
+
+    If `frequency_scale` is below 1, the gains are those for this frequency times `frequency_scale`.
 
     Raises:
         ControllerError: No gains satisfy the requirements.
@@ -175,7 +180,7 @@ def _violated_requirement(joint: JointProperties, sampling: Sampling, design: tu
 
 
 def sampling_of(arm: Arm, period: float = 1e-3) -> Sampling:
-    """Returns the sampling of an arm. The delay includes one period for the computation of the controller."""
+    """Returns the sampling of an arm. The delay includes one period for the computing time of the controller."""
     delay, encoder = arm.effects.delay, arm.effects.encoder
     arm_delay = delay.measurement + delay.command if delay else 0
     return Sampling(period, arm_delay + 1, encoder.velocity_cut_off if encoder else np.inf)

@@ -1,8 +1,8 @@
 """Tuning procedure of the paper (section III.J).
 
 The procedure raises Kp until the joint oscillates, then Kv until the oscillation is damped, and then Ki until the
-offset is inside the settling band. The paper does not state the stopping criteria. Those used here are the constants of
-this module.
+remaining position error (offset) is inside the settling band. The paper does not state the stopping criteria. Those
+used here are the constants of this module.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ MIN_EVALUATED_SWINGS = 3
 
 
 def evaluate_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold: float) -> Oscillation:
-    """Evaluates the oscillation of positions x (m,) at times t (m,) after a release at rest.
+    """Evaluates the oscillation of positions x (m,) at times t (m,) after a release from rest.
 
     Motions smaller than `threshold` [rad, m] are not counted as swings.
     """
@@ -57,7 +57,7 @@ def evaluate_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], thresho
 
 
 def turning_points(x: NDArray[np.float64], threshold: float) -> NDArray[np.int_]:
-    """Returns the indices of the first sample and of each extremum of x (m,) after which x changes by `threshold`."""
+    """Returns the indices of the first sample and of each extremum of x (m,) followed by a change above `threshold`."""
     found, extreme, direction = [0], 0, 0.0
     for i, value in enumerate(x):
         change = value - x[extreme]
@@ -72,7 +72,8 @@ def turning_points(x: NDArray[np.float64], threshold: float) -> NDArray[np.int_]
     return np.array(found)
 
 
-#: Maximum duration of a release, in s and in periods of the last release; durations of the tests for Kv and Ki [s].
+#: Maximum duration of a release, in s and in oscillation periods of the previous release; durations of the tests for Kv
+#: and Ki [s].
 RELEASE_DURATION, RELEASE_PERIODS, DAMPING_DURATION, OFFSET_DURATION = 1.5, 7.0, 1.0, 2.0
 #: Factor by which Kp is raised until the joint oscillates; number of logarithmic bisections after that.
 KP_FACTOR, NUM_BISECTIONS = 2.0, 5
@@ -80,7 +81,8 @@ KP_FACTOR, NUM_BISECTIONS = 2.0, 5
 OVERSHOOT, OVERSHOOT_WITH_INTEGRAL = 0.05, 0.15
 #: Factor by which Kv and Ki are raised; factor by which Kp is reduced if no Kv damps the joint.
 KV_KI_FACTOR, KP_REDUCTION = 1.5, 0.7
-#: Range of the damping ratio that determines Kv; range of Ki as a share of Kp per period of the ultimate oscillation.
+#: Range of the damping ratio that determines Kv; range of Ki, divided by the ratio of Kp to the period of the ultimate
+#: oscillation.
 DAMPING_RATIOS, KI_SHARES = (0.05, 3.0), (0.02, 1.0)
 
 
@@ -148,11 +150,11 @@ def tune_joint(joint: JointUnderTest) -> JointProcedure:
 
 
 def find_ultimate_gain(joint: JointUnderTest) -> Ultimate:
-    """Raises Kp until the oscillation after a release from `joint.step` is sustained, then bisects.
+    """Raises Kp until the oscillation after a release from `joint.step` is sustained, then refines Kp by bisection.
 
     With dry friction F the joint moves only if Kp step > F. Near the ultimate gain of such a joint, small oscillations
-    decay and large ones grow. Therefore the result is valid only for the given step. The largest tested Kp saturates
-    the motor at a twentieth of the step, since a higher Kp has almost no effect.
+    decay and large ones grow. Therefore the result is valid only for the given step. At the largest tested Kp, the
+    motor saturates at a position error of a twentieth of the step. A higher Kp would have almost no effect.
     """
 
     duration = RELEASE_DURATION

@@ -46,7 +46,7 @@ class Margins:
     """Stability margins of the control loop of one joint, opened at the motor.
 
     Attributes:
-        phase: Smallest phase margin over all crossover frequencies [rad]; not positive for an unstable loop.
+        phase: Smallest phase margin over all crossover frequencies [rad]; 0 for an unstable loop.
         crossover: Crossover frequency of the smallest phase margin [rad/s].
         gain: Gain margin: factor of the loop gain at which the loop becomes unstable.
     """
@@ -60,8 +60,8 @@ class SampledLoop:
     """Linear closed loop of n joints with mass matrix M, viscous friction b and a PID controller.
 
     Between two samples M vd = u - b v. The effort is u = Kp e + Kd de + Ki sum(e) h with e = -q, as in
-    GravityPidController. It uses the measurement from `ticks` periods ago and is constant for one period. Gravity is
-    compensated exactly. The velocity is estimated as in `systems.arm_effects.drive_step.DriveStep`.
+    GravityPidController. The effort is computed from the measurement `ticks` periods earlier, and is constant for one
+    period. Gravity is compensated exactly. The velocity is estimated as in `systems.arm_effects.drive_step.DriveStep`.
     """
 
     def __init__(self, M: ArrayLike, sampling: Sampling, viscous: ArrayLike = 0.0) -> None:
@@ -109,7 +109,7 @@ class SampledLoop:
         return bool(np.max(np.abs(np.linalg.eigvals(self.closed_loop(gains)))) < 1.0)
 
     def least_damped_mode(self, gains: Gains) -> tuple[float, NDArray[np.float64]]:
-        """Returns the growth factor of the least damped mode per period, and the joints' shares (n,) of its energy.
+        """Returns the growth factor of the least damped mode per period, and each joint's share (n,) of its energy.
 
         The energy is the kinetic energy without the coupling terms of the mass matrix.
         """
@@ -133,7 +133,7 @@ class SampledLoop:
         stable = self.is_stable(gains)
         size, phase = np.abs(loop), np.unwrap(np.angle(loop))
         crossings = np.flatnonzero((size[:-1] >= 1) & (size[1:] < 1))
-        # The phase of a double integrator starts at -pi, with an integral term at -3 pi / 2.
+        # At low frequency, the phase of a double integrator is -pi. With an integral term, it is -3 pi / 2.
         margins = [abs((phase[i] + 2 * np.pi) % (2 * np.pi) - np.pi) for i in crossings]
         turns = np.flatnonzero(np.diff(np.sign(np.imag(loop))) * (np.real(loop[:-1]) < 0))
         amplify = [1 / size[i] for i in turns if size[i] < 1]

@@ -50,7 +50,8 @@ class StepMeasures:
     Attributes:
         settling: Times (n,) after which the joints stay inside the settling band [s]; infinite for a joint that is
             outside the band during the last `REST_TIME`.
-        overshoot: Maximum distances (n,) beyond the goal, as shares of the step; 0 for a joint that does not reach it.
+        overshoot: Maximum distances (n,) beyond the goal, as shares of the step; 0 for a joint that does not reach the
+            goal.
         steady_error: Mean distances (n,) from the goal over the last `REST_TIME` [rad, m].
         oscillation: Peak-to-peak commanded efforts (n,) over the last `REST_TIME`, as shares of the effort limits.
     """
@@ -88,7 +89,7 @@ class Comparison:
     def best(self, names: Iterable[str]) -> str:
         """Returns the name of the gains with the fewest joints that do not settle.
 
-        For equal numbers, it is the name of the gains with the smallest mean settling time.
+        If several gains have the same number, the name of those with the smallest mean settling time is returned.
         """
 
         def rank(name: str) -> tuple[int, float]:
@@ -132,7 +133,7 @@ Method = Literal["paper", "model"]
 OWN, PUBLISHED = "the arm's own", "published"
 #: Function called with the finished share, 0..1.
 Progress = Callable[[float], object]
-#: Share of the paper's procedure in the progress of a run.
+#: Share of the paper's procedure in the total progress of a run.
 PROCEDURE_SHARE = 0.5
 
 

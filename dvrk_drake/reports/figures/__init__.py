@@ -1,1 +1,1 @@
-"""Plots results as PNG files. Only this package imports Matplotlib."""
+"""Plots results as PNG files. Only `dvrk_drake.reports` imports Matplotlib."""

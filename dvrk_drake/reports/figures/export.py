@@ -14,7 +14,7 @@ from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
 
 FILE_COLOUR = "#d1495b"
 
-#: Mapping from the problem of a pose to the colour of its curve.
+#: Mapping from a problem to the colour of the curve that shows the share of poses with this problem.
 _PROBLEM_COLOURS = {"torque limit active": "#edae49", "opposite sign": "#d1495b", "runaway": "#5b3a8c"}
 
 _BINS = 60
@@ -25,8 +25,9 @@ _NUM_PANELS = 6  # the file has no torque for joint 7
 def plot_compensation(path: str | Path, comparison: CompensationComparison, title: str) -> None:
     """Plots the torques of file and model over the position of each joint, and the share of poses with a problem.
 
-    Bands show the range over the positions of all other joints. The torque of the file is shown before its limits
-    (dashed). The grey area is the range of the data from which the file was identified.
+    Each band shows the range of the torque over the positions of all other joints. The torque of the file is not
+    limited. Dashed lines show the torque limits of the file. The grey area shows the positions of the joint in the
+    recording from which the file was computed.
 
     Args:
         path: PNG file to write.
@@ -55,9 +56,9 @@ def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None
     edges, centres, members = _bins(comparison, j)
     if file.sweep is not None:
         span = np.clip(file.sweep[:, j], edges[0], edges[-1])
-        axes.axvspan(*span, color="0.92", label="range of the data of the file")
+        axes.axvspan(*span, color="0.92", label="positions in the recording of the file")
     for torque, colour, label in (
-        (comparison.file_torque, FILE_COLOUR, "file, before its torque limits"),
+        (comparison.file_torque, FILE_COLOUR, "file, without torque limits"),
         (comparison.model_torque, MODEL_COLOUR, "model"),
     ):
         low, middle, high = (np.array([f(torque[m, j]) for m in members]) for f in (np.min, np.mean, np.max))
@@ -87,7 +88,7 @@ def _draw_shares(axes: Axes, comparison: CompensationComparison, j: int) -> None
 def _bins(
     comparison: CompensationComparison, j: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.int_]]]:
-    """Returns the edges of all bins of q_j, the centres of bins with poses, and the indices of these poses."""
+    """Returns the edges of all bins of q_j, the centres of the bins that contain poses, and the poses in each bin."""
     q = comparison.q[:, j]
     edges = np.linspace(q.min(), q.max(), _BINS + 1)
     index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)

@@ -117,14 +117,14 @@ def plot_measured_against_predicted(
     measured_joints: NDArray[np.bool_],
     excluded: list[ExcludedMeasurement],
 ) -> None:
-    """Plots predicted over measured torque of each pose, with one panel per joint.
+    """Plots the predicted torque over the measured torque of each pose, with one panel per joint.
 
     Args:
         path: PNG file to write.
         model: Model that predicts the torques.
         recording: Recording in joint coordinates.
-        measured_joints: Mask (m, n) of holding torques. Other torques are not drawn.
-        excluded: Excluded measurements, drawn as crosses. The axes do not extend to them.
+        measured_joints: Mask (m, n), True for measured holding torques. Only these torques are drawn.
+        excluded: Excluded measurements, drawn as crosses. They do not affect the limits of the axes.
     """
     usable = usable_measurements(recording.q.shape, excluded) & measured_joints
     arm = model.arm

@@ -1,4 +1,4 @@
-"""Plots the spectra of the efforts of a recording and of their noise."""
+"""Plots the spectra of the efforts in a recording and of the noise in these efforts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm
     Rows are treated as evenly spaced, so the spectra of a motion with gaps are approximate.
 
     Returns:
-        True if the file was written. False for poses and for motions without efforts, which have no spectra.
+        True if the file was written. False for static poses and for motions without efforts, because spectra require
+        a motion with efforts.
     """
     if report.rate is None or report.joints[0].effort_cut_off is None:
         return False

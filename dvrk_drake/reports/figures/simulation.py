@@ -48,7 +48,7 @@ def plot_positions(
         for i, (label, q) in enumerate(curves.items()):
             ax.plot(t, q[:, j], "-" if i == 0 else "--", color=colours[i % 3], linewidth=1.2, label=label)
         low, high = ax.get_ylim()
-        if high - low < 2e-3:  # keeps the noise of a joint at rest small
+        if high - low < 2e-3:  # avoids a magnified view of the noise of a joint at rest
             ax.set_ylim((low + high) / 2 - 1e-3, (low + high) / 2 + 1e-3)
         ax.set_title(f"J{j + 1} {name}", fontsize=10)
         ax.set_ylabel(f"position [{'m' if arm.prismatic[j] else 'rad'}]", fontsize=8)

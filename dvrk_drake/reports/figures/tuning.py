@@ -15,7 +15,7 @@ COLOURS = {OWN: "#9a9a9a", PUBLISHED: "#b58db6", "paper": "#edae49", "model": "#
 
 
 def plot_steps(path: Path, comparison: Comparison) -> None:
-    """Plots the step response from the first pose for all gains, with one panel per joint. The band is shaded."""
+    """Plots the step response from the first pose for all gains, with one panel per joint."""
     arm = comparison.arm
     figure, axes = plt.subplots(2, -(-arm.num_joints // 2), figsize=(15, 7), layout="constrained")
     for j, (name, ax) in enumerate(zip(arm.joint_names, axes.flat, strict=False)):

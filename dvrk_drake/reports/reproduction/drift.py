@@ -35,7 +35,7 @@ def drift_table(
     hand_guided: Drifts | None = None,
     hysteresis_compensated: Drifts | None = None,
 ) -> ResultTable:
-    """Returns a table of the drifts with the paper's model and ours, and of the published drifts.
+    """Returns a table of the published drifts, and of the simulated drifts with the paper's model and with ours.
 
     Args:
         name: Name of the table.
@@ -44,8 +44,8 @@ def drift_table(
         means: Published mean drifts (6,) of joints 2-7 [rad].
         paper: Drifts with the paper's model.
         ours: Drifts with our model.
-        hand_guided: Drifts with our model if a hand guided the arm to the pose, or None.
-        hysteresis_compensated: Like `hand_guided`, with compensated hysteresis, or None.
+        hand_guided: Drifts with our model after a hand guided the arm to the pose. None: no rows for this case.
+        hysteresis_compensated: Like `hand_guided`, but with hysteresis compensation.
     """
     rows: tuple[tuple[str, ...], ...] = (
         ("published, trial of the figure (final)", *_UNPUBLISHED, *numbers(np.abs(trial), "{:.4f}")),
@@ -79,7 +79,7 @@ def _shares(drifts: Drifts) -> tuple[str, ...]:
 
 
 def torque_table(session: ReproductionSession) -> ResultTable:
-    """Returns the RMS torque errors with respect to the ground-truth arm, over the joint range."""
+    """Returns a table of the RMS torque errors of both models at random poses of the ground-truth arm."""
     mtm = session.mtm
     q = session.random_poses(PAPER_ARM, 500)
     true = mtm.truth.model.holding_torque(q)
@@ -100,7 +100,11 @@ def torque_table(session: ReproductionSession) -> ResultTable:
 
 
 def rate_table(releases: dict[str, Drifts]) -> ResultTable:
-    """Returns the drift rates of the joints in the first and the last `RATE_TIME` of releases, by name."""
+    """Returns a table of drift rates in the first, the last and the worst interval of length `RATE_TIME`.
+
+    Args:
+        releases: Mapping from the name of a controller to the drifts with this controller.
+    """
     window = round(RATE_TIME / SAMPLE_PERIOD)
     rows = []
     for label, drifts in releases.items():
@@ -119,7 +123,7 @@ FRICTIONLESS_DURATION = 3.0
 
 
 def reproduce_figure_5(session: ReproductionSession) -> Section:
-    """Simulates releases with torques on all joints: with both models, with hand guiding, and without friction."""
+    """Simulates releases with torques on all joints: with both models, after hand guiding, and without friction."""
     mtm, sample_sizes = session.mtm, session.sample_sizes
     poses = session.random_poses(PAPER_ARM, sample_sizes.releases)
     few = poses[: sample_sizes.paper_releases]
@@ -179,32 +183,33 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     )
     remarks = (
         mtm.truth.origin,
-        f"**Ours** is identified from {sample_sizes.collected} poses, collected on the ground-truth arm with its "
+        f"**Ours** is identified from {sample_sizes.collected} poses, collected on the ground-truth arm with "
         "friction, noise and encoders. Each pose was approached from both sides. The controller compensates gravity "
         f"with this model only. **The paper's** is {_whose(session)}. Each release starts at rest, with unloaded "
-        f"friction, at a random pose inside the joint limits. Each simulation takes {sample_sizes.duration:g} s.",
+        f"friction, at a random pose inside the joint limits. Each simulation lasts {sample_sizes.duration:g} s. "
+        f"In the first table, a joint is held if it stays within {1e3 * BAND[0]:.0f} mrad.",
         f"**Ours keeps all joints within {1e3 * BAND[0]:.0f} mrad at {share(ours.num_held, len(poses))}** of the "
-        f"poses. The shares of single joints are: {_per_joint(ours)}. The paper's parameters keep all joints at "
-        f"{share(paper.num_held, len(few))}. Most releases fail at {_lost(paper)}, where the torque error exceeds "
-        "the dry friction (second table). The causes are the unweighted least squares and the missing spring, as in "
-        "Fig. 4. The published drifts differ, because the real arm was placed by hand, its cables have hysteresis, "
-        "and the friction here was identified on another MTM.",
+        f"poses. The shares for single joints are: {_per_joint(ours)}. The paper's parameters hold all joints at "
+        f"{share(paper.num_held, len(few))} of the poses. Most releases fail at {_lost(paper)}, where the torque error "
+        "exceeds the dry friction (second table). This torque error is caused by the unweighted least squares and the "
+        "missing spring, as in Fig. 4. The published drifts differ, because the real arm was placed by hand, its "
+        "cables have hysteresis, and the friction of the simulated arm was identified on another MTM.",
         f"**Hand-guided**: the arm is moved to the pose from a distance of {APPROACH[0]:g} rad and regulated for "
-        f"{SETTLING_TIME:g} s, which loads its friction. Then ours keeps all joints at "
-        f"{share(hand_guided.num_held, len(hand_guided.positions))} of the poses. Releases that fail, by joint: "
-        f"{_any_lost(hand_guided)}. Gravity compensation does not include the state of friction. Hysteresis with a "
+        f"{SETTLING_TIME:g} s. This motion loads the presliding springs of the friction. Then ours holds all joints at "
+        f"{share(hand_guided.num_held, len(hand_guided.positions))} of the poses. Number of failed releases by joint: "
+        f"{_any_lost(hand_guided)}. The gravity compensation does not compensate the loaded springs. Hysteresis with a "
         "width of 0.06-0.25 rad pushes joints 2 and 3 back, and less friction remains to resist the model error. "
-        "The friction of joint 7 deflects by 15 mrad before it slips. An exact model has the same drift. The "
+        "The friction of joint 7 deflects by 15 mrad before it slips. An exact model causes the same drift. The "
         "published drifts of joints 2 and 3, up to 0.13 rad, have a similar size.",
         f"**With compensated hysteresis** (`run --hysteresis-ratio {MAX_HYSTERESIS_RATIO:g}`, exact friction model), "
-        f"releases that fail, by joint: {_any_lost(hysteresis_compensated)} of "
-        f"{len(hysteresis_compensated.positions)}. The largest drift is {_furthest(hysteresis_compensated)} mrad.",
+        f"the arm is released at {len(hysteresis_compensated.positions)} poses. Number of failed releases by joint: "
+        f"{_any_lost(hysteresis_compensated)}. The largest drift is {_furthest(hysteresis_compensated)} mrad.",
         "**Without friction**, only an exact model keeps an arm at rest, because a small torque error accelerates "
-        f"the wrist by tens of rad/s^2. Within {FRICTIONLESS_DURATION:g} s, the arm reaches its joint limits with "
-        f"both models. It stays away from them at {_num_staying(frictionless_paper)} (paper's) and "
+        f"the wrist by tens of rad/s^2. Within {FRICTIONLESS_DURATION:g} s, the arm usually reaches a joint limit "
+        f"with both models. No joint reaches a limit at {_num_staying(frictionless_paper)} (paper's) and "
         f"{_num_staying(frictionless_ours)} (ours) of {len(few)} poses. **No gravity compensation alone passes this "
-        "test.** With damping (`run --mode damped`), the arm creeps at the rates of the third table, which are the "
-        "torque error divided by the damping. It does not accelerate.",
+        "test.** With damping (`run --mode damped`), the arm creeps at the rates of the third table. Each rate is "
+        "the torque error divided by the damping. The arm does not accelerate.",
     )
     return Section("fig5", "Fig. 5: drift after release, all torques", remarks, tables, figures)
 
@@ -217,23 +222,25 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
     paper = session.release(PAPER_ARM, mtm.truth, zeroed, few, "Fig. 6: releasing the paper's")
     ours = session.release(PAPER_ARM, mtm.truth, session.without_wrist_torque(mtm.file), few, "Fig. 6: releasing ours")
     figures = _plots(
-        session.folder, "fig6", "joints 5-7 zeroed", ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS
+        session.folder, "fig6", "zero torque on joints 5-7", ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS
     )
-    table = drift_table("fig6", "joints 5-7 zeroed", published.FIGURE_6, published.FIGURE_6_MEANS, paper, ours)
+    table = drift_table("fig6", "zero torque on joints 5-7", published.FIGURE_6, published.FIGURE_6_MEANS, paper, ours)
     remarks = (
         f"The experiment uses the arm and the first {len(few)} poses of Fig. 5. Joints 5-7 have zero torque, so only "
-        "friction resists gravity. With the paper's parameters on joints 1-4, all joints stay at "
-        f"{share(paper.num_held, len(few))} of the poses, with ours at {share(ours.num_held, len(few))}. Joint 5 still "
-        "falls where its gravity and spring torque exceeds its friction.",
-        "The gravity torque of joints 6 and 7 is from the recording of 72 poses and is similar to their friction. "
-        "Therefore they drift less than in the published trials. See the ground-truth arm of Fig. 5.",
+        "friction resists gravity. With the paper's parameters on joints 1-4, all joints are held "
+        f"at {share(paper.num_held, len(few))} of the poses. With ours, all joints are held at "
+        f"{share(ours.num_held, len(few))}. Joint 5 still falls at poses where its gravity and spring torque exceeds "
+        "its friction.",
+        "The gravity torque of joints 6 and 7 is identified from the recording of 72 poses and is similar to their "
+        "friction. Therefore these joints drift less than in the published trials. Fig. 5 describes the ground-truth "
+        "arm.",
     )
-    return Section("fig6", "Fig. 6: drift after release, joints 5-7 zeroed", remarks, (table,), figures)
+    return Section("fig6", "Fig. 6: drift after release, zero torque on joints 5-7", remarks, (table,), figures)
 
 
 def _whose(session: ReproductionSession) -> str:
     if session.mtm.truth.is_paper_arm:
-        return "the set of twelve published parameters, identified with g = 9.9 m/s^2 and used with 9.81 m/s^2"
+        return "the set of twelve published parameters. It was identified with g = 9.9 m/s^2 and used with 9.81 m/s^2"
     return (
         "unweighted least squares on the same poses, because the recording for the published parameters is not "
         "available"
@@ -241,7 +248,7 @@ def _whose(session: ReproductionSession) -> str:
 
 
 def _lost(drifts: Drifts) -> str:
-    """Returns the joints that stay in the band in less than half of the releases."""
+    """Returns the names of the joints that are held in less than half of the releases."""
     lost = [joint for joint, held in zip(_JOINTS, drifts.held.mean(axis=0), strict=True) if held < 0.5]
     return ", ".join(lost) if lost else "single joints"
 

@@ -64,9 +64,10 @@ def reproduce_table_1() -> Section:
         "Table I: DH parameters of the MTM",
         (
             f"The DH parameters of the plant are computed from the link poses at {POSES} random joint positions. "
-            f"Their transforms have an error of at most {worst:.0e}. They differ from Table I by at most "
-            f"{angles:.0e} rad and {lengths:.0e} m. Table I does not contain the parallelogram, which transmits "
-            "elbow torque to the shoulder motor and has joint stops in q2 + q3, and L1, which affects no joint.",
+            f"Their transformation matrices have an error of at most {worst:.0e}. These DH parameters differ from "
+            f"Table I by at most {angles:.0e} rad and {lengths:.0e} m. Table I does not contain L1, which affects no "
+            "joint. Table I also does not contain the parallelogram, which transmits elbow torque to the shoulder "
+            "motor and has joint stops in q2 + q3.",
         ),
         (ResultTable("table1", "DH parameters [rad, m], theta = +-q + offset", header, tuple(rows)),),
     )
@@ -95,17 +96,17 @@ def reproduce_psm(session: ReproductionSession) -> Section:
         ("ours, share held", *numbers(ours.held.mean(axis=0), "{:.3f}")),
     )
     remarks = (
-        "The paper shows a model without an experiment, and its masses are placeholders. The first table compares the "
-        "file of the paper with our plant.",
+        "The paper shows a model of the PSM without an experiment. The masses of this model are placeholders. The "
+        "first table compares the file of the paper with our plant.",
         f"{psm.truth.origin} Ours is identified from {sample_sizes.collected} poses of this arm. Each release starts "
-        f"at a random pose inside the joint limits and takes {sample_sizes.duration:g} s with gravity compensation "
+        f"at a random pose inside the joint limits and lasts {sample_sizes.duration:g} s with gravity compensation "
         f"only. **All joints stay within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
         f"{share(ours.num_held, len(poses))}** of the poses with ours, and at {share(nominal.num_held, len(poses))} "
         "with the nominal model.",
-        f"`identify` disabled feedforward of these joints: {', '.join(disabled) or 'none'}. Their torque is below 2 "
-        "% of the effort limit, or the model is not more accurate than zero torque. Only friction resists their "
-        "gravity and spring torque. It is too small for the spring of the roll joint far from the middle of its "
-        "range.",
+        f"`identify` disabled the feedforward of these joints: {', '.join(disabled) or 'none'}. Their torque is below "
+        "2 % of the effort limit, or the model is not more accurate than zero torque. Only friction resists the "
+        "gravity and spring torque of these joints. Far from the middle of the joint range, the spring torque of the "
+        "roll joint is larger than its friction.",
     )
     release = ResultTable("psm_release", "Absolute drift after release [rad; insertion m]", ("", *names), rows)
     shows = "PSM: cumulative distribution of the largest drift of each release"

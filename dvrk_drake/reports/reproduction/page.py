@@ -1,4 +1,4 @@
-"""Writes the results as a page with figures and tables, and each table as a CSV file."""
+"""Writes the results to a page with figures and tables, and each table to a CSV file."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def numbers(values: ArrayLike, pattern: str) -> tuple[str, ...]:
 
 
 def share(held: int, total: int) -> str:
-    """Returns a share with its 95 % confidence interval (Wilson, 1927) as text."""
+    """Returns the share held / total, with its 95 % confidence interval (Wilson, 1927), as text."""
     interval = Share.of(held, total)
     low, high = 100 * interval.lower, 100 * interval.upper
     return f"{held} of {total} ({100 * held / total:.1f} %, 95 % interval {low:.1f}..{high:.1f} %)"
@@ -122,5 +122,5 @@ _PREFACE = (
     "This page compares published figures and tables of *Gravity Compensation Control of da Vinci Robot* (Rutfield, "
     "Zia, Boos, Santoso, Sujumnong, WPI 2015) with results of `dvrk-drake reproduce`. Angles are in rad, torques in "
     "N m. "
-    '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes this project.'
+    '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes the method or model of this project.'
 )

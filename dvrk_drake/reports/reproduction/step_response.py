@@ -31,7 +31,7 @@ _JOINTS = tuple(f"J{j}" for j in range(1, 8))
 
 
 def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION) -> Section:
-    """Simulates the paper's controller on its arm and ours on the ground-truth arm, and writes fig7.png."""
+    """Simulates the paper's controller on the paper's arm and ours on the ground-truth arm, and writes fig7.png."""
     folder, mtm = session.folder, session.mtm
 
     def progress(share: float) -> None:
@@ -65,20 +65,20 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
     remarks = (
         "The step is from J5 = 3.13, J3 = -0.79, J2 = -0.22 rad to zero, at 100 Hz, with the published gains and "
         "masses. The controller of the paper has a fault: the damping terms of joints 5-7 use positions instead of "
-        "velocities. They add stiffness but no damping.",
+        "velocities. These terms add stiffness but no damping.",
         f"Each link has an inertia of {LINK_INERTIA:g} kg m^2, as in the PSM file of the paper. The oscillation period "
         f"of J2 confirms this value: {published.FIGURE_7_VALUES['J2 period']:.0f} s published, "
         f"{longest_period(theirs_arm):.0f} s here.",
-        f"With the fault, the least damped oscillation near zero (joint 7) decays at {max(0.0, -with_fault):.3f} /s, "
-        f"and integral action can make it grow. Without the fault, all oscillations decay at {-without:.3f} /s "
-        "or more. Joints 6 and 7 start at their published amplitudes, because the planar start pose does not excite "
-        "them.",
+        f"With the fault, the least damped oscillation near zero (joint 7) has a decay rate of "
+        f"{max(0.0, -with_fault):.3f} /s, and integral action can increase its amplitude. Without the fault, all "
+        f"oscillations have a decay rate of at least {-without:.3f} /s. Joints 6 and 7 start at their published "
+        "amplitudes, because the planar start pose does not excite these joints.",
         "Our controller regulates the ground-truth MTM of Fig. 5 with all effects except joint stops, because the "
-        "start is beyond the stops. It uses the effort limits of the arm, the identified model, the gains of "
-        "`mechanisms/mtm.yaml` and a rate of 1 kHz. Its largest error in the last second is "
+        "start pose is beyond the stops. The controller uses the effort limits of the arm, the identified model, the "
+        "gains of `mechanisms/mtm.yaml` and a rate of 1 kHz. The largest position error in the last second is "
         f"{1e3 * np.abs(ours[-round(1 / PERIOD) :]).max():.1f} mrad, because friction resists small integral efforts.",
-        "The solver, joint limits and friction of Gazebo differ from those here. Therefore the phase of undamped "
-        "oscillations is not comparable, only whether they decay.",
+        "The solver, joint limits and friction of Gazebo differ from those here. Therefore the phases of the "
+        "oscillations cannot be compared. Only the decay of the oscillations is compared.",
     )
     table = ResultTable(
         "fig7",

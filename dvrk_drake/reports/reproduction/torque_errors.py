@@ -16,7 +16,8 @@ from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 
 _FILE = "fig4.png"
-#: Smallest drawn squared error [(N m)^2]. Smaller errors, for efforts measured as exactly 0, are drawn at this value.
+#: Smallest drawn squared error [(N m)^2]. Smaller squared errors are drawn at this value. They occur if an effort was
+#: measured as exactly 0.
 FLOOR = 1e-9
 
 
@@ -36,7 +37,7 @@ def reproduce_figure_4(
     included = ~_excluded(ours)
     _plot(folder / _FILE, ours, paper, zero, included)
     same = (
-        "Its squared errors differ from the published errors by at most "
+        "The reproduced squared errors differ from the published squared errors by at most "
         f"{np.abs(paper.residuals[:, 1:] ** 2 - published).max():.0e} (N m)^2. "
         if published is not None
         else ""
@@ -78,14 +79,15 @@ def reproduce_figure_4(
     worse = [f"J{j + 1}" for j in range(1, 7) if np.mean(paper.residuals[:, j] ** 2) > np.mean(zero[:, j] ** 2)]
     remarks = (
         f"Both methods use the recording of the paper ({len(recording)} poses of a real MTM). The paper's method is "
-        f"unweighted least squares with twelve parameters (eq. 10). {same}On {', '.join(worse)}, its error is larger "
-        "than that of zero torque, even at the fitted poses. The torques of joints 2 and 3 are ten to a hundred times "
-        "larger and therefore determine the parameters.",
+        f"unweighted least squares with twelve parameters (eq. 10). {same}On {', '.join(worse)}, the error of the "
+        "paper's method is larger than the error of zero torque, even at the fitted poses. The torques of joints 2 "
+        "and 3 are ten to a hundred times larger than the torques of these joints, and therefore determine the "
+        "parameters.",
         "Our method differs in four points. Joints are weighted by their residual variance. Offsets, springs and "
-        "cables are added if they improve cross-validation. A joint gets zero torque if the model does not improve "
-        f"it. Finally, {int(np.sum(~included))} measurements at joint stops and outliers are excluded (crosses in "
-        "the figure). With all measurements, the paper's error on J2 is smaller, because it fits the joint stop "
-        "together with gravity.",
+        "cables are added if they improve cross-validation. A joint gets zero torque if the model does not reduce "
+        f"its error. Finally, {int(np.sum(~included))} measurements at joint stops and outliers are excluded (crosses "
+        "in the figure). With all measurements, the paper's method has a smaller error on J2 than ours, because the "
+        "paper's method fits the torque of the joint stop together with gravity.",
     )
     shows = "Squared torque error of joints 2-7 at 72 poses, leave-one-out; errors below 1e-9 are drawn at 1e-9"
     return Section("fig4", "Fig. 4: torque errors", remarks, (squared, left_out), {_FILE: shows})

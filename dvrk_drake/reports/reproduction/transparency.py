@@ -37,8 +37,8 @@ def reproduce_transparency(session: ReproductionSession) -> Section:
         "The paper proposes this experiment as future work. A simulated hand (spring and damper) slowly moves the "
         "handle of the ground-truth arm along a path through random poses.",
         mtm.truth.origin,
-        f"In the last row, {MAX_RATIO:g} of the friction is compensated. The ratio is smaller where friction must "
-        "resist the error of the identified gravity (docs/friction_compensation.md).",
+        f"In the last row, friction is compensated with a ratio of at most {MAX_RATIO:g}. The ratio is smaller on "
+        "joints whose friction must resist the error of the identified gravity torque (docs/friction_compensation.md).",
     )
     return Section(
         "transparency",

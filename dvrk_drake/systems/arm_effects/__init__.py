@@ -1,1 +1,1 @@
-"""Effects of a simulated arm besides links, joints and linkage. Parts of `ArmStation`; see `models.effects_schema`."""
+"""Simulated effects of an arm, such as friction and cables, for `ArmStation`. See `models.effects_schema`."""

@@ -21,11 +21,11 @@ from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 class Motors:
     """Conversion of commanded joint efforts to motor efforts.
 
-    The command is clamped to the limits of the joints and converted to actuator efforts J^-T tau [N m, N]. The actuator
-    efforts are rounded to multiples of `effort.command_resolution` and limited to `saturation`.
+    The command is clamped to the effort limits of the joints and converted to actuator efforts J^-T tau [N m, N]. The
+    actuator efforts are rounded to multiples of `effort.command_resolution` and limited to `saturation`.
 
     Attributes:
-        constants: Joint limits, command resolution and saturation, as rows of an array (3, n).
+        constants: Effort limits of the joints, command resolution and saturation, as rows of an array (3, n).
         to_motors: Matrix J^-T (n, n) from joint efforts to actuator efforts.
     """
 
@@ -63,7 +63,7 @@ def motor_effort_into(command, constants, to_motors, effort):
 
 
 class EffortSensor(LeafSystem):
-    """Sensor of the motor efforts, as computed from the motor currents.
+    """Simulated sensor of the motor efforts. A dVRK computes these efforts from the motor currents.
 
     .. pydrake_system::
 
@@ -79,7 +79,7 @@ class EffortSensor(LeafSystem):
 
     The noise comes from a counter-based generator (Philox, Salmon et al., SC 2011). The noise of a time step depends
     only on the seed and the index of the step. A seed therefore gives identical noise for any order of evaluations.
-    Python cannot set the seed of Drake's RandomSource (1.51 to 1.58).
+    Drake's RandomSource is not used, because Python cannot set its seed (Drake 1.51 to 1.58).
     """
 
     def __init__(self, arm: Arm, motors: Motors, effort: EffortEffect | None, time_step: float, seed: int) -> None:
@@ -129,7 +129,7 @@ class DriveForce(LeafSystem):
         - generalized_force
 
     - `effort_commanded` (n): commanded joint efforts [N m, N]; see `Motors`. Unconnected: zero.
-    - `effort_disturbance` (n): joint efforts that are added after the motors [N m, N]. Unconnected: zero.
+    - `effort_disturbance` (n): joint efforts that act in addition to the motors [N m, N]. Unconnected: zero.
     - `plant_state`: state of the whole plant.
     - `generalized_force`: generalized force (nv) for the plant's port `applied_generalized_force`. The effects of
       cables and springs are defined as the effort that compensates them, so they are subtracted.
@@ -142,7 +142,7 @@ class DriveForce(LeafSystem):
             arm: Simulated arm.
             motors: Motors of the arm.
             parts: Effects in the finalized plant of the arm.
-            effects: Effects of the arm, of which cables and springs are used here.
+            effects: Effects of the arm. Only cables and springs are used here.
 
         Raises:
             StationError: An effect is not valid for this arm.
@@ -204,9 +204,9 @@ class DriveForce(LeafSystem):
     cache=True,
 )
 def _force_into(command, disturbance, state, joints, constants, to_motors, from_motors, q, motors, force):
-    """Computes the generalized force of motors and disturbance, in place in `force`.
+    """Writes the generalized force of motors and disturbance to `force`.
 
-    The joint positions `q` and the actuator efforts `motors` are also written.
+    The joint positions are written to `q` and the actuator efforts to `motors`.
     """
     motor_effort_into(command, constants, to_motors, motors)
     for i in range(len(force)):

@@ -1,4 +1,4 @@
-"""Joints of a plant for the coordinates of an arm's drive, at which Drake's solver computes friction and stops."""
+"""Joints of a plant for the coordinates of the drive. At these joints, Drake's solver computes friction and stops."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import Cable
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
-#: Inertia of each added body as a fraction of the arm's inertia at the coordinate. Mass of each added body [kg]. Drake
-#: limits the stiffness of a constraint, depending on the lighter body and the time step. For the parallelogram of an
-#: MTM, 3 N m cause a deflection of 1 mrad.
+#: Inertia of each added body, as a fraction of the arm's inertia along the coordinate. Mass of each added body [kg].
+#: Drake limits the stiffness of a constraint. The limit depends on the lighter body and on the time step. At the
+#: parallelogram of an MTM, an effort of 3 N m therefore causes a deflection of 1 mrad.
 SHARE, MASS = 2e-3, 1e-6
 #: Distance from the axis at which coupled bodies are constrained [m].
 RADIUS = 0.1
@@ -36,17 +36,17 @@ STIFF = Cable(stiffness=float("inf"))
 
 
 class DriveJoints:
-    """Finds or creates the joint of a coordinate x = row q of an arm's joints, before the plant is finalized.
+    """Finds or creates the joint for a coordinate x = row q of the joint positions q (n,), in a plant before Finalize.
 
-    If x is proportional to the position of one joint, that joint is used. For a sum of joints, a body with its own
-    joint is added, which rotates by x. The body is coupled in one of two ways:
+    If x is proportional to the position of one joint, that joint is used. If x depends on several joints, a body with
+    its own joint is added. The position of this joint is x. The body is coupled in one of two ways:
 
     - to a link that rotates by x about the same axis, e.g. the crank of the parallelogram relative to the yaw link,
     - otherwise to the last body of a chain that begins at the world. Each body of the chain rotates relative to the
-      previous one by the contribution of one joint.
+      previous body by the contribution of one joint to x.
 
     Attributes:
-        motors: Motors that `add_motor` created, by the name of the actuator.
+        motors: Mapping from the name of an actuator to the motor that `add_motor` created.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
@@ -56,7 +56,7 @@ class DriveJoints:
         self.motors: dict[str, JointActuator] = {}
 
     def add_motor(self, name: str, cable: Cable) -> None:
-        """Adds a separate joint for the motor of an actuator and couples it to the arm by an elastic cable.
+        """Adds a separate joint for the motor of an actuator and couples this joint to the arm by an elastic cable.
 
         Afterwards, `joint_of_coordinate` returns the joint of the motor for this actuator. The rotor inertia in the SDF
         is moved from the actuator's joint to the motor.
@@ -112,7 +112,7 @@ class DriveJoints:
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
     def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
-        """Returns a new joint parallel to coaxial joints whose angles add up to row q, or None if there are none."""
+        """Returns a new joint parallel to coaxial joints whose angles add up to row q, or None without such joints."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
         for name in names:

@@ -1,4 +1,4 @@
-"""Discrete update of the drive in each time step: springs of dry friction, and encoders."""
+"""Discrete update of the drive in each time step: anchors of the presliding springs, and encoders."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 
 
 class DriveStep(LeafSystem):
-    """Updates friction springs and encoders in one system, because each Python system costs time in every step.
+    """Updates friction springs and encoders in one system, because each additional Python system costs time.
 
     .. pydrake_system::
 
@@ -30,24 +30,25 @@ class DriveStep(LeafSystem):
         - desired_state
         - state_estimated
 
-    - `plant_state`: state of the plant that contains the sliders of `add_friction`.
-    - `desired_state`: positions, then velocities (zero) of all actuators of the arm's instance, for the plant's port of
-      that name. The position for a slider's actuator is the anchor of the slider's spring.
+    - `plant_state`: state of the plant, which contains the friction elements from `add_friction`.
+    - `desired_state`: desired positions, then desired velocities (zero), of all actuators of the arm's model instance.
+      They are for the plant's port `desired_state`. The desired position of a `Slider` is the anchor of its spring.
     - `state_estimated` (2n): measured q, then v of the arm's joints [rad, rad/s; m, m/s on a prismatic joint], delayed
       by the measurement delay.
 
-    **Friction.** An anchor is fixed while the deflection of the spring is below the slip limit. Beyond this limit, the
-    anchor follows at a constant distance; see `effect_step`. The plant evaluates the spring at the end of a step. The
-    anchor moves afterwards, always towards less deflection. The spring therefore never returns more energy than was
-    put into it, so friction adds no energy. At initialization, all springs are relaxed.
+    **Friction.** The anchor of a friction spring is fixed while the deflection of the spring is below the slip limit.
+    Beyond this limit, the anchor follows the joint at a constant distance; see `effect_step`. The plant evaluates the
+    spring at the end of a step. The anchor is updated afterwards, and this update only reduces the deflection. A spring
+    therefore never returns more energy than was stored in it, and friction adds no energy. At initialization, the
+    deflection of all springs is zero.
 
     **Encoders.** A measured actuator position is a whole number of encoder counts. Joint positions follow from the
     transmission. The velocity is the difference of two readings over the time step h, after a first-order low-pass
     filter with cut-off frequency f: y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h with a = exp(-2 pi f h). Without an
     encoder, position and velocity are exact.
 
-    **Start.** The arm is assumed to be at rest before the start, at the pose of `SetAtRest` or at the pose at
-    initialization. With a delay, the output during initialization uses the pose of `SetAtRest`.
+    **Start.** Before the start, the arm is assumed to be at rest at the pose that it has at initialization. With a
+    delay, the output during initialization uses the pose of `SetAtRest` instead.
     """
 
     def __init__(self, arm: Arm, parts: PlantEffects, effects: ArmEffects, q_default: NDArray[np.float64]) -> None:
@@ -56,7 +57,7 @@ class DriveStep(LeafSystem):
         Args:
             arm: Simulated arm.
             parts: Effects in the finalized plant of the arm.
-            effects: Effects of the arm, of which encoder and delay are used here.
+            effects: Effects of the arm. Only encoder and delay are used here.
             q_default: Initial pose (n,) [rad, m] of the arm at rest.
         """
         super().__init__()
@@ -107,13 +108,13 @@ class DriveStep(LeafSystem):
         return update
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        """Computes the output without delay. It is the result of the coming update."""
+        """Computes the output without delay, which equals the result of the next update."""
         memory = context.get_discrete_state(_MEMORY).get_value().copy()
         state = self.EvalVectorInput(context, 0).get_value()
         self._measure_into(state, *self._maps, self._constants, memory, output.get_mutable_value())
 
     def SetAtRest(self, context: Context, q: NDArray[np.float64]) -> None:
-        """Sets the measurements in the context of this system to those of an arm at rest at q (n,) [rad, m]."""
+        """Sets the measurements in the context of this system for an arm at rest at q (n,) [rad, m]."""
         for group, value in zip((_OUT, _MEMORY), self._at_rest(q), strict=True):
             context.SetDiscreteState(group, value)
 
@@ -142,7 +143,7 @@ _ANCHORS, _OUT, _MEMORY = 0, 1, 2  # indices of the discrete state groups
 
 @numba.njit("void(float64[::1], int64[:, ::1], float64[:, ::1], float64, float64[::1])", cache=True)
 def _move_anchors(state, places, laws, time_step, anchors):
-    """Moves the anchors of the springs, in place. `places` and `laws` have one row per `Slider`."""
+    """Updates the array `anchors` of the spring anchors in place. `places` and `laws` have one row per `Slider`."""
     num_positions = len(state) // 2
     for i in range(len(places)):
         code, actuator, column = places[i]
@@ -152,14 +153,14 @@ def _move_anchors(state, places, laws, time_step, anchors):
         if fall_speed > 0.0:
             slip_travel *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
         deflection = side * (position - anchors[actuator])
-        # The deflection of a spring that starts relaxed equals the element's state.
+        # From state 0, a travel by the deflection gives the limited deflection, divided by `slip_travel`.
         z, _ = effect_step(code, 0.0, deflection, 0.0, slip_travel)
         if abs(deflection - z * slip_travel) < 1e-12 * travel:
             continue
         deflection = z * slip_travel
         if slip_travel < travel:
-            # The deflection still increases in this step and in the step that uses the anchor. At the full `travel`,
-            # the effort limit of the actuator covers this.
+            # The joint also moves in this step and in the step that uses the new anchor. The deflection is reduced by
+            # this motion in advance. With the full `travel`, the effort limit of the actuator has the same effect.
             deflection = math.copysign(max(abs(deflection) - 2.0 * time_step * abs(velocity), 0.0), deflection)
         anchors[actuator] = position - side * deflection
 
@@ -172,7 +173,8 @@ def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out)
     """Measures `state` and writes the delayed measurement to `out`. Without a queue, there is no delay.
 
     `memory` contains the last readings and velocities of the actuators, then the queue of measurements. `constants`
-    contains the resolutions (n), the decay of the low-pass filter and the time step.
+    contains the resolutions (n,), the decay factor of the low-pass filter and the time step [s]. Without an encoder,
+    the decay factor is negative.
     """
     n, num_positions = to_actuators.shape
     decay, time_step = constants[n], constants[n + 1]

@@ -1,4 +1,4 @@
-"""Drive with simulated effects, between a plant and the ports of its station."""
+"""Drive with simulated effects, between a plant and the ports of the station."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
         builder.Connect(step.GetOutputPort("desired_state"), plant.get_desired_state_input_port(drive.instance))
     state = add_true_state(builder, plant, drive.joints)
     motors = Motors(drive.arm, drive.effects, drive.joints.effort_limits)
-    # This port is optional. The output of the PassThrough is not read if it is unconnected.
+    # The input of the PassThrough is optional. If this input is unconnected, the output is zero.
     commanded = builder.AddNamedSystem("effort_commanded", PassThrough(drive.arm.num_joints))
     force = builder.AddNamedSystem("drive_force", DriveForce(drive.arm, motors, drive.parts, drive.effects))
     at_motors = _add_delay(builder, "command_delay", delay.command, commanded.get_output_port(), drive)

@@ -1,4 +1,4 @@
-"""Effects of a real arm that are elements of Drake's solver, mainly dry friction."""
+"""Effects that Drake's solver computes, mainly dry friction."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from dvrk_drake.models.effects_schema import FRICTION_KINDS, ArmEffects, Frictio
 from dvrk_drake.systems.arm_effects.drive_joints import DriveJoints
 from dvrk_drake.systems.ideal_drive import PlantJoints
 
-#: Relaxation time of the presliding springs [s], i.e. damping divided by stiffness. It limits oscillations after an
-#: impact. Drake limits the sum of spring and damper effort to the friction coefficient, so it does not change sliding
-#: friction.
+#: Relaxation time of the presliding springs [s], i.e. damping divided by stiffness. The damping reduces oscillations
+#: after an impact. Drake limits the sum of spring effort and damper effort to the friction coefficient. The damping
+#: therefore does not change sliding friction.
 RELAXATION = 0.02
 
 
@@ -32,7 +32,8 @@ class Slider:
         actuator: Index of the actuator in the model instance.
         position: Index of the joint's position in the plant.
         travel: Travel of the joint until the element slips [rad, m].
-        fall_speed: Speed at which the slip limit is 1/e of the limit at rest [rad/s, m/s]; 0 for a constant limit.
+        fall_speed: Speed at which the slip limit is 1/e of the slip limit at rest [rad/s, m/s]; 0 for a constant slip
+            limit.
         side: -1 if the directions +x and -x are exchanged, otherwise 1.
     """
 
@@ -69,19 +70,20 @@ def add_friction(
     """Adds friction to a plant that is not finalized.
 
     The solver evaluates each element at the end of the step. The element therefore dissipates energy in every step, for
-    any stiffness. The kinds of friction are, with coefficient c and scale s:
+    any stiffness. The kinds of friction are listed below. The coefficient is c, the scale s, the position along the
+    coordinate x and the velocity v.
 
     - "presliding": effort -c clip((x - x_s + T v) / s, -1, 1). x_s is the anchor from `DriveStep`, and T is
-      `RELAXATION`. Below c, the joint sticks without creep. With a fall speed w, the limit is c exp(-(v/w)^2), i.e.
-      Stribeck friction that decreases while sliding. T is then 0, because the limit applies only to the spring.
-    - "presliding forward": as "presliding" with the limits 0 and 1 and T = 0. It represents the excess of friction
-      towards +x over friction towards -x. A negative coefficient exchanges the directions.
-    - "coulomb": effort -c clip(v / s, -1, 1), the smoothed sign function of an identification. Below c, the joint
-      creeps with a speed up to s.
+      `RELAXATION`. If the applied effort is below c, the joint sticks without creep. With a fall speed w, the limit of
+      the effort is c exp(-(v/w)^2) (Stribeck friction). T is then 0, because this limit applies only to the spring.
+    - "presliding forward": as "presliding" with the limits 0 and 1 and T = 0. It represents the additional friction in
+      the direction +x, compared with -x. A negative coefficient exchanges the directions.
+    - "coulomb": effort -c clip(v / s, -1, 1), which contains a smoothed sign function as in the identification. If the
+      applied effort is below c, the joint creeps with a speed of up to s.
     - "viscous": effort -c v.
 
-    While the limit of a presliding element is below c, its anchor is late by two time steps h. This acts like viscous
-    friction with the coefficient 2 h c / s. Choose a scale s well above 2 h v.
+    While the limit of a presliding element is below c, its anchor has a delay of two time steps h. This delay acts like
+    viscous friction with the coefficient 2 h c / s. Choose a scale s well above 2 h v, where v is the sliding speed.
 
     Returns:
         Elements that need a `DriveStep`: actuator in the plant, effect, and ratio of the coordinate to the position of
@@ -115,7 +117,10 @@ def add_friction(
 
 
 def _copy_rotor(plant: MultibodyPlant, actuator: JointActuator) -> None:
-    """Copies the rotor inertia to a new actuator, as Drake uses that of a joint's last actuator (1.51 to 1.58)."""
+    """Copies the rotor inertia of the joint to a new actuator.
+
+    Drake uses only the rotor inertia of the last actuator of a joint (1.51 to 1.58).
+    """
     for index in plant.GetJointActuatorIndices():
         motor = plant.get_joint_actuator(index)
         if motor.joint().index() == actuator.joint().index() and motor.default_rotor_inertia() > 0:
@@ -128,7 +133,7 @@ def _add_damping(joint: Joint, damping: float) -> None:
 
 
 class PlantEffects:
-    """Adds effects to a plant that is not finalized. Provides indices and matrices after `finish`.
+    """Adds effects to a plant that is not finalized. After Finalize, `finish` computes indices and matrices.
 
     Attributes:
         drive: Joints of the coordinates of the drive.

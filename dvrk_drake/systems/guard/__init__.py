@@ -1,1 +1,1 @@
-"""Command guard between the senders of commands and the motors of an arm. Independent of Drake and LCM."""
+"""Command guard between the senders of commands and the motors of an arm. It does not depend on Drake."""

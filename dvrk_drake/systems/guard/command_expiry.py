@@ -1,18 +1,19 @@
-"""Expiry of commands. A command answers a measurement and expires by the age of that measurement."""
+"""Expiry of commands. A command expires when the measurement from which it was computed is too old."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
 
-#: Number of measurements at 2 kHz within the longest expiry, 1 s.
+#: Largest number of recorded times: measurements at 2 kHz during the longest allowed expiry of 1 s.
 _MAX_MEASUREMENTS = 2000
 
 
 class WallClock:
-    """Wall-clock times of measurements. The wall clock continues while the process and the arm's clock are stopped.
+    """Record of the wall-clock times of measurements.
 
-    Copies of a guard share one object, because it records external events.
+    The wall clock continues while the process or the arm's clock is stopped. All copies of a guard share one record,
+    because the recorded times do not depend on the state of a copy.
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
@@ -25,7 +26,7 @@ class WallClock:
         self._times: OrderedDict[int, int] = OrderedDict()
 
     def note(self, measured_utime: int, age: int) -> None:
-        """Records the current wall-clock time of a measurement.
+        """Records the wall-clock time of a measurement, unless the time of this measurement is already recorded.
 
         Args:
             measured_utime: Time of the measurement on the arm's clock [us].
@@ -46,15 +47,16 @@ class WallClock:
         return self.now() - age if time is None else time
 
     def forget(self) -> None:
-        """Discards all measurements. Called after the arm's clock went back."""
+        """Discards all recorded times. The guard calls this method after the arm's clock went back."""
         self._times.clear()
 
 
 class CommandExpiry:
-    """Age limit of commands, counted from the measurement that a command answers.
+    """Age limit of commands. The age of a command is the age of the measurement from which it was computed.
 
-    The age is measured by the arm's clock and, if there is one, by the wall clock. The larger value counts. A command
-    therefore also expires while the arm's clock is late or stopped. Copies of a guard share one object.
+    The age is determined by the arm's clock and, if there is a wall clock, also by the wall clock. The larger of these
+    ages counts. A command therefore also expires while the arm's clock is late or stopped. All copies of a guard share
+    one object of this class.
     """
 
     def __init__(self, expiry: int, wall_clock: Callable[[], int] | None) -> None:
@@ -75,7 +77,7 @@ class CommandExpiry:
         """Returns the reason why a command has expired, or "" if it has not expired.
 
         Args:
-            age: Age of the measurement that the command answers, by the arm's clock [us].
+            age: Age of the measurement from which the command was computed, by the arm's clock [us].
             wall_utime: Wall-clock time of that measurement [us]; see `wall_time`.
         """
         clock = "the arm's clock"
@@ -83,4 +85,6 @@ class CommandExpiry:
             age, clock = by_wall, "the wall clock"
         if age <= self.expiry:
             return ""
-        return f"the last command expired: {1e-3 * age:.1f} ms old by {clock}, {1e-3 * self.expiry:g} ms are allowed"
+        return (
+            f"the last command expired: it is {1e-3 * age:.1f} ms old by {clock}; {1e-3 * self.expiry:g} ms are allowed"
+        )

@@ -1,4 +1,4 @@
-"""Command guard: checks the commands to an arm and the arm's measurements. Independent of Drake and LCM."""
+"""Command guard: checks the commands to an arm and the arm's measurements. It does not depend on Drake."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ from dvrk_drake.systems.guard.settings import GuardSettings
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
-#: Largest time step that the rate limits use [s]. They do not compensate for longer intervals between two steps.
+#: Largest time step that the rate limits use [s]. They also use this value if the time between two steps is longer.
 _MAX_STEP = 0.01
 
-#: Longest gap between two measurements that are compared [s]. During a longer gap, the arm may have been moved.
+#: Longest gap between two measurements that are compared with each other [s]. During a longer gap, the arm may have
+#: been moved.
 _MAX_GAP = 0.1
 
 #: States in which a position controller regulates the arm to a target.
@@ -48,22 +49,24 @@ _ACTIVE = {
 
 
 class CommandGuard:
-    """Watchdog between the sender of commands and the motors of an arm.
+    """Guard between the sender of commands and the motors of an arm.
 
-    Call `receive` with every command and `step` once per period (1 ms). Both require the time of the arm's clock [us],
-    which is also the clock of the status messages. `step` returns the output for this period. The caller applies this
-    output unchanged.
+    Call `receive` with every command and `step` once per period (1 ms). Both methods require the time of the arm's
+    clock [us]. The status messages use the same clock. `step` returns the output for this period. The caller must apply
+    this output unchanged.
 
     **States** (lcmt_dvrk_status.STATE_*) and the behaviour of the arm in each of them:
 
-    - OFF: The motors have no power. Only a HOLD command leaves this state, to HOLD.
-    - HOLD: The arm regulates to a latched pose. This is the initial state. It needs no commands.
-    - STARTING: As HOLD, while the POSITION or EFFORT commands of a sender are monitored.
-    - POSITION, EFFORT: The last command acts, inside the limits of GuardLimits.
-    - FAULT: As HOLD. After a measurement fault, the guard regulates only joints with a valid position. Joints without
-      one get the gravity effort at their last valid position. If the motors had no power, FAULT is as OFF.
+    - OFF: The motors have no power. Of all commands, only HOLD ends this state.
+    - HOLD: The arm's position controller regulates to a latched pose. HOLD is the initial state and needs no commands.
+    - STARTING: The arm behaves as in HOLD. The POSITION or EFFORT commands of a sender are monitored but do not act
+      yet.
+    - POSITION, EFFORT: The last accepted command acts inside the limits of `GuardLimits`.
+    - FAULT: The arm behaves as in HOLD. After a measurement fault, the guard regulates only joints with a valid
+      position. All other joints get the gravity effort at their last valid position. If the motors had no power before
+      the fault, the arm behaves as in OFF.
 
-    ::
+    Transitions are written as "state --command or event--> next state"::
 
         HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, except from FAULT
         HOLD --POSITION, EFFORT--> STARTING --accepted for start_time--> POSITION, EFFORT
@@ -72,69 +75,77 @@ class CommandGuard:
         POSITION, EFFORT --the other mode--> STARTING
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
-    **Expiry**: A command expires `expiry` after the measurement that it answers (`status_utime` of the command). The
-    time of arrival does not matter. Repeating the answer to one measurement does not extend its expiry. After the
-    expiry, the arm holds. See `CommandExpiry`.
+    **Expiry**: A command contains the time of the measurement from which it was computed (`status_utime`). The command
+    expires when this measurement is older than the setting `expiry`. The time of arrival does not matter. A second
+    command with the same `status_utime` therefore does not expire later. When the command in force expires, the guard
+    holds the arm. See `CommandExpiry`.
 
-    **Measurements** are checked for finite numbers, age and plausibility (`Plausibility`). A measurement that is not
-    finite or too old ends the control by commands. While the arm holds, a few such measurements in a row are tolerated.
-    A longer sequence is a fault. The first measurement, and the first one after a gap, OFF or a reset, is not compared
-    with an earlier one. Its pose must not be far outside the limits.
+    **Measurements**: The guard checks that each measurement is finite, recent and plausible (`Plausibility`). A
+    measurement that is not finite or too old ends STARTING, POSITION and EFFORT. While the arm holds, up to
+    `bad_samples` such measurements in a row are tolerated. A longer sequence of such measurements is a fault. The first
+    measurement is not compared with an earlier one. The same applies to the first measurement after a gap in the
+    measurements, after OFF and after a reset. The pose of such a measurement must not be far outside the limits.
 
-    **Period**: The guard refuses POSITION and EFFORT commands if it was not stepped for `longest_period`, or if its
-    median period is above `slow_period`. Its limits would then act too late.
+    **Period**: The guard refuses POSITION and EFFORT commands if `step` was not called for `longest_period`, or if the
+    median time between two calls exceeds `slow_period`. In these cases, the limits would act too late.
 
-    **Resume**: If an expiry, an invalid measurement or a long period ends POSITION or EFFORT, the watchdog takes over.
-    The guard then refuses POSITION and EFFORT until an operator resumes. A resume uses the same command as the reset of
-    a fault. `hold_reason` states the reason. This is not a fault: the arm holds, and OFF is allowed. No resume is
-    needed if the sender commanded HOLD before it stopped sending, or if STARTING ended.
-    `GuardSettings.resume_automatically` disables this requirement. The next sender still passes through STARTING.
+    **Watchdog hold**: If an expired command, an invalid measurement or a long period ends POSITION or EFFORT, the guard
+    holds the arm. This is called a watchdog hold. The guard then refuses POSITION and EFFORT until an operator resumes.
+    The command for a resume is the same as for the reset of a fault. `hold_reason` states the reason of the hold. A
+    watchdog hold is not a fault, and OFF is allowed. No resume is needed if the sender commanded HOLD before it stopped
+    sending, or if no POSITION or EFFORT command has acted yet. With `GuardSettings.resume_automatically`, no resume is
+    needed in any case. New commands act only after STARTING.
 
-    **Refused commands** are not finite, expired on arrival, out of order, duplicated, after a jump of the sender's
-    sequence or clock, or in a mode that is not accepted in this state. `lcmt_dvrk_status.REFUSAL_*` lists the reasons.
-    A refused command does not act and does not extend the expiry of an older command. A stream of refused commands
-    therefore ends in HOLD.
+    **Refused commands**: A command is refused if a number is not finite, or if the command has expired on arrival, is
+    out of order or is a duplicate. It is also refused after a jump of the sender's sequence or clock, and if its mode
+    is not accepted in the present state. `lcmt_dvrk_status.REFUSAL_*` lists all reasons. A refused command does not
+    act, and the expiry of the command in force does not change. If all new commands are refused, the state therefore
+    changes to HOLD.
 
-    **Ignored messages** are unreadable, not authentic, or for another arm, size or session. Messages of a second sender
-    are ignored while the first one still sends. Ignored messages are counted separately and have no effect, so the
-    first sender stays in control. Without a key, only the sender_id identifies a sender. Any process on the network can
-    copy it.
+    **Ignored messages**: A message is ignored if it is unreadable or not authentic, or if it has another arm, number of
+    joints or session. Messages of a second sender are ignored while commands of the first sender are accepted. Ignored
+    messages have no effect. They are not included in the number of refused commands. Without a key, only the sender_id
+    identifies a sender, and any process on the network can copy this number.
 
-    **OFF** drops an arm without brakes. It must be listed in `modes`, and a single message is not sufficient: the arm
-    must hold, and the sender's last command must have been HOLD. The guard refuses OFF during a fault and holds the arm
-    until an operator resets the fault. In an emergency, press the stop button.
+    **OFF**: An arm without brakes falls when its motors are off. OFF must be listed in `modes`. A single message is not
+    sufficient, because the state must be HOLD and the sender's last command must have been HOLD. In FAULT, the guard
+    refuses OFF and holds the arm until an operator resets the fault. In an emergency, press the stop button.
 
-    **Start check**: Commands act only after `start_time` without a refusal and without a gap of `expiry`. During this
-    time, all commands must be close to the present state:
+    **Start check**: Commands act only if, for the time `start_time`, no accepted command expires and no command is
+    refused because of its content or mode. During this time, all commands must be close to the present state:
 
     - Commanded efforts must be near the measured efforts.
-    - Commanded positions must be near the measured positions, including the lead of the feedforward velocity.
-    - Before efforts, the pose must not exceed a limit by more than half of the margin. The present effort must be
-      inside the limit for commands and near the model's gravity effort.
+    - Commanded positions must be near the measured positions. The same applies to the commanded position plus Kd/Kp
+      times the commanded velocity.
+    - For EFFORT, the measured pose must not exceed a position limit by more than half of the margin. The measured
+      effort must be near the gravity effort of the model, and may exceed the limit for commands by at most
+      `start_effort`.
 
-    A controller that was restarted or is in a wrong state therefore does not move the arm.
+    A controller that was restarted, or whose state does not match the arm's state, therefore does not move the arm.
 
-    **Faults** are latched. The causes are:
+    **Faults**: A fault is latched. The causes of a fault are:
 
     - measurements that are not plausible, not finite or too old,
-    - a pose that exceeds a limit by more than half of the margin while efforts act,
+    - a pose that exceeds a position limit by more than half of the margin while efforts act,
     - a joint that does not follow its target or is pushed away from the target,
-    - efforts that oscillate,
+    - commanded efforts that oscillate,
     - an arm clock that goes backwards or stands still,
     - an output that is not finite,
     - a fault that the driver reports.
 
-    A reset needs a HOLD command in which the flag changes from false to true. A cause that persists triggers the fault
-    again.
+    A fault is reset by a HOLD command in which `reset_fault` changes from false to true. If the cause persists, the
+    fault occurs again.
 
-    **Bumpless transfer**: HOLD keeps the target of the regulation. After POSITION, it keeps the target only if the arm
-    is near it. Otherwise it latches the measured pose. POSITION starts from the held pose, and EFFORT from the measured
-    effort. If EFFORT starts inside a soft wall, the effort of the wall increases over `start_time`. All transitions are
-    limited in rate.
+    **Bumpless transfer**: After STARTING, HOLD keeps the target of the position controller. After POSITION or FAULT,
+    HOLD keeps this target only if the arm is near the target. Otherwise, HOLD latches the measured pose as the target.
+    POSITION starts at the target of HOLD, and EFFORT at the measured effort. If the arm is inside a soft wall when
+    EFFORT starts, the effort of the wall increases over `start_time`. Commanded targets and efforts are limited in
+    rate.
 
-    **Clocks**: The guard compares only the advance of the sender's and of the arm's clock between two commands, so the
-    clocks need not be synchronised. After a jump of the sender's clock, commands are refused until the command in force
-    has expired. A forward jump of the arm's clock makes the command in force expire.
+    **Clocks**: The sender's clock and the arm's clock need not be synchronised. The guard compares only the times that
+    elapse on these clocks between two commands. After a jump of the sender's clock, commands are refused until the
+    command in force has expired. After a forward jump of the arm's clock by more than `expiry`, the command in force
+    expires.
     """
 
     def __init__(
@@ -150,14 +161,14 @@ class CommandGuard:
 
         Args:
             arm: Arm whose limits are enforced.
-            session_id: Random identifier of the session, not 0. It changes with every start of the arm.
-            model: Model of the arm as mounted, e.g. `ControlModel(IdentifiedModel.from_arm(arm))`. An identified model
-                detects more faults.
-            settings: Settings of the guard. None: the defaults of GuardSettings.
-            modes: Accepted modes among POSITION, EFFORT and OFF. None: POSITION and EFFORT.
-            wall_clock: Function that returns the computer's monotonic time [us]. Commands then also expire by this
-                clock. None: only by the arm's clock, as for an arm in a simulated Diagram. Copies of the guard share
-                it.
+            session_id: Random identifier of the session, not 0. Every start of the arm requires a new identifier.
+            model: Model of the arm with its actual base orientation, e.g.
+                `ControlModel(IdentifiedModel.from_arm(arm))`. With an identified model, the guard detects more faults.
+            settings: Settings of the guard. None: the defaults of `GuardSettings` are used.
+            modes: Accepted modes among POSITION, EFFORT and OFF. None: POSITION and EFFORT are accepted.
+            wall_clock: Function that returns the computer's monotonic time [us]. If it is given, commands also expire
+                by this clock. If it is None, e.g. for an arm in a simulated Diagram, commands expire only by the arm's
+                clock. Copies of the guard share this function.
 
         Raises:
             StationError: The session is 0, a mode is unknown, or the settings or the arm's gains are out of range.
@@ -165,14 +176,14 @@ class CommandGuard:
         if unknown := set(modes or ()) - {*_ACTIVE, lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD}:
             raise StationError(f"modes must be POSITION, EFFORT or OFF; got {sorted(unknown)}")
         if session_id == 0:
-            raise StationError("session_id must not be 0, the value in a command that was not filled in")
+            raise StationError("session_id must not be 0, because 0 is the default value in a command")
         self.settings = settings or GuardSettings()
         self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
         self.state = lcmt_dvrk_status.STATE_HOLD
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
-        #: Reason for which the watchdog took over, until an operator resumes. Empty: it did not.
+        #: Reason of the watchdog hold until an operator resumes. Empty if there is no watchdog hold.
         self.hold_reason = ""
         self.refusal_code = self.ignored_code = lcmt_dvrk_status.REFUSAL_NONE
         self.counts = GuardCounts()
@@ -184,7 +195,7 @@ class CommandGuard:
         )
         self._in_force = CommandInForce()
         self._powered = True
-        #: Description of the error of the last measurement. Empty: no error.
+        #: Reason why the last measurement is invalid. Empty if it is valid.
         self._problem = ""
         self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
         self._plausibility = Plausibility(arm, model, self.settings.plausibility, self.limits.speed)
@@ -195,7 +206,8 @@ class CommandGuard:
         self._commanded = self.output.effort
 
     def __deepcopy__(self, memo: object) -> CommandGuard:
-        # A Drake context copies its state before every update, so copying must be fast. No array is changed in place.
+        # Drake copies the state of a context before every update, so copying must be fast. The copies share arrays,
+        # because no array is changed in place.
         other = object.__new__(CommandGuard)
         other.__dict__.update(self.__dict__)
         for name in (
@@ -228,24 +240,24 @@ class CommandGuard:
 
     @property
     def sender_id(self) -> int:
-        """Identifier of the sender whose commands act or are monitored. 0: no sender."""
+        """Identifier of the sender whose commands act or are monitored, or 0 if there is no such sender."""
         return self._stream.sender_id if self._is_starting_or_in_force() else 0
 
     @property
     def last_sender_id(self) -> int:
-        """Identifier of the sender of the last accepted command. 0: no sender."""
+        """Identifier of the sender of the last accepted command, or 0 if there is no such command."""
         return self._stream.sender_id
 
     @property
     def last_command(self) -> lcmt_dvrk_command:
-        """The last accepted command."""
+        """Last accepted command."""
         return self._in_force.command
 
     @property
     def blocked_reason(self) -> str:
-        """Reason why POSITION and EFFORT are refused although there is no fault. Empty: they are not refused.
+        """Reason why POSITION and EFFORT are refused although there is no fault, or "" if they are accepted.
 
-        The reason is `hold_reason` until an operator resumes, otherwise a period of the guard that is too long.
+        The reason is `hold_reason` until an operator resumes. Otherwise, it is a period of the guard that is too long.
         """
         return self.hold_reason or self._period.fault
 
@@ -255,14 +267,14 @@ class CommandGuard:
         return self._plausibility.gravity
 
     def receive(self, command: lcmt_dvrk_command | None, utime: int) -> int:
-        """Checks one command and stores it if it is accepted.
+        """Checks one command and stores an accepted command.
 
         Args:
-            command: Received command. None: the message was unreadable.
+            command: Received command, or None if the message was unreadable.
             utime: Time of arrival on the arm's clock [us].
 
         Returns:
-            Reason of the refusal, lcmt_dvrk_status.REFUSAL_*. REFUSAL_NONE if the command is accepted.
+            Reason of the refusal, lcmt_dvrk_status.REFUSAL_*, or REFUSAL_NONE if the command is accepted.
         """
         self._expire(utime)
         code = foreign_refusal(command, self.arm_name, self.num_joints, self.session_id)
@@ -284,20 +296,20 @@ class CommandGuard:
         """Counts ignored messages, including messages that were never passed to `receive`.
 
         Args:
-            code: Reason why the last one was ignored, lcmt_dvrk_status.REFUSAL_*.
-            count: Number of messages.
+            code: Reason why the last message was ignored, lcmt_dvrk_status.REFUSAL_*.
+            count: Number of ignored messages.
         """
         self.counts.ignored += count
         self.ignored_code = code
 
     def step(self, utime: int, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> GuardOutput:
-        """Returns the output of the guard for the period that starts at `utime` [us].
+        """Checks a measurement and returns the output of the guard for the period that starts at `utime`.
 
         Args:
             utime: Present time of the arm's clock [us].
             measured_utime: Time of the measurement of q, v and effort on the arm's clock [us].
             q: Measured positions (n,) [rad, m].
-            v: Velocities (n,) [rad/s, m/s].
+            v: Measured velocities (n,) [rad/s, m/s].
             effort: Applied motor efforts (n,) [N m, N].
         """
         dt, problem = self._measured.advance(utime)
@@ -331,13 +343,14 @@ class CommandGuard:
         return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
-        """Latches a fault that the arm's driver reports. Call it before each `step` while the fault lasts.
+        """Latches a fault that the arm's driver reports. Call this method before each `step` while the fault lasts.
 
         Args:
-            text: Description of the fault with its numbers. The first description is kept until the reset.
+            text: Description of the fault, including measured values. The description of the first fault is kept until
+                the reset.
             code: lcmt_dvrk_status.FAULT_*.
-            has_power: False if the motors cannot hold the arm. The output is then as in OFF. A reset then holds the
-                measured pose, not the pose before the fault.
+            has_power: False if the motors cannot hold the arm. The output is then the same as in OFF. After a reset,
+                the arm holds the measured pose, not the pose before the fault.
         """
         if self.state != lcmt_dvrk_status.STATE_FAULT:
             powered = self._powered
@@ -396,10 +409,10 @@ class CommandGuard:
             self._take_over(reason)
 
     def _take_over(self, reason: str) -> None:
-        """Changes to HOLD. A resume is needed if commands acted. Has no effect in OFF and in FAULT.
+        """Changes to HOLD, unless the state is OFF or FAULT. If commands acted, an operator must resume.
 
         Args:
-            reason: Description of the reason. The first description is kept until the resume.
+            reason: Reason of the change. The first reason is kept until the resume.
         """
         if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
             return
@@ -414,7 +427,7 @@ class CommandGuard:
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
         if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry.expiry:
             return lcmt_dvrk_status.REFUSAL_STALE
-        # The stream is checked first: a command that does not continue it interrupts nothing.
+        # The stream is checked before the content. A command that does not continue the stream must not end STARTING.
         if (code := self._stream.refusal(command, utime)) != lcmt_dvrk_status.REFUSAL_NONE:
             return code
         if (code := content_refusal(command)) != lcmt_dvrk_status.REFUSAL_NONE:
@@ -447,7 +460,7 @@ class CommandGuard:
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:
-            # A reset must not hold a pose that is not measured at present or that is implausible.
+            # The pose that is held after a reset must be a valid and plausible measurement.
             problem = self._problem or self.limits.implausible_pose(self._q())
             if resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
                 self.fault_text = problem
@@ -476,7 +489,7 @@ class CommandGuard:
             self._follower.begin_effort(self._measured.effort, self._q())
 
     def _hold(self) -> None:
-        """Changes to HOLD. Keeps the target if the arm is regulated to it, otherwise latches the measured pose."""
+        """Changes to HOLD. Keeps a target to which the arm is regulated, otherwise latches the measured pose."""
         q = self._q()
         regulated = (
             self.state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_FAULT)

@@ -1,4 +1,4 @@
-"""Inbox between the network and a command guard. Drops foreign messages early and bounds the cost of a flood."""
+"""Inbox of a command guard for messages from the network. It limits the computing time for a flood of messages."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: Largest number of commands kept between two steps: for the sender in control, and for all other senders together.
+#: Largest number of commands of the sender in control that are kept between two steps. The same number of commands is
+#: kept for all other senders together.
 _CAPACITY = 16
-#: Offsets of sequence, sender_id and session_id in an encoded command, and the start of arm_name [bytes].
+#: Byte ranges of sequence, sender_id and session_id in an encoded command, and offset of arm_name [bytes].
 _SEQUENCE, _SENDER, _SESSION, _NAME = slice(16, 24), slice(24, 32), slice(32, 40), 48
 
 _UNREADABLE = lcmt_dvrk_status.REFUSAL_UNREADABLE
@@ -27,13 +28,13 @@ def _sequence(data: bytes) -> int:
 class CommandInbox:
     """Buffer for encoded commands that arrived since the last step of the guard.
 
-    `put` examines only the bytes: length, type, arm, session and, with a key, the authentication code. A message that
-    fails this check is counted and dropped. A bounded number of the remaining messages is kept. `deliver` decodes the
-    kept messages and passes them to the guard.
+    `put` checks the length, type, arm and session of a message without decoding the message. If there is a key, `put`
+    also checks the authentication code. A message that fails a check is counted and dropped. Only a limited number of
+    the other messages is kept. `deliver` decodes the kept messages and passes them to the guard.
 
-    The sender in control has a separate part of the buffer, so a flood from other senders does not displace its
-    commands. That part keeps the commands with the latest sequence, so a flood of copies of earlier commands does not
-    displace them either.
+    Commands of the sender in control are kept in a separate list, so a flood from other senders does not displace these
+    commands. If this list is full, the command with the lowest sequence is dropped. A flood of copies of earlier
+    commands therefore does not displace new commands.
     """
 
     def __init__(self, guard: CommandGuard, key: MessageKey | None = None, capacity: int = _CAPACITY) -> None:
@@ -42,7 +43,8 @@ class CommandInbox:
         Args:
             guard: Guard whose arm and session the commands must address. `deliver` also accepts copies of this guard.
             key: Key that must have signed the commands. None: authentication codes are not verified.
-            capacity: Largest number of kept commands of the sender in control, and of all other senders together.
+            capacity: Largest number of kept commands of the sender in control. The same number of commands is kept for
+                all other senders together.
         """
         name = guard.arm_name.encode() + b"\0"
         self._fingerprint = lcmt_dvrk_command()._get_packed_fingerprint()
@@ -74,7 +76,12 @@ class CommandInbox:
         self._code = code
 
     def deliver(self, guard: CommandGuard, utime: int) -> None:
-        """Passes the kept messages to the guard, with arrival time `utime` [us], and counts the dropped messages."""
+        """Passes the kept messages and the number of dropped messages to the guard.
+
+        Args:
+            guard: Guard that receives the messages.
+            utime: Time of arrival on the arm's clock [us].
+        """
         if self._ignored:
             guard.ignore(self._code, self._ignored)
             self._ignored = 0

@@ -1,4 +1,4 @@
-"""Checks of a command that do not depend on the state of the arm: content, and continuity of the sender's stream."""
+"""Checks of a command that do not depend on the state of the arm: its content and its place in the sender's stream."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.limits import Vector
 
-#: Refusals of messages that do not belong to the session or to the sender in control. They are counted separately.
+#: Refusals of messages that do not belong to the session or to the sender in control. The guard counts these messages
+#: as ignored, not as refused.
 FOREIGN = frozenset(
     {
         lcmt_dvrk_status.REFUSAL_UNREADABLE,
@@ -24,8 +25,8 @@ FOREIGN = frozenset(
     }
 )
 
-#: Refusals of commands that do not continue the sender's stream, such as copies and replays. They do not interrupt the
-#: stream.
+#: Refusals of commands that do not continue the sender's stream, such as copies and replays. Such commands do not end
+#: STARTING.
 OUT_OF_STREAM = frozenset(
     {
         lcmt_dvrk_status.REFUSAL_STALE,
@@ -45,13 +46,13 @@ def is_finite(numbers: list[float]) -> bool:
 
 
 def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints: int, session_id: int) -> int:
-    """Checks that a command addresses this arm and session.
+    """Checks that a command is addressed to this arm and session.
 
     Args:
-        command: Received command. None: the message was unreadable.
+        command: Received command, or None if the message was unreadable.
         arm_name: Name of the arm.
         num_joints: Number of joints of the arm.
-        session_id: Session of the arm.
+        session_id: Identifier of the arm's session.
 
     Returns:
         Reason of the refusal, lcmt_dvrk_status.REFUSAL_*, or REFUSAL_NONE.
@@ -109,7 +110,7 @@ class CommandInForce:
         position: Commanded positions (n,) [rad, m].
         velocity: Commanded velocities (n,) [rad/s, m/s].
         effort: Commanded efforts (n,) [N m, N].
-        status_utime: Time of the measurement that the command answers [us].
+        status_utime: Time of the measurement from which the command was computed [us].
         wall_utime: Wall-clock time of that measurement [us]; 0 without a wall clock.
         accepted_since: Time at which the start check of this stream began [us].
     """
@@ -132,24 +133,24 @@ class CommandInForce:
 
 @dataclass
 class CommandStream:
-    """Stream of the commands of one sender. All times are in us. Times of arrival are on the arm's clock.
+    """Stream of the commands of one sender. All times are in us. Times of arrival refer to the arm's clock.
 
-    A sender is in control while its commands are accepted. A second sender is refused until no command of the first
-    sender has been accepted for `expiry`. A refused command does not extend the control of its sender. Otherwise, a
-    process that repeats one command could prevent an operator from resuming.
+    A sender is in control while its commands are accepted. Commands of a second sender are refused until `expiry` has
+    elapsed since the last accepted command of the first sender. Refused commands of the first sender do not extend this
+    time. Otherwise, a process that repeats one command could prevent an operator from resuming.
 
-    Sequence and time of a command are compared with those of the last accepted command, unless that command is older
-    than `expiry`. A refused command does not change this reference. A spoofed sequence or time therefore does not end
-    the control of the authentic sender. After a jump of its clock or sequence, a sender is accepted again when its last
-    accepted command has expired.
+    The sequence and time of a command are compared with the sequence and time of the last accepted command, unless that
+    command arrived more than `expiry` ago. Refused commands are not used for this comparison. A forged sequence or time
+    in a refused command therefore does not end the control of the authentic sender. After a jump of a sender's clock or
+    sequence, the commands of this sender are accepted again when `expiry` has elapsed since the last accepted command.
 
     Attributes:
-        expiry: Time without an accepted command after which another sender is accepted, and after which sequence and
-            time of the last accepted command are no longer compared.
-        clock_tolerance: Allowed difference between the advances of the sender's and the arm's clock, from one accepted
-            command to the next.
+        expiry: Time since the last accepted command after which another sender is accepted. After the same time, a
+            command is no longer compared with the last accepted command.
+        clock_tolerance: Allowed difference between the times that elapse on the sender's clock and on the arm's clock
+            from one accepted command to the next.
         sequence_jump: Largest difference in sequence between two accepted commands.
-        sender_id: Identifier of the sender. 0: no sender yet.
+        sender_id: Identifier of the sender, or 0 if there is no sender yet.
         lost: Number of commands missing in the sequence of accepted commands.
     """
 
@@ -171,7 +172,7 @@ class CommandStream:
         """Returns REFUSAL_* for a command that does not continue the sender's stream, otherwise REFUSAL_NONE."""
         if self.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-        # The command comes from the sender in control. It is compared with the last accepted command if that is recent.
+        # A command is compared only with a recent command, which then has the same sender.
         if self._last is not None and utime - self._arrival <= self.expiry:
             step = command.sequence - self._last.sequence
             if step <= 0:
@@ -186,7 +187,7 @@ class CommandStream:
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
-        """Accepts a command. Returns True if it requests a reset, i.e. if reset_fault changed from false to true."""
+        """Accepts a command. Returns True if the command requests a reset: reset_fault changed from false to true."""
         if command.sender_id != self.sender_id:
             self.forget()
             self.sender_id = command.sender_id
@@ -199,7 +200,7 @@ class CommandStream:
         return resets
 
     def forget(self) -> None:
-        """Discards the sender and its last command. Called when the arm's clock went back, or for a new sender."""
+        """Discards the sender and its last command, because the arm's clock went back or there is a new sender."""
         self.sender_id, self._last = 0, None
         self._can_reset = self._can_turn_off = False
 

@@ -13,11 +13,13 @@ from dvrk_drake.systems.guard.limits import Flags, GuardLimits, Mask, Vector, cl
 
 @dataclass
 class GuardOutput:
-    """Output of the guard until the next step, for n joints in the arm's order. Always finite and inside the limits.
+    """Output of the guard until the next step, for n joints in the arm's order.
+
+    All numbers are finite and inside the limits.
 
     Attributes:
         control_mode: Mode lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
-        position: Target (n,) [rad, m] of the regulation in HOLD and POSITION; otherwise the measured pose.
+        position: Target (n,) [rad, m] of the position controller in HOLD and POSITION; otherwise the measured pose.
         velocity: Feedforward velocity (n,) [rad/s, m/s] in POSITION; otherwise zero.
         effort: Motor effort (n,) [N m, N] in EFFORT; otherwise zero.
         joint_flags: Flags lcmt_dvrk_status.FLAG_* (n,) of the limits that acted on each joint.
@@ -35,10 +37,10 @@ class GuardOutput:
 
 
 class Follower:
-    """Follows commands inside the limits. Each mode starts from the present state of the arm. All arrays are (n,).
+    """Computes outputs that follow the commands inside the limits. Each mode starts from the present state of the arm.
 
     Attributes:
-        target: Target (n,) [rad, m] of the regulation in HOLD and POSITION.
+        target: Target (n,) [rad, m] of the position controller in HOLD and POSITION.
     """
 
     def __init__(self, limits: GuardLimits) -> None:
@@ -47,28 +49,32 @@ class Follower:
         self.target = self._filtered_target = self._effort = self._start_wall_effort = self._zero
 
     def off(self, q: Vector) -> GuardOutput:
-        """Returns the output without motor power, at the measured pose q."""
+        """Returns the output without motor power, at the measured pose q (n,) [rad, m]."""
         return self._output(lcmt_dvrk_command.OFF, q)
 
     def latch(self, q: Vector, v: Vector) -> None:
-        """Uses the measured pose q as the target. The allowed following error includes the braking distance from v."""
+        """Sets the target to the measured pose q (n,) [rad, m] of an arm that moves with v (n,) [rad/s, m/s].
+
+        The filtered target starts ahead of q in the direction of v, so that the motion during braking causes no fault.
+        """
         self.target = q.copy()
         speed = self._limits.speed
         self._filtered_target = q + self._limits.following_time * clip(v, -speed, speed)
 
     def hold(self, dt: float) -> GuardOutput:
-        """Returns the output that holds the target, `dt` seconds after the previous output."""
+        """Returns the next output, which holds the target. `dt` is the time since the previous output [s]."""
         self._filter_target(dt)
         return self._output(lcmt_dvrk_command.HOLD, self.target)
 
     def hold_valid_joints(self, q: Vector, v: Vector, valid: Mask, gravity: Vector) -> GuardOutput:
-        """Returns efforts that hold the joints with a valid position. Other joints get only their gravity effort.
+        """Returns the output that holds the joints with a valid position. All other joints get only the gravity effort.
 
         Args:
             q: Measured positions (n,) [rad, m].
             v: Measured velocities (n,) [rad/s, m/s].
             valid: Mask (n,) of joints with a valid position.
-            gravity: Gravity effort (n,) [N m, N] at q, where invalid positions are replaced by the last valid ones.
+            gravity: Gravity effort (n,) [N m, N] of the model at q, with the last valid position for each invalid
+                position.
         """
         limits = self._limits
         largest, least = limits.fault_effort, limits.fault_effort / 3
@@ -88,7 +94,7 @@ class Follower:
         self._filtered_target = self.target
 
     def follow_position(self, position: Vector, velocity: Vector, dt: float) -> GuardOutput:
-        """Returns the output for a position command, `dt` seconds after the previous output.
+        """Returns the next output for a position command.
 
         Args:
             position: Commanded position (n,) [rad, m].
@@ -106,11 +112,11 @@ class Follower:
         )
 
     def following_fault(self, q: Vector) -> str:
-        """Describes the joint with the largest following error, or returns "" if no error exceeds the allowed one.
+        """Returns a description of the joint with the largest following error, or "" if all errors are allowed.
 
-        A position controller without feedforward lags by Kd/Kp. Any position between the target and the target after a
-        first-order low-pass filter with time constant `following_time` is therefore accepted. The allowed error is
-        added on both sides.
+        A position controller without feedforward follows a moving target with a delay of Kd/Kp. All positions between
+        the target and the filtered target are therefore accepted. The filter is a first-order low-pass filter with time
+        constant `following_time`. The accepted range is extended on both sides by the allowed error.
         """
         ahead = q - np.maximum(self.target, self._filtered_target)
         behind = np.minimum(self.target, self._filtered_target) - q
@@ -128,18 +134,19 @@ class Follower:
         """Starts following effort commands from the measured `effort` (n,) [N m, N] at the pose q (n,) [rad, m]."""
         limit = self._limits.command_limits
         self._effort = clip(effort, -limit, limit)
-        # Effort of the walls at the start, for an arm at rest. `follow_effort` subtracts a decreasing share of it.
+        # Effort of the walls at the start for zero velocity. `follow_effort` subtracts a decreasing fraction of this
+        # effort.
         self._start_wall_effort = self._limits.wall_effort(q, self._zero)[0]
 
     def follow_effort(self, effort: Vector, q: Vector, v: Vector, dt: float, start_share: float) -> GuardOutput:
-        """Returns the output for an effort command, `dt` seconds after the previous output.
+        """Returns the next output for an effort command.
 
         Args:
             effort: Commanded effort (n,) [N m, N].
             q: Measured positions (n,) [rad, m].
             v: Measured velocities (n,) [rad/s, m/s].
             dt: Time since the previous output [s].
-            start_share: Elapsed share (0..1) of the time in which the effort of the walls increases.
+            start_share: Elapsed fraction (0 to 1) of the time in which the effort of the walls increases.
         """
         self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
         withheld = None if start_share == 1.0 else (1.0 - start_share) * self._start_wall_effort
@@ -155,7 +162,7 @@ class Follower:
         effort: Vector | None = None,
         flags: Flags | None = None,
     ) -> GuardOutput:
-        """Returns an output with separate arrays, which the caller may change."""
+        """Returns an output whose arrays the caller may change."""
         return GuardOutput(
             mode,
             position.copy(),

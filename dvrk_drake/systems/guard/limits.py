@@ -23,44 +23,49 @@ _ROUNDING = 1e-12
 
 _CLAMPED, _RATE_LIMITED = np.int8(lcmt_dvrk_status.FLAG_EFFORT_CLAMPED), np.int8(lcmt_dvrk_status.FLAG_RATE_LIMITED)
 
-#: Largest gain of a soft wall, as a multiple of the position controller's gain at 1 kHz. Larger gains cause chatter.
+#: Largest gain of a soft wall, divided by the gain of the position controller. Larger gains cause chatter at a period
+#: of 1 ms.
 _WALL_GAIN = 4.0
 
 
 def clip(x: Vector, lower: ArrayLike, upper: ArrayLike) -> Vector:
-    """Returns x (n,) limited to the range from lower to upper. Faster than np.clip for small arrays."""
+    """Returns x (n,) limited to the range from lower to upper. For small arrays, np.clip is slower."""
     return np.minimum(np.maximum(x, lower), upper)
 
 
 def is_any(mask: Mask) -> bool:
-    """Returns whether any element of the mask (n,) is true. Faster than mask.any() for small arrays."""
+    """Returns whether any element of the mask (n,) is true. For small arrays, mask.any() is slower."""
     return True in mask.tolist()
 
 
 class GuardLimits:
     """Limits of one arm with n joints, in the arm's order of joints.
 
-    **Effort commands.** A soft wall acts before each position limit lower <= A q <= upper, i.e. before the limits of
-    the joints and the coupled limits. The wall is a spring and damper along the coordinate of the limit, c = A_k q:
+    **Effort commands.** The position limits lower <= A q <= upper are the limits of the joints and the coupled limits.
+    A soft wall acts before each position limit. The wall is a virtual spring and damper along the coordinate c = A_k q
+    of limit k. At an upper limit, its effort is:
 
         lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda
 
     - F_k is the largest ratio of effort limit to |A_kj| among the joints j of the limit. At a depth of 1/2, the wall
       therefore cancels the full motor effort of each of these joints.
-    - depth is the position of c + T_k dc/dt in the wall: 0 where the wall begins, 1 at the limit.
-    - T_k is the ratio Kd/Kp of the joint's position controller. The wall therefore acts earlier on a fast joint.
+    - depth is the relative position of c + T_k dc/dt in the wall: 0 where the wall begins, 1 at the limit.
+    - T_k is the largest ratio Kd/Kp of the position controllers of these joints. The wall therefore acts earlier on a
+      fast joint.
 
-    At the limit, the full motor effort is directed inward. The wall is as wide as the margin, or wider if its gains
-    would otherwise exceed four times those of the position controller. Larger gains cause chatter with a delay of one
-    period.
+    At the limit, the joint is therefore pushed inward by the full motor effort, even if the command is the full effort
+    outward. The width of the wall is the margin. It is larger if the gain of the wall would otherwise exceed four times
+    the gain of the position controller. Larger gains cause chatter, because the output has a delay of one period.
 
-    The wall only pushes inward. It also acts without commanded efforts, e.g. on a falling arm. Joints above their speed
-    limit are braked. Above 1.25 times the speed limit, no effort accelerates them further. Commands are clamped and
-    limited in rate before the wall acts. The effort of the wall is not limited in rate.
+    The wall only pushes inward. It also acts if the commanded effort is zero, e.g. on a falling arm. Joints above their
+    speed limit are braked. Above 1.25 times the speed limit, no commanded effort accelerates a joint further. Commanded
+    efforts are clamped and limited in rate before the effort of the wall is added. The effort of the wall is not
+    limited in rate.
 
-    **Position commands** move a target that is limited in rate and stays inside the limits. A target that starts
-    outside moves no further outward. With a feedforward velocity v, a position controller settles at a distance
-    Kd/Kp v beyond a constant target. The velocity is therefore reduced until that point is also inside the limits.
+    **Position commands.** A position command moves a target. The target is limited in rate and stays inside the
+    position limits. If the target starts outside a limit, it does not move further outward. With a feedforward velocity
+    v and a constant target, a position controller settles at a distance of Kd/Kp v beyond the target. The feedforward
+    velocity is therefore reduced until this point is also inside the limits.
     """
 
     def __init__(self, arm: Arm, settings: GuardSettings) -> None:
@@ -103,7 +108,10 @@ class GuardLimits:
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
     def position_limit_fault(self, q: Vector) -> str:
-        """Describes the limit that q (n,) exceeds most, or returns "" if the excess is at most half of the margin."""
+        """Returns a description of the limit that q (n,) exceeds most.
+
+        Returns "" if no limit is exceeded by more than half of its margin.
+        """
         c = self.A.dot(q)
         excess = np.abs(c - self._middle) - self._allowed
         k = int(excess.argmax())
@@ -115,7 +123,7 @@ class GuardLimits:
         )
 
     def implausible_pose(self, q: Vector) -> str:
-        """Describes the first limit that q (n,) exceeds by more than half of its range, or returns "" if there is none.
+        """Returns a description of the first limit that q (n,) exceeds by more than half of the range, or "".
 
         An arm may rest slightly outside a limit, because limits depend on calibration. Half of the range is far beyond
         any mechanical stop.
@@ -127,8 +135,8 @@ class GuardLimits:
         k = int(far[0])
         wrong_unit = "mm" if self.unit(k) == "m" else "degrees"
         return (
-            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, far outside its limits "
-            f"{self.lower[k]:.4g}..{self.upper[k]:.4g} {self.unit(k)}; check its unit ({wrong_unit}?) and its zero"
+            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, far outside its limits {self.lower[k]:.4g}.."
+            f"{self.upper[k]:.4g} {self.unit(k)}; check its unit ({wrong_unit}?) and its zero position"
         )
 
     def unit(self, k: int) -> str:
@@ -179,7 +187,7 @@ class GuardLimits:
         return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
 
     def wall_effort(self, q: Vector, v: Vector) -> tuple[Vector, Flags]:
-        """Returns the effort (n,) [N m, N] of the walls at q, v (n,) and the joint flags (n,)."""
+        """Returns the effort of the walls (n,) [N m, N] at q and v (n,), and the joint flags (n,)."""
         flags = np.zeros(len(q), np.int8)
         c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
         if not is_any(np.abs(c - self._middle) > self._free):
@@ -193,13 +201,14 @@ class GuardLimits:
     def restrain_effort(
         self, effort: Vector, q: Vector, v: Vector, withheld: Vector | None = None
     ) -> tuple[Vector, Flags]:
-        """Adds the efforts of the walls and of the speed limit. They are not limited in rate, to avoid a delay.
+        """Adds the efforts of the walls and of the speed limit, without a rate limit that would delay them.
 
         Args:
             effort: Effort (n,) [N m, N] that follows the command.
             q: Measured positions (n,) [rad, m].
             v: Measured velocities (n,) [rad/s, m/s].
-            withheld: Effort (n,) [N m, N] that is subtracted from the effort of the walls, at most to zero, or None.
+            withheld: Effort (n,) [N m, N] by which the effort of the walls is reduced, at most to zero. None: the
+                effort of the walls is not reduced.
 
         Returns:
             Effort (n,) [N m, N] inside the effort limits, and joint flags (n,).
@@ -215,7 +224,13 @@ class GuardLimits:
         return clip(effort + added, -limit, limit), flags
 
     def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
-        """Returns the target (n,) for `command` (n,), `dt` seconds after the target `last`, and the joint flags."""
+        """Returns the next target (n,) [rad, m] of a position command, and the joint flags (n,).
+
+        Args:
+            command: Commanded positions (n,) [rad, m].
+            last: Previous target (n,) [rad, m].
+            dt: Time since the previous target [s].
+        """
         step = self.speed * dt
         target = clip(command, last - step, last + step)
         flags = np.where(target != command, lcmt_dvrk_status.FLAG_RATE_LIMITED, 0).astype(np.int8)
@@ -223,7 +238,7 @@ class GuardLimits:
         return inside, flags | limited
 
     def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
-        """Returns the limited feedforward velocity (n,) at `target` (n,). It is zero for joints with `flags`."""
+        """Returns the limited feedforward velocity (n,) at `target` (n,). It is zero where `flags` is not zero."""
         velocity = np.where(flags == 0, clip(command, -self.speed, self.speed), 0.0)
         lead = self._look_ahead * velocity
         ahead, _ = self._inside(target + lead, target)
@@ -232,7 +247,9 @@ class GuardLimits:
         return velocity * clip(share, 0, 1)
 
     def _inside(self, target: Vector, last: Vector) -> tuple[Vector, Flags]:
-        """Limits `target` (n,) to the position limits. A target outside them may not exceed `last` (n,).
+        """Limits `target` (n,) to the position limits.
+
+        If the previous target `last` (n,) is outside a limit, the target does not move further outward.
 
         Returns:
             Limited target (n,) and joint flags (n,).
@@ -248,12 +265,13 @@ class GuardLimits:
             change = row @ inside - c[k]
             allowed = clip(change, lower[k] - c[k], upper[k] - c[k])
             if allowed != change:
-                # All joints of this limit move by the same fraction, so that they stop on it together.
+                # All joints of this limit move by the same fraction of their change, so that they reach the limit
+                # together.
                 share = np.where(row != 0, allowed / change, 1.0)
                 inside = last + share * (inside - last)
                 flags[row != 0] |= lcmt_dvrk_status.FLAG_COUPLED_LIMIT
         c = self.A @ inside
         if np.any((c > upper + _ROUNDING) | (c < lower - _ROUNDING)):
-            # Corrections for coupled limits that share joints can conflict. The target then does not move.
+            # The corrections for two coupled limits with a common joint can conflict. The target then does not move.
             return last.copy(), flags
         return inside, flags

@@ -12,23 +12,24 @@ from numpy.typing import ArrayLike
 from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.guard.limits import Vector
 
-#: Largest number of steps without an advance of the arm's clock. Commands do not expire by a clock that stands still.
-#: Drake steps twice at the start.
+#: Largest number of steps without an advance of the arm's clock. While this clock stands still, commands do not expire
+#: by it. Several steps are allowed, because Drake updates the guard twice at time zero.
 _MAX_STEPS_AT_ONE_TIME = 10
 
 
 @dataclass
 class Measurement:
-    """Last measurement of an arm with n joints, on the arm's clock [us].
+    """Last measurement of an arm with n joints. All times in us are on the arm's clock.
 
     Attributes:
         num_joints: Number of joints n.
         max_age: Largest age of a valid measurement [us].
-        utime: Time of the last step [us]. None: not stepped yet.
-        q: Last valid positions (n,) [rad, m]. None: no valid measurement yet.
+        utime: Time of the last step [us], or None before the first step.
+        q: Last valid positions (n,) [rad, m], or None before the first valid measurement.
         v: Velocities (n,) [rad/s, m/s] of the last valid measurement.
         effort: Applied motor efforts (n,) [N m, N] of the last valid measurement.
-        dt: Time between the last two valid measurements [s]; 0 for a repeated one, inf for the first one.
+        dt: Time between the last two valid measurements [s]; 0 for a repeated measurement, inf for the first
+            measurement.
         num_invalid: Number of consecutive invalid measurements up to now.
     """
 
@@ -47,7 +48,7 @@ class Measurement:
         self.v = self.effort = np.zeros(self.num_joints)
 
     def advance(self, utime: int) -> tuple[float, str]:
-        """Advances to `utime` [us]. Returns the elapsed time [s] and a description of a fault of the clock, or ""."""
+        """Advances to `utime` [us]. Returns the elapsed time [s] and the description of a clock fault, or ""."""
         dt = 0.0 if self.utime is None else 1e-6 * (utime - self.utime)
         self._steps_at_one_time = 0 if dt else self._steps_at_one_time + 1
         self.utime = utime
@@ -57,7 +58,7 @@ class Measurement:
         return dt, "the arm's clock stands still" if self._steps_at_one_time > _MAX_STEPS_AT_ONE_TIME else ""
 
     def time_since(self, measured_utime: int) -> float:
-        """Returns the time [s] from the last valid measurement to `measured_utime` [us]; inf if there is none."""
+        """Returns the time [s] from the last valid measurement to `measured_utime` [us], or inf without a valid one."""
         return math.inf if self._measured_utime is None else 1e-6 * (measured_utime - self._measured_utime)
 
     def store(
@@ -75,17 +76,17 @@ class Measurement:
             q: Positions (n,) [rad, m].
             v: Velocities (n,) [rad/s, m/s].
             effort: Applied motor efforts (n,) [N m, N].
-            implausible_pose: Function that describes the error of implausible positions, or returns "". Used for
-                positions that are not compared with earlier ones. None: no check.
+            implausible_pose: Function that returns the reason why a pose is implausible, or "" for a plausible pose. It
+                is given for a measurement that is not compared with an earlier one. None: the pose is not checked.
 
         Returns:
-            Reason why the measurement is invalid, or "".
+            Reason why the measurement is invalid, or "" for a valid measurement.
         """
         assert self.utime is not None
         age, dt = self.utime - measured_utime, self.time_since(measured_utime)
         if not 0 <= age <= self.max_age:
             self.num_invalid += 1
-            return f"the measurement is {1e-6 * age:.3f} s old; allowed is 0 to {1e-6 * self.max_age:g} s"
+            return f"the measurement is {1e-6 * age:.3f} s old; allowed: 0 to {1e-6 * self.max_age:g} s"
         if dt == 0:
             self.dt = 0.0
             return ""

@@ -1,4 +1,4 @@
-"""Monitors of the guard: period of the steps and oscillation of the efforts."""
+"""Monitors of the guard: period of the steps and oscillation of the commanded efforts."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.systems.guard.settings import GuardSettings
 
-#: Number of periods for the median.
+#: Number of periods whose median is checked.
 _PERIODS = 100
 
-#: Time constant [s] of the mean effort that is subtracted. Variations slower than about 1 Hz are not oscillations.
+#: Time constant [s] of the low-pass filter whose output is subtracted from the effort. Changes of the effort below
+#: about 1 Hz therefore do not count as oscillations.
 _MEAN_TIME = 0.2
 
 
 class PeriodMonitor:
-    """Monitor of the period between two steps of the guard: the last period, and the median of the last 100.
+    """Monitor of the time between two steps of the guard. It checks the last period and the median of 100 periods.
 
     Attributes:
-        fault: Description of the fault of the last periods, or "".
+        fault: Description of the fault of the last periods, or "" without a fault.
     """
 
     def __init__(self, settings: GuardSettings) -> None:
@@ -35,7 +36,7 @@ class PeriodMonitor:
         self.fault = ""
 
     def add(self, period: float) -> str:
-        """Adds one period [s]. Returns the description of a fault, or ""."""
+        """Adds one period [s]. Returns the description of a fault, or "" without a fault."""
         self._slow = (self._slow << 1 | (period > self._slow_period)) & ((1 << _PERIODS) - 1)
         self.fault = ""
         if period > self._longest_period:
@@ -48,10 +49,11 @@ class PeriodMonitor:
 
 
 class OscillationMonitor:
-    """Monitor that counts reversals of the commanded efforts, with exponential decay.
+    """Monitor that counts reversals of the commanded efforts. The count decays exponentially.
 
-    The alternating part of an effort is x = tau - filter(tau), with a first-order filter. A reversal is a change of x
-    from above +`oscillation` to below -`oscillation` of the effort limit, or back.
+    The alternating part of an effort is x = tau - filter(tau), with a first-order low-pass filter. A reversal is a
+    change of x from above h to below -h, or from below -h to above h. The threshold h is the fraction `oscillation` of
+    the effort limit.
     """
 
     def __init__(self, settings: GuardSettings, arm: Arm) -> None:

@@ -14,13 +14,14 @@ from dvrk_drake.systems.guard.settings import PlausibilitySettings
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
-#: Period in which the mass matrix is evaluated [s]. An evaluation takes as long as a step of the guard.
+#: Time between two evaluations of the mass matrix [s]. One evaluation takes as long as one step of the guard.
 _MASS_MATRIX_PERIOD = 0.05
 
-#: Time after power on in which the effort of an arm that lies on an object may change without a motion [s].
+#: Time after the motors are switched on in which the effort may change without a motion [s]. This happens if the arm
+#: lies on an object.
 _POWER_ON = 0.25
 
-#: Number of encoder counts that is added to the tolerances of positions.
+#: Number of encoder counts that are added to each position tolerance.
 _COUNTS = 3.0
 
 
@@ -43,7 +44,7 @@ class Sample:
         q: Measured positions (n,) [rad, m].
         v: Measured velocities (n,) [rad/s, m/s].
         step: Change of position (n,) [rad, m] since the previous measurement.
-        speed: Larger magnitude (n,) [rad/s, m/s] of the velocities of this and the previous measurement.
+        speed: Larger value (n,) of the speeds in this measurement and in the previous measurement [rad/s, m/s].
         effort: Measured effort (n,) [N m, N] of the motors.
         net_effort: Measured effort (n,) [N m, N] minus the gravity effort of the model.
         commanded: Effort (n,) [N m, N] that the guard commanded in the previous step, or None if it commanded no
@@ -61,10 +62,10 @@ class Sample:
 
 
 class Check(Protocol):
-    """Protocol of one plausibility check. The caller keeps the state, because Drake copies the guard at every update.
+    """Protocol of one plausibility check. The caller stores the state, because Drake copies the guard at every update.
 
     Attributes:
-        text: Description of the error that the check detects.
+        text: Description of the error that this check detects.
         about_position: True if the position of a joint with this error is invalid.
     """
 
@@ -75,7 +76,7 @@ class Check(Protocol):
         """Returns the initial state, given the first sample."""
 
     def check(self, sample: Sample, state: Any) -> tuple[Any, Mask]:
-        """Returns the next state and a mask (n,) of the implausible joints."""
+        """Returns the next state and a mask (n,) of the joints whose measurement is implausible."""
 
 
 class PositionJump:
@@ -97,15 +98,15 @@ class PositionJump:
 
 
 class VelocityConsistency:
-    """Check that velocities agree with the change of position.
+    """Check that the measured velocity agrees with the change of the measured position.
 
     The difference e between the change of position and the integrated velocity decays with the time constant T:
 
-        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + r T + delay s
+        e[k] = (1 - dt/T) e[k-1] + dq - v dt,    |e[k]| <= tolerance + r T + delay s
 
-    - s is the largest recent speed, which decays in the same way. This term accounts for the delay of the velocity
-      estimate while the joint accelerates.
-    - r is the error of a velocity that is estimated from the time between two encoder counts.
+    - s is the largest recent speed. It decays with the same time constant. The term `delay s` accounts for the delay of
+      the velocity estimate while the joint accelerates.
+    - r is the allowed error of a velocity that is estimated from the time between two encoder counts.
     """
 
     text, about_position = "position and velocity disagree", True
@@ -116,7 +117,7 @@ class VelocityConsistency:
         self._tolerance = tolerance + self._memory * settings.velocity_counts * counts
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector]:
-        """Returns the difference e (n,) and the speed s (n,)."""
+        """Returns the initial difference e (n,) and speed s (n,)."""
         return np.zeros_like(sample.q), sample.speed
 
     def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
@@ -142,7 +143,11 @@ class FrozenPosition:
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, float]:
-        """Returns effort (n,) at the last position change, time (n,) of excessive difference, and time since start."""
+        """Returns the initial state.
+
+        The state is the net effort (n,) at the last change of position, the time (n,) [s] since the change of effort
+        became too large, and the time since the first sample [s].
+        """
         return sample.net_effort, np.zeros_like(sample.q), 0.0
 
     def check(self, sample: Sample, state: tuple[Vector, Vector, float]) -> tuple[tuple[Vector, Vector, float], Mask]:
@@ -158,9 +163,10 @@ class Response:
     """Check that accelerations agree with the efforts.
 
     The unexplained effort r = filter(tau - G(q)) - M(q) filter(vd) contains friction, external forces, model errors,
-    and errors of sensors or motors. With a first-order low-pass filter of time constant T,
-    filter(vd) = (v - filter(v)) / T, so the velocity is not differentiated. The slowly varying part of r is attributed
-    to model errors and subtracted. Coriolis terms are omitted, because they are small at the allowed speeds.
+    and errors of sensors or motors. G(q) is the gravity effort, M(q) the mass matrix, and vd the acceleration. With a
+    first-order low-pass filter of time constant T, filter(vd) = (v - filter(v)) / T, so the velocity is not
+    differentiated. The slowly varying part of r is attributed to model errors and subtracted. Coriolis terms are
+    omitted, because they are small at the allowed speeds.
     """
 
     text, about_position = "the motion does not follow from the effort", True
@@ -172,7 +178,7 @@ class Response:
         self._memory, self._model = settings.response_memory, model
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, Vector, NDArray[np.float64], float]:
-        """Returns filtered effort, filtered velocity, lasting effort (n,), M / T (n, n), and the age of M / T [s]."""
+        """Returns the filtered effort, filtered velocity, model error (n,), M / T (n, n), and the age of M / T [s]."""
         M = self._model.mass_matrix(sample.q) / self._time
         return sample.net_effort, sample.v, sample.net_effort, M, 0.0
 
@@ -192,7 +198,7 @@ class Response:
 
 
 class SilentEffort:
-    """Check that measured efforts follow the commanded ones. Detects silent sensors and motors without power."""
+    """Check that measured efforts follow commanded efforts. It detects sensors that read zero, and unpowered motors."""
 
     text, about_position = "the measured effort does not follow the commanded effort", False
 
@@ -204,7 +210,7 @@ class SilentEffort:
         self._largest = np.array([arm.effects.saturation.get(name, np.inf) for name in arm.joint_names])
 
     def begin(self, sample: Sample) -> Vector:
-        """Returns the time (n,) [s] for which the measured effort has not followed the commanded one."""
+        """Returns the time (n,) [s] for which the measured effort has not followed the commanded effort."""
         return np.zeros_like(sample.q)
 
     def check(self, sample: Sample, state: Vector) -> tuple[Vector, Mask]:
@@ -231,7 +237,7 @@ class Plausibility:
     Attributes:
         gravity: Gravity effort (n,) [N m, N] of the model at the last sample.
         invalid: Mask (n,) of joints whose position was found invalid since the last `restart`.
-        fault: Description of the error of the last sample, or "".
+        fault: Description of the error of the last sample, or "" for a plausible sample.
         last_valid: Last valid positions (n,) [rad, m] of the `invalid` joints; undefined for all other joints.
     """
 
@@ -240,7 +246,7 @@ class Plausibility:
 
         Args:
             arm: Arm with n joints.
-            model: Model of that arm as mounted.
+            model: Model of that arm with its actual base orientation.
             settings: Tolerances of the checks.
             speed_limit: Speed limits (n,) [rad/s, m/s] that the guard enforces.
         """
@@ -282,7 +288,8 @@ class Plausibility:
             q: Measured positions (n,) [rad, m].
             v: Measured velocities (n,) [rad/s, m/s].
             effort: Measured efforts (n,) [N m, N].
-            commanded: Effort (n,) [N m, N] that the guard commanded in the previous step. None: it commanded no effort.
+            commanded: Effort (n,) [N m, N] that the guard commanded in the previous step, or None if it commanded no
+                effort.
 
         Returns:
             Description of the detected error, or "" if the measurement is plausible.
@@ -309,7 +316,7 @@ class Plausibility:
         return self.fault
 
     def reject_all(self) -> None:
-        """Marks the positions of all joints as invalid. Called when measurements are lost."""
+        """Marks the positions of all joints as invalid. The guard calls this method if measurements are missing."""
         self._reject(~self._none)
 
     def _report(self, check: Check, joints: Mask) -> None:
@@ -321,6 +328,6 @@ class Plausibility:
             self._reject(joints)
 
     def _reject(self, joints: Mask) -> None:
-        # An error begins before it is detected. The last valid pose is therefore an earlier one.
+        # An error begins before its detection. The last valid positions are therefore taken from an earlier pose.
         self.last_valid = np.where(joints & ~self.invalid, self._poses[0], self.last_valid)
         self.invalid = self.invalid | joints

@@ -14,27 +14,31 @@ class PlausibilitySettings:
     """Tolerances of the plausibility checks of measurements; see `dvrk_drake.systems.guard.plausibility`.
 
     Attributes:
-        position_tolerance: Tolerance of position steps, and of the difference between positions and integrated
-            velocities [rad; a tenth of the number in m for a prismatic joint]. Three encoder counts are added.
+        position_tolerance: Tolerance of position steps, and of the difference between the position and the integrated
+            velocity [rad]. For a prismatic joint, the tolerance in m is a tenth of the number. Three encoder counts are
+            added to the tolerance.
         jitter: Largest error of the time between two measurements [s].
         velocity_delay: Largest delay of the velocity estimate [s].
-        velocity_counts: Error of the velocity as a rate of encoder counts [1/s]. A velocity that is estimated from the
-            time between two counts keeps its last value until the next count.
+        velocity_counts: Allowed error of the velocity, in encoder counts per second [1/s]. This error occurs if the
+            velocity is estimated from the time between two counts, because the estimate is constant until the next
+            count.
         velocity_memory: Time constant of the comparison of positions and velocities [s].
         frozen_effort: Change of effort that must cause a change of position, as a fraction of the effort limit.
-        frozen_time: Longest time for which a position may stay constant under that change [s].
-        frozen_speed: Lowest speed at which a joint is expected to move by an encoder count [rad/s, m/s].
-        response: Allowed unexplained effort in addition to `hand_effort`, as a fraction of the effort limit.
-        hand_effort: Allowed effort of a hand on a joint, or of a model error [N m; ten times the number in N for a
-            prismatic joint].
+        frozen_time: Longest time for which a position may stay constant after such a change of effort [s].
+        frozen_speed: Lowest expected speed of a joint during a motion by one encoder count [rad/s, m/s].
+        response: Allowed unexplained effort as a fraction of the effort limit, in addition to `hand_effort`. See
+            `plausibility.Response`.
+        hand_effort: Allowed effort of the operator's hand or of a model error on a joint [N m]. For a prismatic joint,
+            the effort in N is ten times the number.
         response_time: Time constant of the filters of effort and acceleration [s].
-        response_memory: Time constant with which lasting unexplained effort is attributed to the model [s].
-        start_gravity: Allowed difference of measured effort and gravity effort when effort commands start, as a
-            fraction of the effort limit. The arm's dry friction and `hand_effort` are added.
-        silent_effort: Commanded effort that the measured effort must follow, as a fraction of the effort limit.
-        silent_time: Time within which the measured effort must follow [s].
-        detection_time: Least age of the pose that is used as the last valid one when a fault is detected [s].
-        bad_samples: Number of consecutive measurements that may be late or not finite while the arm holds.
+        response_memory: Time constant with which the slowly varying part of the unexplained effort is attributed to
+            model errors [s].
+        start_gravity: Allowed difference between the measured effort and the gravity effort when effort commands start,
+            as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added.
+        silent_effort: Lowest commanded effort that the measured effort must follow, as a fraction of the effort limit.
+        silent_time: Time within which the measured effort must follow the commanded effort [s].
+        detection_time: Minimum age of the last valid pose at the detection of a fault [s].
+        bad_samples: Largest number of consecutive measurements that may be late or not finite while the arm holds.
     """
 
     position_tolerance: float = field(default=0.01, metadata=within(0.001, 0.1, "rad"))
@@ -60,39 +64,44 @@ class PlausibilitySettings:
 class GuardSettings:
     """Settings of a command guard.
 
-    The range of each setting is stated next to the setting. Values outside the range would disable the protection or
-    reject all commands.
+    The accepted range of each setting is given next to its default value. Values outside this range would disable the
+    protection, or all commands would be refused.
 
     Attributes:
-        expiry: Age at which a command expires, counted from the measurement that it answers [s]. Another sender is
-            accepted after the same time without a command.
+        expiry: Age at which a command expires [s]. The age of a command is the age of the measurement from which it was
+            computed. Another sender is accepted after the same time without an accepted command.
         measurement_age: Largest age of a valid measurement [s].
-        start_time: Time of the start check, during which all commands must be accepted before they act [s].
-        clock_tolerance: Allowed difference between the advances of the sender's and the arm's clock, from one command
-            to the next [s].
-        sequence_jump: Largest increment of the sequence from one command to the next. 1000 is one second at 1 kHz.
-        start_effort: Allowed difference of the first commanded efforts from the measured efforts, as a fraction of the
-            effort limit.
-        margin: Least width of the soft wall before each position limit [rad]. It is also the allowed difference of the
-            first commanded positions from the measured pose. While efforts act, a pose that exceeds a limit by more
-            than half of the margin is a fault.
-        margin_fraction: Largest margin as a fraction of the joint's range. Relevant for short or prismatic joints.
-        effort_fraction: Fraction of each effort limit that effort commands may use. Soft wall and brake always use the
-            whole limit.
+        start_time: Duration of the start check [s]. Commands act only if all commands were accepted during this time.
+        clock_tolerance: Allowed difference between the times that elapse on the sender's clock and on the arm's clock
+            from one command to the next [s].
+        sequence_jump: Largest increment of the sequence from one command to the next. 1000 corresponds to one second at
+            1 kHz.
+        start_effort: Allowed difference between the first commanded efforts and the measured efforts, as a fraction of
+            the effort limit.
+        margin: Minimum width of the soft wall before each position limit [rad, m]. The margin is also the allowed
+            difference between the first commanded positions and the measured pose. While efforts act, a pose that
+            exceeds a limit by more than half of the margin is a fault.
+        margin_fraction: Largest margin as a fraction of the range of the joint. It determines the margin of prismatic
+            joints and of joints with a small range.
+        effort_fraction: Fraction of each effort limit that effort commands may use. The soft wall and the braking at
+            the speed limit can use the full effort limit.
         effort_rise_time: Shortest time in which the commanded effort grows from zero to its limit [s].
-        traverse_time: Shortest time in which a joint may cross its range [s]. This defines the speed limit. Commanded
-            positions move no faster. While efforts act, a joint above the speed limit is braked.
-        following_error: Allowed distance of a joint from its commanded position, as a fraction of its range.
-        following_time: Allowed lag of the arm's position controller [s], Kd/Kp for a PD controller.
-        fault_effort: Largest effort of held joints after a measurement fault, as a fraction of the effort limit. If
-            gravity needs more than two thirds of this effort, the limit is the gravity effort plus a third of it.
-        slow_period: Largest median of the last 100 periods between two steps of the guard [s].
-        longest_period: Largest time between two steps of the guard [s].
-        oscillation: Alternating part of the commanded effort that counts as a reversal, as a fraction of the effort
-            limit.
-        oscillation_reversals: Allowed number of reversals, weighted exponentially with `oscillation_time`.
-        oscillation_time: See `oscillation_reversals` [s].
-        resume_automatically: If true, commands may act again after the watchdog took over, without an operator.
+        traverse_time: Shortest time in which a joint may cross its range [s]. The speed limit is the range divided by
+            this time. The target of position commands does not exceed the speed limit. While efforts act, a joint above
+            the speed limit is braked.
+        following_error: Allowed distance of a joint from its target, as a fraction of the range of the joint.
+        following_time: Allowed delay with which the arm's position controller follows a moving target [s]. For a PD
+            controller, the delay is Kd/Kp.
+        fault_effort: Largest effort of the joints that are held after a measurement fault, as a fraction of the effort
+            limit. If the gravity effort exceeds two thirds of this value, the largest effort is the gravity effort plus
+            a third of this value.
+        slow_period: Largest allowed median of the last 100 periods between two steps of the guard [s].
+        longest_period: Largest allowed time between two steps of the guard [s].
+        oscillation: Threshold of the alternating part of the commanded effort for a reversal, as a fraction of the
+            effort limit. See `monitors.OscillationMonitor`.
+        oscillation_reversals: Allowed number of reversals. The count decays exponentially.
+        oscillation_time: Time constant with which the count of reversals decays [s].
+        resume_automatically: If true, commands may act again after a watchdog hold without a resume by an operator.
         plausibility: Tolerances of the checks of measurements.
     """
 

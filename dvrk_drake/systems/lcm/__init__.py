@@ -1,1 +1,1 @@
-"""Systems for both ends of an arm's LCM channels, as pydrake.systems.lcm contains Drake's LCM systems."""
+"""Drake systems for both ends of an arm's LCM channels: the controller and the arm."""

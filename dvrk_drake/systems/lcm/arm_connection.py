@@ -1,4 +1,4 @@
-"""Systems that connect a Diagram with one arm over LCM."""
+"""Systems that connect a Diagram to one arm over LCM."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class TolerantSerializer(PySerializer):
-    """Serializer that keeps the last message if a new one is rejected, and signs messages with a key.
+    """Serializer that keeps the last accepted message if a new message is rejected. With a key, it signs messages.
 
     With Drake's serializer for Python types, `HandleSubscriptions` raises the exception of the decoder. Any process on
-    the network could then stop this process.
+    the network could therefore stop this process by an invalid message.
     """
 
     def __init__(
@@ -33,12 +33,12 @@ class TolerantSerializer(PySerializer):
         read: Callable[[bytes], Any] | None = None,
         key: MessageKey | None = None,
     ) -> None:
-        """Creates a serializer of a type that lcm-gen generated.
+        """Creates a serializer for a message type that lcm-gen generated.
 
         Args:
             message_type: Type of the message.
-            read: Function that returns the message in the received bytes, or None to ignore the message. None: the
-                decoder of `message_type`.
+            read: Function that decodes received bytes. It returns the message, or None if the message is rejected. If
+                `read` is None, the decoder of `message_type` is used.
             key: Key that signs sent messages. None: messages are not signed.
         """
         super().__init__(message_type)
@@ -64,11 +64,11 @@ def connect_arm(
 
     Args:
         builder: Builder of the Diagram.
-        arm: Arm of the channels. Messages that do not continue the first received session are ignored; see
+        arm: Arm that is connected. Statuses that do not continue the first received session are ignored; see
             `StatusFilter`.
         driver: Configuration of the driver. Its key verifies statuses and signs commands.
-        lcm: LCM interface whose `HandleSubscriptions` the caller calls. None: a new interface at `driver.lcm_url`,
-            which the Simulator handles.
+        lcm: LCM interface whose `HandleSubscriptions` the caller calls. If it is None, a new interface at
+            `driver.lcm_url` is added, and the Simulator handles its messages.
 
     Returns:
         Receiver of the status and sender of the command.

@@ -1,4 +1,4 @@
-"""Systems for the command channel of an arm: sender of the controller, and receiver of the arm with a command guard."""
+"""Systems for the command channel of an arm: sender for a controller, and receiver with a command guard for an arm."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw_id() -> int:
 
 
 class DvrkCommandSender(LeafSystem):
-    """Computes the command that answers a status, for an LcmPublisherSystem.
+    """Computes the command for a received status. An LcmPublisherSystem can publish the command.
 
     .. pydrake_system::
 
@@ -41,13 +41,14 @@ class DvrkCommandSender(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `lcmt_dvrk_status`: status to answer. The command contains the session, time and sequence of this status. The arm
-      refuses a second command for the same status, so it holds if there are no new statuses.
+    - `lcmt_dvrk_status`: received status. The command contains the session, time and sequence of this status. The arm
+      refuses a second command for the same status. The arm therefore holds if the sender receives no new statuses.
     - `effort` (n): commanded efforts. `desired_state` (2n): commanded q, then v.
-    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Other values mean HOLD. Unconnected: EFFORT
-      if `effort` is connected, otherwise POSITION if `desired_state` is connected, otherwise HOLD.
-    - `reset_fault` (1): a value other than zero requests the reset of a fault, or a resume after the watchdog took
-      over. The mode is then HOLD.
+    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Other values mean HOLD. If the port is
+      unconnected, the mode is EFFORT if `effort` is connected, otherwise POSITION if `desired_state` is connected,
+      otherwise HOLD.
+    - `reset_fault` (1): a value other than zero requests the reset of a fault, or a resume after a watchdog hold. The
+      mode is then HOLD.
     - `lcmt_dvrk_command`: command message. The mode is HOLD if the commanded values are unconnected or not finite.
     """
 
@@ -56,7 +57,7 @@ class DvrkCommandSender(LeafSystem):
 
         Args:
             arm: Controlled arm.
-            sender_id: Identifier of the sender. None: a random identifier.
+            sender_id: Identifier of the sender. None: a random identifier is used.
         """
         super().__init__()
         n = arm.num_joints
@@ -110,7 +111,8 @@ class DvrkCommandSender(LeafSystem):
 class DvrkCommandReceiver(LeafSystem):
     """Receives commands for one arm, checks them with a guard, and outputs the resulting efforts and targets.
 
-    Until a command acts, the measured pose is held, as in Drake's receivers. It is also held when the guard takes over.
+    Until a command acts, the arm holds the measured pose, as with Drake's command receivers. The arm also holds a pose
+    after a watchdog hold or a fault.
 
     .. pydrake_system::
 
@@ -129,21 +131,23 @@ class DvrkCommandReceiver(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `lcmt_dvrk_command`: command, e.g. from an LcmSubscriberSystem. A repeated message is received only once. Drake
-      keeps only the newest message of a channel, without the bytes that a key could verify. A process that moves an arm
-      must therefore pass every message to `Receive` instead.
+    - `lcmt_dvrk_command`: command, e.g. from an LcmSubscriberSystem. A repeated message is processed only once. Drake
+      keeps only the newest message of a channel, without the encoded bytes that are needed to verify the signature. A
+      process that moves an arm must therefore pass every message to `Receive` instead.
     - `state_estimated` (2n): measured q, then v. `effort_measured` (n): applied motor efforts.
     - `position_control_effort` (n): present effort of the position controller in the arm's driver.
     - `gravity_effort` (n): gravity compensation of the arm's driver. If connected, it is added to commanded efforts and
       subtracted from `effort_measured`.
     - `control_mode` (1): mode in force, lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
-    - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose at rest.
-    - `effort` (n): motor efforts to apply, inside the effort limits. Zero in OFF. In EFFORT: output of the guard plus
-      `gravity_effort`. Otherwise: `position_control_effort`, or the model's gravity effort if that is not finite.
+    - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose with zero
+      velocity.
+    - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
+      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If this is not
+      finite, the gravity effort of the model is used instead.
     - `guard`: the CommandGuard, read-only.
 
-    The guard is abstract state, which is updated once per period of the clock. Drake updates it before it steps
-    discrete plants at the same time, so a command acts in the next step of the plant.
+    The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
+    steps a discrete plant at the same time. A command therefore acts in the next step of the plant.
 
     Attributes:
         stalled: If true, the guard is not stepped, as in a bridge whose process is stopped. Messages then wait in the
@@ -161,8 +165,8 @@ class DvrkCommandReceiver(LeafSystem):
 
         Args:
             arm: Arm that defines the number of joints and their effort limits.
-            guard: Guard in its initial state. Each context has its own copy.
-            clock: Clock of the arm, with the period of the guard. None: ArmClock().
+            guard: Guard in its initial state. Each context has its own copy of the guard.
+            clock: Clock of the arm, with the period of the guard. None: `ArmClock()` is used.
             key: Key that must have signed the messages for `Receive`. None: signatures are not verified.
         """
         super().__init__()
@@ -229,7 +233,7 @@ class DvrkCommandReceiver(LeafSystem):
             output.SetFromVector(np.clip(guarded.effort + gravity, -self._effort_limits, self._effort_limits))
         else:
             effort = self._position_control.Eval(context)
-            # The position controller has no valid effort while its measurement is lost for a few periods.
+            # The effort of the position controller is not finite while measurements are missing for a few periods.
             effort = effort if is_finite(effort.tolist()) else self.GetGuard(context).gravity_effort
             output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
 

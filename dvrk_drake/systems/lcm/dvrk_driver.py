@@ -26,17 +26,18 @@ class DvrkDriver:
     """Configuration of the driver of one arm, comparable to Drake's IiwaDriver.
 
     Attributes:
-        lcm_url: URL of the LCM network. Empty: LCM_DEFAULT_URL of the environment, or LCM's default.
-        status_period: Period in which the arm sends a status and a controller answers [s].
+        lcm_url: URL of the LCM network. If it is empty, the environment variable LCM_DEFAULT_URL or LCM's default is
+            used.
+        status_period: Period in which the arm sends statuses and a controller sends commands [s].
         control_modes: Modes that the arm accepts in addition to hold: position, effort, "off" (in quotes, because YAML
-            reads off as false). "off" is not in the default, because an arm falls when it is off.
-        key_file: Key that must sign commands and that signs statuses, created by `dvrk-drake key`. The path is relative
-            to the driver's YAML file. Empty: messages are not authenticated, and any process on the network can
-            command the arm.
+            reads off as false). "off" is not accepted by default, because an arm falls when its motors are off.
+        key_file: File with the key that signs commands and statuses, created by `dvrk-drake key`. The path is relative
+            to the driver's YAML file. If it is empty, messages are not authenticated, and any process on the network
+            can command the arm.
         gravity_compensation: If true, the arm adds its own gravity compensation to commanded efforts (an option of a
             dVRK).
         model: File of the identified model with which the guard checks measurements. The path is relative to the
-            driver's YAML file. Empty: the model of the arm's SDF.
+            driver's YAML file. If it is empty, the model of the arm's SDF is used.
         guard: Settings of the command guard.
     """
 
@@ -52,7 +53,7 @@ class DvrkDriver:
         self.check()
 
     def check(self) -> None:
-        """Checks the values. Call it again after setting fields one by one, as yaml_load_typed does.
+        """Checks the values. Call this method again if fields are set later, as yaml_load_typed does.
 
         Raises:
             StationError: A control mode is unknown, the period is out of range, or a setting of the guard is invalid.
@@ -71,7 +72,7 @@ class DvrkDriver:
             self.model = str(folder / self.model)
 
     def load_model(self, arm: Arm) -> IdentifiedModel | None:
-        """Returns the model in the file `model`, or None if there is none.
+        """Returns the model in the file `model`, or None if `model` is empty.
 
         Raises:
             ModelError: The file cannot be read, or the model is not valid for `arm`.
@@ -79,7 +80,7 @@ class DvrkDriver:
         return IdentifiedModel.load(self.model, arm) if self.model else None
 
     def load_key(self) -> MessageKey | None:
-        """Returns the key in `key_file`, or None if there is none.
+        """Returns the key in `key_file`, or None if `key_file` is empty.
 
         Raises:
             KeyFileError: The key cannot be used; see `MessageKey.load`.

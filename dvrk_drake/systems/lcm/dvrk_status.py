@@ -1,4 +1,4 @@
-"""Systems for the status channel of an arm: sender of the arm with a clock, and receiver of the controller."""
+"""Systems for the status channel of an arm: sender and clock for an arm, and receiver for a controller."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 @dataclass(frozen=True)
 class ArmClock:
-    """Clock of an arm. It advances with the context's time and never jumps.
+    """Clock of an arm. It advances with the time of the context and never jumps.
 
     Attributes:
         start_utime: Value at time zero of the context [us].
@@ -70,7 +70,7 @@ class DvrkStatusSender(LeafSystem):
         Args:
             arm: Arm of the status.
             guard: Guard of the arm, which defines the type of the port.
-            clock: Clock that provides the time and the number of periods. None: ArmClock().
+            clock: Clock that provides the time and the number of periods. None: `ArmClock()` is used.
             gravity_compensation: True if the arm adds its own gravity compensation to commanded efforts.
         """
         super().__init__()
@@ -117,7 +117,7 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
 
 
 class DvrkStatusReceiver(LeafSystem):
-    """Outputs the measurements of one arm from its status, which an LcmSubscriberSystem receives.
+    """Outputs the measurements in the status messages of one arm, which an LcmSubscriberSystem receives.
 
     .. pydrake_system::
 
@@ -136,7 +136,7 @@ class DvrkStatusReceiver(LeafSystem):
     """
 
     def __init__(self, arm: Arm) -> None:
-        """Creates the receiver of `arm`. Messages of another arm or size are treated as missing."""
+        """Creates the receiver of `arm`. For messages of another arm or size, the outputs are NaN."""
         super().__init__()
         n = arm.num_joints
         self._arm_name, self._num_joints = arm.name, n

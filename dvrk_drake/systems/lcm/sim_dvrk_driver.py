@@ -35,8 +35,9 @@ class SimDvrkDriver(Diagram):
         - effort_commanded
         - lcmt_dvrk_status
 
-    The ports are those of DvrkCommandReceiver and DvrkStatusSender. The position controller is a GravityPidController.
-    It holds the arm while no command acts. The position controller of a real arm also has to overcome friction.
+    The ports are described in DvrkCommandReceiver and DvrkStatusSender. The position controller is a
+    GravityPidController, which holds the arm while no command acts. The position controller of a real arm also has to
+    overcome friction.
     """
 
     def __init__(
@@ -52,10 +53,10 @@ class SimDvrkDriver(Diagram):
         """Creates the driver of `arm`.
 
         Args:
-            arm: Simulated arm with its mounting.
+            arm: Simulated arm with its base orientation.
             driver: Configuration of the driver.
-            model: Model for the gravity compensation of the position controller. None: the model of the arm's SDF. The
-                guard checks measurements with `driver.model` if it is set, otherwise with this model.
+            model: Model for the gravity compensation of the position controller. None: the model of the arm's SDF is
+                used. The guard checks measurements with `driver.model` if it is set, otherwise with this model.
             start_utime: Time of the arm's clock at time zero of the context [us].
             wall_clock: Function that returns the wall-clock time [us] for the guard. None: commands expire only by the
                 time of the context.
@@ -106,11 +107,11 @@ class SimDvrkDriver(Diagram):
         self.set_name(f"{arm.name.lower()}_driver")
 
     def Receive(self, data: bytes) -> None:
-        """Receives a message of the command channel, which the next update reads."""
+        """Adds a message of the command channel to the inbox that the next update reads."""
         self._receiver.Receive(data)
 
     def SetStalled(self, stalled: bool) -> None:
-        """Stops or restarts the guard, to simulate a bridge whose process is stopped.
+        """Stops or continues the steps of the guard, to simulate a bridge whose process is stopped.
 
         While the guard is stopped, no command is received and the motors keep their last efforts.
         """
@@ -142,7 +143,7 @@ def apply_driver_config(
         builder: Builder of the Diagram.
         model: See SimDvrkDriver.
         start_utime: Time of the arm's clock at time zero of the context [us].
-        subscribe: If true, commands are received from `lcm`. Over UDP, it keeps only the newest command between two
+        subscribe: If true, commands are received from `lcm`. Over UDP, `lcm` keeps only the newest command between two
             calls of `HandleSubscriptions`. If false, the caller passes every message to `SimDvrkDriver.Receive`.
         wall_clock: Function that returns the wall-clock time [us] for the guard, for a simulation that is stepped by
             the wall clock. None: commands expire only by the time of the context.

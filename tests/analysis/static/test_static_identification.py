@@ -280,7 +280,7 @@ def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
         with pytest.warns(FutureWarning, match='key "trust" was renamed to "feedforward_scale"'):  # an earlier key
             read = IdentifiedModel.load(tmp_path / "old.yaml")
         assert (read.arm, read.effects) == (load_arm(name), effects)
-    with pytest.raises(ModelError, match=r"new\.yaml: the model is of MTMR, not of PSM"):
+    with pytest.raises(ModelError, match=r"new\.yaml: the model is for MTMR, not for PSM"):
         IdentifiedModel.load(tmp_path / "new.yaml", load_arm("psm"))
 
 

@@ -220,7 +220,8 @@ def test_implausible_first_pose_is_a_fault():
     guard = bench.guard
     assert (guard.state, guard.fault_code) == (Status.STATE_FAULT, Status.FAULT_MEASUREMENT)
     assert guard.fault_text == (
-        "outer_yaw is at 40 rad, far outside its limits -0.6981..1.134 rad; check its unit (degrees?) and its zero"
+        "outer_yaw is at 40 rad, far outside its limits -0.6981..1.134 rad; "
+        "check its unit (degrees?) and its zero position"
     )
     assert bench.output.control_mode == Command.OFF  # no pose was held
     bench.q = Q
@@ -328,9 +329,8 @@ def test_prismatic_joint_in_millimetres_is_reported():
     q = np.zeros(7)
     q[2] = 120.0
     guard.step(0, 0, q, 0 * q, 0 * q)
-    assert (
-        guard.fault_text == "insertion is at 120 m, far outside its limits 0..0.24 m; check its unit (mm?) and its zero"
-    )
+    text = "insertion is at 120 m, far outside its limits 0..0.24 m; check its unit (mm?) and its zero position"
+    assert guard.fault_text == text
 
 
 def test_off_in_fault_requires_reset():
@@ -353,7 +353,7 @@ def test_old_measurement_is_invalid(mode):
     bench.age += MS
     bench.tick()
     assert bench.guard.state == Status.STATE_HOLD
-    old = "the measurement is 0.021 s old; allowed is 0 to 0.02 s"
+    old = "the measurement is 0.021 s old; allowed: 0 to 0.02 s"
     assert bench.guard.hold_reason == ("" if mode == Command.HOLD else old)
     output = bench.tick(BAD)
     assert (output.control_mode, bench.guard.fault_code) == (Command.EFFORT, Status.FAULT_MEASUREMENT)

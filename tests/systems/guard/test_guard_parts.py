@@ -54,7 +54,7 @@ def test_measurement_age_is_checked(age, good):
     assert measured.num_invalid == (not good)
     for kept, added in ((measured.q, 1), (measured.v, 2), (measured.effort, 3)):
         np.testing.assert_array_equal(kept, GOOD + added if good else GOOD)
-    assert good or "allowed is 0 to 0.02 s" in problem
+    assert good or "allowed: 0 to 0.02 s" in problem
 
 
 @pytest.mark.parametrize("which", range(3))

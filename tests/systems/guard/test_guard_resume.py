@@ -1,4 +1,4 @@
-"""Resume by an operator after the watchdog took over, and expiry by the wall clock in stalls of either side."""
+"""Resume by an operator after a watchdog hold, and expiry by the wall clock in stalls of either side."""
 
 import copy
 
@@ -14,7 +14,7 @@ from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
 MODES = pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
 WAITING = modes(Command.HOLD)
-EXPIRED = "the last command expired: 51.0 ms old by the arm's clock, 50 ms are allowed"
+EXPIRED = "the last command expired: it is 51.0 ms old by the arm's clock; 50 ms are allowed"
 
 
 def expire(bench):
@@ -249,7 +249,7 @@ def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, c
         return
     assert (output.control_mode, guard.state, guard.counts.expired) == (Command.HOLD, Status.STATE_HOLD, 1)
     age = milliseconds + 2
-    reason = f"the last command expired: {age:.1f} ms old by the wall clock, 50 ms are allowed"
+    reason = f"the last command expired: it is {age:.1f} ms old by the wall clock; 50 ms are allowed"
     assert waits(bench, reason)
 
 
@@ -289,7 +289,7 @@ def test_delayed_command_has_age_of_its_measurement():
     assert bench.step().control_mode == Command.EFFORT
     bench.stall(0.001)
     assert bench.step().control_mode == Command.HOLD
-    assert bench.guard.hold_reason.startswith("the last command expired: 50.0 ms old by the wall clock")
+    assert bench.guard.hold_reason.startswith("the last command expired: it is 50.0 ms old by the wall clock")
 
 
 def test_measurements_have_wall_clock_times():

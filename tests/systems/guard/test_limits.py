@@ -106,7 +106,7 @@ def test_implausible_pose_starts_at_half_of_the_range(row, side):
 
     assert at(-0.5) == at(0.0) == at(0.499) == ""
     assert at(0.501).startswith(f"{LIMITS.names[row]} is at ")
-    assert at(0.501).endswith("; check its unit (degrees?) and its zero")
+    assert at(0.501).endswith("; check its unit (degrees?) and its zero position")
 
 
 # The start

@@ -164,7 +164,7 @@ def test_missing_measurements_end_efforts():
     # A few bad measurements are tolerated in HOLD.
     assert scene.topics(321, 321 + BAD) == {"servo_jp"}
     assert scene.topics(321 + BAD, 400) == {"hold"}
-    assert scene.statuses[-1].fault_text == "the measurement is 0.041 s old; allowed is 0 to 0.02 s"
+    assert scene.statuses[-1].fault_text == "the measurement is 0.041 s old; allowed: 0 to 0.02 s"
     # Statuses carry the constant time of the measurement, so nothing is recorded twice.
     assert len({status.utime for status in scene.statuses[300:]}) == 1
 
