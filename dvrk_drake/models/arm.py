@@ -186,8 +186,9 @@ class Arm:
         return rows | {name: row @ J_inverse for name, row in self.friction_coordinates.items()}
 
     def encoder_counts(self) -> NDArray[np.float64]:
-        """Returns the size (n,) of one encoder count at each joint [rad, m]. It is 0 for an arm without
-        `effects.encoder`.
+        """Returns the size (n,) of one encoder count at each joint [rad, m].
+
+        The size is 0 for an arm without `effects.encoder`.
         """
         resolution = self.effects.encoder.resolution if self.effects.encoder is not None else {}
         return np.abs(self.transmission.inverse.matrix) @ per_actuator(resolution, self.joint_names, 0.0)
@@ -202,7 +203,7 @@ class Arm:
         return dry
 
     def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Returns A, lower and upper for lower <= A q <= upper. The coupled limits are the last rows."""
+        """Returns A, lower and upper of the limits lower <= A q <= upper. The last rows are the coupled limits."""
         rows = [[limit.coefficients.get(j, 0.0) for j in self.joint_names] for limit in self.coupled_limits]
         A = np.vstack([np.eye(self.num_joints), np.array(rows).reshape(-1, self.num_joints)])
         lower = np.concatenate([self.position_lower, [limit.lower for limit in self.coupled_limits]])
@@ -226,7 +227,7 @@ class Arm:
         Args:
             count: Number of poses.
             generator: Random number generator.
-            margin: Fraction (0 to 0.5) of the range of each limit that is excluded at each end.
+            margin: Fraction (0 to 0.5) of each position range that is excluded at both ends of the range.
 
         Raises:
             ArmError: Almost no pose within the joint limits meets the coupled limits.
