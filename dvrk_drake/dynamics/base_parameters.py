@@ -67,7 +67,7 @@ class BaseParameters:
 def independent_columns(
     regressor: NDArray[np.float64], tolerance: float = 1e-9
 ) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
-    """Returns indices of independent columns of a regressor, and the combinations that give all columns.
+    """Returns indices of linearly independent columns of a regressor, and the combinations that give all columns.
 
     The indices `columns` (b,) and the matrix B (b, p) satisfy regressor = regressor[:, columns] B.
 
@@ -92,9 +92,9 @@ def reduce_to_base(
 ) -> BaseParameters:
     """Computes base parameters whose regressor columns come as early as possible in `preference`.
 
-    The method is a QR decomposition. Its pivots are chosen in the order of `preference` instead of by magnitude. For an
-    exact regressor, the order affects only the form of the base parameters. Reference: Gautier, "Numerical calculation
-    of the base inertial parameters of robots" (1991).
+    The method is a QR decomposition. Its pivots are chosen in the order of `preference` instead of by magnitude.
+    Without rounding errors, the order affects only the form of the base parameters. Reference: Gautier, "Numerical
+    calculation of the base inertial parameters of robots" (1991).
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.

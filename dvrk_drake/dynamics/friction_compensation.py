@@ -25,8 +25,8 @@ HOLDING_SPEED = 0.25
 MAX_RATIO = 0.6
 #: Largest share of the hysteresis effects (see `Friction.springs_back`) that may be compensated.
 MAX_HYSTERESIS_RATIO = 0.9
-#: Assumed ratio of the largest error of the holding torque to the leave-one-out RMS error of a model. The ratio is
-#: rarely larger on simulated arms.
+#: Assumed ratio of the largest error of the holding torque to the leave-one-out RMS error of a model. On simulated
+#: arms, the actual ratio is rarely larger.
 HOLDING_ERROR_FACTOR = 2.0
 
 

@@ -80,8 +80,8 @@ class JointStatistics:
         rms_cross_validation_included: RMS error of 10-fold cross-validation without excluded measurements. The effects
             are selected again for each fold.
         num_excluded: Number of excluded measurements.
-        feedforward_scale: Factor of the joint's torque, 0 to 1. It is less than 1 if the recording does not fully
-            support a feedforward.
+        feedforward_scale: Factor of the joint's torque, 0 to 1. It is less than 1 if the torque cannot be predicted
+            accurately from the recording.
         position_lower: Lower end of the position range that the recording covers.
         position_upper: Upper end of the position range that the recording covers.
         coverage: Ratio of this position range to the range of the joint limits.
@@ -207,7 +207,8 @@ class IdentifiedModel(_Identified):
             arm: Arm whose SDF specifies the inertias.
             effects: Position-dependent effects, e.g. `arm.effects.cables + arm.effects.springs`. Not allowed together
                 with `dynamics`.
-            dynamics: True to include the full dynamics: rotors, and friction, cables and springs of `arm.effects`.
+            dynamics: True to include the full dynamics, with the rotors and with the friction, cables and springs of
+                `arm.effects`.
 
         Raises:
             ModelError: Both `effects` and `dynamics` are given.

@@ -367,7 +367,7 @@ def _build_arm(
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     if not joints or len({*joints}) < len(joints):
-        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and each joint its own name")
+        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and all joint names must differ")
     if not mechanism.sdf:
         raise ArmError(f"{path}: the mechanism file has no sdf")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)

@@ -191,7 +191,6 @@ def load_gains(path: str | Path) -> Gains:
 
     The controller checks whether its arm accepts the gains.
 
-
     Raises:
         ControllerError: The file does not exist, is not a gains file, or has a gain outside the range of `Gains`.
     """

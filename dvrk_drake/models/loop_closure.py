@@ -28,8 +28,8 @@ def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClos
     Drake's solver SAP assigns each constraint the compliance 5e-10 s^2 / m at a time step of 1 ms, where m is the
     effective mass of the unconstrained tree at the pin. The three equations of the pin share one effective mass. A
     light bar that rotates freely makes the pin compliant in all directions, including the direction of the bar, in
-    which the linkage is loaded. The distance constraint has the effective mass of the linkage and is stiff. With this constraint, the
-    weight of the PSM moves its remote centre by 1e-8 m instead of 2e-6 m.
+    which the linkage is loaded. The distance constraint has the effective mass of the linkage and is stiff. With this
+    constraint, the weight of the PSM moves its remote centre by 1e-8 m instead of 2e-6 m.
     """
     A, B = (plant.GetFrameByName(name, instance) for name in (loop.frame_a, loop.frame_b))
     p_AP, p_BQ = (frame.GetFixedPoseInBodyFrame().translation() for frame in (A, B))

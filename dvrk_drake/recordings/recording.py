@@ -52,7 +52,7 @@ class Recording:
         q: Positions (m, n).
         tau: Efforts (m, n) applied by the motors, or None.
         qd: Velocities (m, n), or None.
-        t: Times (m,), or None for static poses.
+        t: Times (m,) [s], or None for static poses.
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
         lines: Line number (m,) of each row in the source, or None. For an LCM log, `lines` contains event numbers; for
@@ -271,7 +271,8 @@ def read_recording(
         progress: Callback that receives the name of the step ("reading") and the completed fraction (0 to 1) of a CSV.
 
     Returns:
-        Recording with SHA-256 and line numbers. Its attribute `notes` contains the omitted rows and messages.
+        Recording with SHA-256 and line numbers. Its attribute `notes` lists the omitted rows of a CSV, or counts the
+        omitted messages of a log.
 
     Raises:
         RecordingError: The file cannot be read as a recording. The message names the file, line and column.

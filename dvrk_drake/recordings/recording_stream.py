@@ -18,7 +18,7 @@ from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.recording import column_names
 
-#: Columns of a CSV after the columns of a Recording. They identify the status of each row.
+#: Additional columns of a CSV, after the columns of a Recording. They identify the status of each row.
 _ORIGIN = ("utime", "sequence", "guard_state")
 
 
@@ -63,7 +63,7 @@ def check_stream_output(path: str | Path) -> None:
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:
-    """Creates the file at `path`. A .csv contains the statuses that `stream` uses, a .log every message as received.
+    """Creates the file at `path`. A .csv contains the statuses that `stream` accepts. A .log contains all messages.
 
     Raises:
         RecordingError: See `check_stream_output`; additionally if the file cannot be written.
