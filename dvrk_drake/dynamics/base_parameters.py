@@ -73,7 +73,8 @@ def independent_columns(
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
-        tolerance: Largest norm of the independent part of a dependent column, relative to the largest column norm.
+        tolerance: Relative tolerance. A column is dependent if the norm of its component that is orthogonal to the
+            chosen columns is at most `tolerance` times the largest column norm.
     """
     R, pivots = scipy.linalg.qr(regressor, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > tolerance * abs(R[0, 0])))
@@ -102,7 +103,8 @@ def reduce_to_base(
         preference: Permutation of the column indices 0 to p - 1, most preferred column first.
         lengths: Name -> coefficient, such as a length [m] or a product of lengths. In the names of base parameters, the
             name replaces the value of the coefficient.
-        tolerance: Largest norm of the independent part of a dependent column, relative to the largest column norm.
+        tolerance: Relative tolerance. A column is dependent if the norm of its component that is orthogonal to the
+            chosen columns is at most `tolerance` times the largest column norm.
     """
     scale = np.linalg.norm(regressor, axis=0).max()
     columns: list[int] = []

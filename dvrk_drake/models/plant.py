@@ -42,7 +42,7 @@ def add_arm(
     Args:
         plant: Plant, with or without a scene graph.
         arm: Arm to add.
-        closure: Method of closing the loops of the linkage.
+        closure: Method of closing the loops of the linkage, see `Closure`.
         collision_shapes: Whether to add collision shapes. Without collision shapes, the arm has no contact, and a plant
             with a scene graph needs less time per step.
 
