@@ -201,7 +201,7 @@ def _run_effect(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale
 
 
 def distinct_coordinates(arm: Arm) -> list[str]:
-    """Returns the names of all coordinates, except coordinates that are proportional to a preceding coordinate.
+    """Returns the names in `Arm.effect_coordinates`, without coordinates that are proportional to a previous one.
 
     The positions of the actuators come first, so all of them are included.
     """

@@ -21,7 +21,7 @@ GRAVITY = sympy.Symbol("g", positive=True)
 
 @dataclass(frozen=True, eq=False)
 class SymbolicGravity(GravityParameters):
-    """Symbolic gravity torque tau = Y(q) beta of the n independent joints, which holds the arm at rest.
+    """Symbolic torque tau = Y(q) beta that compensates gravity at the n independent joints.
 
     Attributes:
         q: Joint positions as symbols q1, ..., qn [rad, m].

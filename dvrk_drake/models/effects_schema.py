@@ -1,8 +1,6 @@
-"""Schema of `effects:` in an arm's YAML files: friction, cables, stops and sensors of the real arm.
+"""Schema of `effects:` in an arm's YAML files: friction, cables, stops and sensors of the real arm."""
 
-Postponed annotations are not used here because yaml_load_typed reads the types at run time.
-"""
-
+# This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,8 @@
-"""Channels, authentication and decoding of the LCM messages of an arm."""
+"""Channels, authentication and decoding of the LCM messages of an arm.
+
+A status is a message lcmt_dvrk_status, which the arm's process sends. A command is a message lcmt_dvrk_command, which a
+controller sends.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads LCM logs, including damaged ones, and the measurements of one arm in them.
+"""Reads LCM logs, including damaged logs, and extracts the statuses (lcmt_dvrk_status) of one arm.
 
 The format is described at https://lcm-proj.github.io/lcm/content/log-file-format.html. A log is a sequence of events.
 Each event is big-endian and consists of a magic number, the event number, a time, two lengths, channel and data.
@@ -42,7 +42,7 @@ class LcmEvent(NamedTuple):
 
 
 class LcmLogReader:
-    """Iterates over the events of a log in order, and skips damaged ones.
+    """Iterates over the events of a log in order, and skips damaged events.
 
     Attributes:
         path: Path of the log.

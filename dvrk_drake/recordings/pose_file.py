@@ -1,8 +1,6 @@
-"""Files of the command `collect`: the poses to measure (YAML) and the measured poses (CSV).
+"""Files of the command `collect`: the poses to measure (YAML) and the measured poses (CSV)."""
 
-Postponed annotations are not used here because yaml_load_typed reads the types at run time.
-"""
-
+# This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 import os
 import time
 from dataclasses import dataclass, field

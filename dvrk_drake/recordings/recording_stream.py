@@ -1,6 +1,7 @@
-"""Writes recordings while statuses are received. If the process ends, the file ends with a complete row.
+"""Writes the statuses of an arm to a CSV or an LCM log while they are received.
 
-Written rows survive the termination of the process. The last rows before a power failure may be lost.
+If the process is terminated, the file ends with the last complete row. The last rows before a power failure may be
+lost.
 """
 
 from __future__ import annotations
