@@ -115,7 +115,8 @@ class Teacher:
 
         Args:
             controller: Controller in mode "gravity".
-            path: Path of the file. The poses are added to an existing file. The file is complete at any time.
+            path: Path of the file. If the file exists, new poses are added to it. Each change replaces the file
+                atomically.
             at_rest: True to record each pose at which the arm is at rest for a second.
             requested: Function that returns whether to record the present pose. It is called once per status.
             report: Function that is called with one line per pose.
