@@ -102,8 +102,8 @@ class ArmController:
         Args:
             status: Received status.
             time: Time of arrival on the controller's clock [s].
-            desired_state: Desired state (2n,) in mode "hold": q_d, then v_d. None: the stored pose is held; see the
-                class.
+            desired_state: Desired state (2n,) in mode "hold": q_d, then v_d. None: the stored pose is held; see
+                `ArmController`.
 
         Returns:
             Command for the arm.

@@ -75,7 +75,7 @@ class ArmLink:
             url: URL of the LCM network.
             key: Key that must have signed the statuses, and that signs the commands. None: statuses are not verified
                 and commands are not signed.
-            before: Status of the session that is used. A session is one run of the process of the arm. None: the
+            before: Status of the session that is used. A session is one run of the arm's process. None: the
                 session of the first received status is used.
             replays: True to accept statuses of any session and time, for example from a replayed log. Must be False for
                 a controller, because old statuses would determine the commands.

@@ -59,7 +59,7 @@ class CubicTrajectory:
 
     @classmethod
     def braking(cls, state: NDArray[np.float64], duration: float) -> CubicTrajectory:
-        """Returns a trajectory with constant deceleration from `state` (2n,) to rest. The state is q, then v."""
+        """Returns a trajectory with constant deceleration from `state` (2n,), i.e. q, v, to rest in `duration` [s]."""
         q, v = np.split(state, 2)
         return cls(q, v, q + 0.5 * duration * v, duration)
 

@@ -60,9 +60,10 @@ class Teleoperation(LeafSystem):
     compensation has no controller for this motion.)
 
     **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits. Each commanded position
-    then moves towards the clamped position within the velocity limit of the joint. If a desired pose has no solution,
-    e.g. at and above the remote centre of motion, only the jaw moves. If the handle moves beyond a limit, the tip stops
-    at the limit. When the handle returns, the tip moves again as defined by the control law.
+    then moves towards the clamped position within the velocity limit of the joint. If the inverse kinematics has no
+    solution for a desired pose, e.g. at and above the remote centre of motion, only the jaw moves. If the handle moves
+    beyond a limit, the tip stops at the limit. When the handle returns, the tip moves again as defined by the control
+    law.
 
     **Hold.** `desired_state` is constant with zero rates in any of these cases:
 

@@ -116,7 +116,7 @@ class EffortSensor(LeafSystem):
 
 
 class DriveForce(LeafSystem):
-    """Computes the sum of the efforts of motors, cables, springs and disturbance. One system is faster than several.
+    """Computes the sum of motor, cable, spring and disturbance efforts. One system is faster than several systems.
 
     .. pydrake_system::
 

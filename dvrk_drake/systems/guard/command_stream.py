@@ -135,7 +135,7 @@ class CommandInForce:
 class CommandStream:
     """Stream of the commands of one sender. All times are in us. Times of arrival refer to the arm's clock.
 
-    A sender is in control while its commands are accepted. Commands of a second sender are refused until `expiry` has
+    A sender is in control while its commands are accepted. Commands of a second sender are ignored until `expiry` has
     elapsed since the last accepted command of the first sender. Refused commands of the first sender do not extend this
     time. Otherwise, a process that repeats one command could prevent an operator from resuming.
 

@@ -112,7 +112,7 @@ class DvrkCommandReceiver(LeafSystem):
     """Receives commands for one arm, checks them with a guard, and outputs the resulting efforts and targets.
 
     Until a command acts, the arm holds the measured pose, as with Drake's command receivers. The arm also holds a pose
-    after a watchdog hold or a fault.
+    during a watchdog hold and after a fault.
 
     .. pydrake_system::
 
@@ -142,8 +142,8 @@ class DvrkCommandReceiver(LeafSystem):
     - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose with zero
       velocity.
     - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
-      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If this is not
-      finite, the gravity effort of the model is used instead.
+      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If
+      `position_control_effort` is not finite, the gravity effort of the model is used instead.
     - `guard`: the CommandGuard, read-only.
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
