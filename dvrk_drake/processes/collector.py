@@ -1,4 +1,4 @@
-"""Moves an arm to a sequence of poses and measures holding efforts: steps 4 to 6 of section III.G of the paper."""
+"""Moves an arm to poses and measures holding torques: steps 4 to 6 of section III.G of Rutfield et al. (WPI, 2015)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class CollectionSettings:
     Attributes:
         traverse_time: Time in which a joint may cross its range [s]. It determines the speed between poses.
         both_sides: If true, each pose is approached from below and from above in all joints. Coulomb friction cancels
-            in the average of the two measurements. If false, each pose is measured once, as in the paper.
+            in the average of the two measurements. If false, each pose is measured once, as in Rutfield et al.
     """
 
     traverse_time: float = field(default=5.0, metadata=within(1.0, 60.0, "s"))

@@ -94,6 +94,6 @@ def _keep_cores_awake() -> None:
 
 
 def settle_memory() -> None:
-    """Excludes existing objects from garbage collection, which makes collections short."""
+    """Excludes existing objects from garbage collection, which shortens each collection."""
     gc.collect()
     gc.freeze()

@@ -1,4 +1,7 @@
-"""Poses taught by hand (steps 1 to 3 of section III.G of the paper), and trajectories between poses."""
+"""Poses taught by hand, and trajectories between poses.
+
+Teaching consists of steps 1 to 3 of section III.G of Rutfield et al. (WPI, 2015).
+"""
 
 from __future__ import annotations
 

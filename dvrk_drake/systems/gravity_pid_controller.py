@@ -27,9 +27,9 @@ class GravityPidController(LeafSystem):
 
     The control law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), with e = q_d - q and de = v_d - v for every joint.
     It is equation 11 of Rutfield et al. (WPI, 2015). G(q) is the predicted holding torque of the model: gravity,
-    cables, springs and offsets. The holding torque of each joint is multiplied by its feedforward scale. Gains are
-    diagonal. In "gravity" mode tau = G(q). In "damped" mode tau = G(q) - Kd v, so an error of G causes a slow motion
-    that does not accelerate.
+    cables, springs and offsets. The holding torque of each joint is multiplied by its feedforward scale. The gain
+    matrices are diagonal. In "gravity" mode tau = G(q). In "damped" mode tau = G(q) - Kd v, so an error of G causes a
+    slow motion that does not accelerate.
 
     .. pydrake_system::
 

@@ -112,7 +112,7 @@ class DriveJoints:
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
     def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
-        """Returns a new joint parallel to coaxial joints whose angles add up to row q, or None without such joints."""
+        """Returns a new joint whose angle row q is the sum of the angles of coaxial joints; None if there are none."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
         for name in names:

@@ -259,7 +259,8 @@ class CommandGuard:
     def blocked_reason(self) -> str:
         """Reason why POSITION and EFFORT are refused although there is no fault, or "" if they are accepted.
 
-        The reason is `hold_reason` until an operator resumes. Otherwise, it is a period of the guard that is too long.
+        The reason is `hold_reason` until an operator resumes. Otherwise, the reason is that a period of the guard was
+        too long.
         """
         return self.hold_reason or self._period.fault
 
@@ -345,7 +346,7 @@ class CommandGuard:
         return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
-        """Latches a fault that the arm's driver reports. Call this method before each `step` while the fault lasts.
+        """Latches a fault. A driver that reports a fault calls this method before each `step` while the fault lasts.
 
         Args:
             text: Description of the fault, including measured values. The description of the first fault is kept until

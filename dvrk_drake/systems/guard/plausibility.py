@@ -62,7 +62,9 @@ class Sample:
 
 
 class Check(Protocol):
-    """Protocol of one plausibility check. The caller stores the state, because Drake copies the guard at every update.
+    """Protocol of a plausibility check. The caller stores the state of the check.
+
+    The state is separate from the check, because Drake copies the guard at every update.
 
     Attributes:
         text: Description of the error that this check detects.

@@ -34,7 +34,8 @@ class PlausibilitySettings:
         response_memory: Time constant with which the slowly varying part of the unexplained effort is attributed to
             model errors [s].
         start_gravity: Allowed difference between the measured effort and the gravity effort when effort commands start,
-            as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added.
+            as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added to the allowed
+            difference.
         silent_effort: Lowest commanded effort that the measured effort must follow, as a fraction of the effort limit.
         silent_time: Time within which the measured effort must follow the commanded effort [s].
         detection_time: Minimum age of the last valid pose at the detection of a fault [s].

@@ -139,7 +139,7 @@ def apply_driver_config(
         driver: Configuration of the driver. `driver.lcm_url` is not used. The driver's key verifies commands and signs
             statuses.
         station: Station in `builder` with an unconnected effort input.
-        lcm: LCM interface whose `HandleSubscriptions` the caller calls, e.g. an LcmInterfaceSystem or a loop.
+        lcm: LCM interface whose `HandleSubscriptions` the caller calls, e.g. in a loop or by an LcmInterfaceSystem.
         builder: Builder of the Diagram.
         model: See SimDvrkDriver.
         start_utime: Time of the arm's clock at time zero of the context [us].
