@@ -71,7 +71,7 @@ class Teleoperation(LeafSystem):
     - A number of an input is not finite, or its magnitude exceeds 1e6.
     - A joint of the follower is farther from its commanded position than its velocity limit times `MAX_LAG`. The jaw is
       not checked, because it may press on an object.
-    - The instrument is inside the cannula, i.e. less than `MIN_DEPTH` beyond the remote centre.
+    - The instrument is inside the cannula, i.e. its wrist centre is less than `MIN_DEPTH` beyond the remote centre.
 
     After each of these cases, X_MG and X_FT are stored again, as when the clutch closes. If the follower was moved
     externally while the clutch was open, the command is set to the measured position. Before the first finite

@@ -132,8 +132,8 @@ class DvrkCommandReceiver(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `lcmt_dvrk_command`: command, e.g. from an LcmSubscriberSystem. A repeated message is processed only once. Drake
-      keeps only the newest message of a channel, without the encoded bytes that are needed to verify the signature. A
-      process that moves an arm must therefore pass every message to `Receive` instead.
+      keeps only the newest message of a channel, without the encoded bytes that are needed to verify the authentication
+      code. A process that moves an arm must therefore pass every message to `Receive` instead.
     - `state_estimated` (2n): measured q, then v. `effort_measured` (n): applied motor efforts.
     - `position_control_effort` (n): present effort of the position controller in the arm's driver.
     - `gravity_effort` (n): gravity compensation of the arm's driver. If connected, it is added to commanded efforts and
@@ -167,7 +167,7 @@ class DvrkCommandReceiver(LeafSystem):
             arm: Arm that defines the number of joints and their effort limits.
             guard: Guard in its initial state. Each context has its own copy of the guard.
             clock: Clock of the arm, with the period of the guard. None: `ArmClock()` is used.
-            key: Key that must have signed the messages for `Receive`. None: signatures are not verified.
+            key: Key that must have signed the messages for `Receive`. None: authentication codes are not verified.
         """
         super().__init__()
         n = arm.num_joints

@@ -60,7 +60,7 @@ class SimDvrkDriver(Diagram):
             start_utime: Time of the arm's clock at time zero of the context [us].
             wall_clock: Function that returns the wall-clock time [us] for the guard. None: commands expire only by the
                 time of the context.
-            key: Key that must have signed the messages for `Receive`. None: signatures are not verified.
+            key: Key that must have signed the messages for `Receive`. None: authentication codes are not verified.
 
         Raises:
             ModelError: The driver's model cannot be read, or is not valid for this arm.
