@@ -135,8 +135,8 @@ class ArmStation(Diagram):
         Args:
             arm: Arm that defines the names of the ports. Controllers of this station use the same arm.
             plant_config: Configuration of the plant. None: `arm_plant_config()`.
-            meshcat: Meshcat in which the arm is drawn, below the path of its lower-case name. `SetTransform("mtml",
-                X_WB)` places the arm. None: the arm is not drawn.
+            meshcat: Meshcat in which the arm is drawn. The path in Meshcat begins with the arm's lower-case name.
+                `SetTransform("mtml", X_WB)` places the arm. None: the arm is not drawn.
             closure: Method that closes the loops of the linkage; see `add_arm`.
             plant_arm: Arm to simulate. Its gravity direction or SDF may differ from that of `arm`, but its joints must
                 be the same. None: `arm`.

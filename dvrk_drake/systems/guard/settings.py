@@ -34,7 +34,8 @@ class PlausibilitySettings:
         response_memory: Time constant with which the slowly varying part of the unexplained effort is attributed to
             model errors [s].
         start_gravity: Allowed difference between the measured effort and the gravity effort when effort commands start,
-            as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added.
+            as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added to the allowed
+            difference.
         silent_effort: Lowest commanded effort that the measured effort must follow, as a fraction of the effort limit.
         silent_time: Time within which the measured effort must follow the commanded effort [s].
         detection_time: Minimum age of the last valid pose at the detection of a fault [s].
@@ -64,8 +65,8 @@ class PlausibilitySettings:
 class GuardSettings:
     """Settings of a command guard.
 
-    The accepted range of each setting is given next to its default value. Values outside this range would disable the
-    protection, or all commands would be refused.
+    The accepted range of each setting is given next to its default value. With a value outside this range, the guard
+    would not protect the arm or would refuse all commands.
 
     Attributes:
         expiry: Age at which a command expires [s]. The age of a command is the age of the measurement from which it was
@@ -78,9 +79,9 @@ class GuardSettings:
             1 kHz.
         start_effort: Allowed difference between the first commanded efforts and the measured efforts, as a fraction of
             the effort limit.
-        margin: Minimum width of the soft wall before each position limit [rad, m]. The margin is also the allowed
-            difference between the first commanded positions and the measured pose. While efforts act, a pose that
-            exceeds a limit by more than half of the margin is a fault.
+        margin: Minimum width of the soft wall before each position limit [rad, m]; see `GuardLimits`. The margin is
+            also the allowed difference between the first commanded positions and the measured pose. While efforts act,
+            a pose that exceeds a limit by more than half of the margin is a fault.
         margin_fraction: Largest margin as a fraction of the range of the joint. It determines the margin of prismatic
             joints and of joints with a small range.
         effort_fraction: Fraction of each effort limit that effort commands may use. The soft wall and the braking at
