@@ -64,7 +64,7 @@ class JointDesign:
     Attributes:
         kp, kd, ki: Gains [N m/rad, N m s/rad, N m/(rad s)], with N/m instead of N m/rad for a prismatic joint.
         frequency: Natural frequency of the closed loop at the largest inertia [rad/s].
-        margins: Margins at the smallest and at the largest inertia.
+        margins: Stability margins at the smallest and at the largest inertia.
         limited_by: Requirement that the next higher frequency violates.
     """
 
@@ -95,8 +95,8 @@ def design_arm(arm: Arm) -> ArmDesign:
     """Designs the gains of each joint separately, then checks the stability of all joints together.
 
     The closed loop of all joints must be stable at all checked poses, with one additional period of delay and 20 % less
-    inertia. While it is unstable, the function reduces the natural frequency of the joint with the largest share of the
-    unstable mode's energy by 10 %.
+    inertia. While it is unstable at a pose, the function reduces the natural frequency of one joint by 10 %: the joint
+    with the largest share of the unstable mode's energy.
 
     Raises:
         ControllerError: No gains satisfy the requirements, for one joint or for all joints together.
