@@ -87,7 +87,7 @@ def collect_static_poses(
 ) -> Recording:
     """Moves an arm to poses under position control and records the holding effort at each pose.
 
-    These are steps 4 to 6 of section III.G of the paper.
+    These are steps 4 to 6 of section III.G of the paper (Rutfield et al., WPI 2015).
 
     Args:
         station: Simulated arm. It becomes part of a Diagram and cannot be used in another one.
@@ -132,7 +132,7 @@ class GroundTruth:
 
     Attributes:
         arm: Arm to simulate, with an SDF in the output folder and the `effects` of the real arm.
-        model: Exact model of the torque of gravity, cables and springs, used only for evaluation.
+        model: Exact model of the gravity, cable and spring torques, used only for evaluation.
         is_paper_arm: Whether the arm is identified from the paper's recording.
         origin: Origin of the arm, one sentence.
     """
@@ -227,7 +227,10 @@ def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) 
 def damped_station(
     arm: Arm, ground_truth_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
 ) -> ArmStation:
-    """Makes a station that simulates a ground-truth arm with effects, and with joint damping instead of friction."""
+    """Makes a station for `arm` that simulates `ground_truth_arm` with viscous damping of all joints.
+
+    `effects` are simulated in addition. For `closure`, see `add_arm`.
+    """
     damping = arm.per_joint(0.03, 0.3) * arm.effort_limits
 
     def damp(plant: MultibodyPlant) -> None:

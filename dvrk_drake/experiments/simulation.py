@@ -35,8 +35,8 @@ class Simulation:
     """Result of `simulate`.
 
     Attributes:
-        recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects` the measurements are exact, except
-            for the noise of tau.
+        recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects`, the measurements are exact,
+            except for the noise of tau.
         state_true: True state (m, 2n): positions [rad, m], then velocities [rad/s, m/s].
         hand: Torque [N m], then force [N] of the hand on the arm (m, 6) at the grasped frame, expressed in the base
             frame. Zero without a hand.
@@ -90,7 +90,7 @@ def simulate(
         progress: Function called with the name of the step ("simulating") and its finished share, 0..1.
 
     Returns:
-        Recording of the measurements, true states, forces of the hand, and desired positions.
+        Measured recording, true states, forces of the hand, and desired positions.
 
     Raises:
         ScenarioError: An argument is invalid, e.g. a pose is outside the limits, or a setting is given together with a

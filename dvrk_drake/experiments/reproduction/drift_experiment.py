@@ -27,7 +27,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 
 #: Sample period [s].
 SAMPLE_PERIOD = 0.02
-#: Duration of the motion after a release [s]; maximum distance from the release pose at which a joint counts as held [rad], [m].
+#: Duration of the motion after a release [s]; maximum distance of a held joint from its release position [rad], [m].
 DURATION = 10.0
 BAND = 0.015, 0.0015
 #: Approach to the release pose: distance [rad], [m], duration [s], and settling time at the release pose [s].

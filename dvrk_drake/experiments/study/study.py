@@ -134,8 +134,8 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
     """Provides worker processes on this computer, by default one per core.
 
-    The workers end at the end of the block. After an error, they end immediately. They also end if this process is
-    killed. The workers are spawned, so a script that uses this function needs `if __name__ == "__main__":`.
+    The workers end at the end of the `with` block. After an error, they end immediately. They also end if this process
+    is killed. The workers are spawned, so a script that uses this function needs `if __name__ == "__main__":`.
     """
     # Workers read these variables at their start. More BLAS threads per worker would compete for the cores.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):

@@ -190,7 +190,10 @@ class Bench:
         self._inertias = _scaled_links(self._station.plant, condition.inertia)
 
     def step(self, q: NDArray[np.float64], q_desired: NDArray[np.float64], gains: Gains, duration: float) -> Response:
-        """Simulates a step from q (n,), at rest and without force of the presliding springs, to q_desired (n,) at time 0."""
+        """Simulates a step at time 0 from q (n,) to q_desired (n,).
+
+        The arm starts at rest, and the presliding springs carry no force.
+        """
         root = self._diagram.CreateDefaultContext()
         station = self._station.GetMyMutableContextFromRoot(root)
         controller = self._controller.GetMyMutableContextFromRoot(root)

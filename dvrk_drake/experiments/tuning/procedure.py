@@ -1,4 +1,4 @@
-"""Tuning procedure of the paper (section III.J).
+"""Tuning procedure of the paper (Rutfield et al., WPI 2015, section III.J).
 
 The procedure raises Kp until the joint oscillates, then Kv until the oscillation is damped, and then Ki until the
 remaining position error (offset) is inside the settling band. Kv is the paper's name of kd. The paper does not state
@@ -23,7 +23,7 @@ class Oscillation:
     """Oscillation of a joint. A swing is the motion from one turning point to the next.
 
     Attributes:
-        swings: Number of swings. The first swing is not evaluated, since friction and integral are zero at its start.
+        swings: Number of swings. The first swing is not evaluated, since friction is zero at its start.
         growth: Mean ratio of the amplitudes of consecutive swings; 0 for too few swings.
         period: Period of the oscillation, i.e. duration of two swings [s]; infinite for too few swings.
     """
