@@ -276,7 +276,7 @@ def collect(
 
 
 def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
-    """Returns q and tau (m, 2n), each the mean over two opposite approaches to the pose."""
+    """Returns rows (m, 2n) of q and tau, one per pose: means over two opposite approaches to the pose."""
     arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
     visited = np.concatenate([[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses])

@@ -52,7 +52,7 @@ NO_DRY_FRICTION = (
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """Effects, poses and settings of the demo for one arm.
+    """Effects, poses and settings of the demo for one type of arm.
 
     Attributes:
         effects: Effects of the ground-truth arm that are not in the nominal model.

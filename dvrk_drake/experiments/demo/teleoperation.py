@@ -119,8 +119,8 @@ def play_teleoperation(
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     """Simulates teleoperation in real time with controls for hand, clutch, jaw and scale in Meshcat.
 
-    The simulation ends when the user clicks the button Stop, at the latest after `duration` [s]. A sphere above the
-    master is green while the follower follows the master, and grey otherwise.
+    The simulation ends after `duration` [s], or earlier if the user clicks the button Stop. A sphere above the master
+    is green while the follower follows the master, and grey otherwise.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 

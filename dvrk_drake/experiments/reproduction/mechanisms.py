@@ -20,8 +20,8 @@ POSES = 20
 def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
     """Computes the DH table of an MTM from the motion of the plant's frames `paper_0` to `paper_7`.
 
-    These frames are fixed to the links. If a joint of the plant does not move as a DH joint between two frames, the
-    returned error is large.
+    These frames are fixed to the links. If the motion between two consecutive frames is not that of a DH
+    joint, the returned error is large.
 
     Returns:
         - Table (n, 5) with the columns sign, offset [rad], d [m], alpha [rad] and a [m].

@@ -47,7 +47,7 @@ class Measure:
 
     @property
     def is_boolean(self) -> bool:
-        """Whether the measure is boolean."""
+        """True for a boolean measure."""
         return isinstance(self.worst, bool)
 
     @property

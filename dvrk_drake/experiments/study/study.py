@@ -118,7 +118,7 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
     """Runs a study on this computer, see `run_study`. If a worker is killed, a new pool runs the missing cases.
 
     Raises:
-        StudyError: See `run_study`. Killed workers raise it only after `MAX_POOLS` pools.
+        StudyError: See `run_study`. For killed workers, it is raised only if `MAX_POOLS` pools lost a worker.
     """
     for pool in range(MAX_POOLS):
         try:

@@ -189,7 +189,7 @@ def sampling_of(arm: Arm, period: float = 1e-3) -> Sampling:
 def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Computes the mass matrices (m, n, n) at poses (m, n), including the linkage and the rotors.
 
-    They are G' M G with the mass matrix M of the tree joints and G = `arm.linkage.matrix`.
+    They are G' M G with the mass matrix M of the joints `arm.tree_joint_names` and G = `arm.linkage.matrix`.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()

@@ -1,7 +1,7 @@
 """Tuning procedure of the paper (Rutfield et al., WPI 2015, section III.J).
 
 The procedure raises Kp until the joint oscillates, then Kv until the oscillation is damped, and then Ki until the
-remaining position error (offset) is inside the settling band. Kv is the paper's name of kd. The paper does not state
+remaining position error (offset) is inside the settling band. Kv is the paper's name for kd. The paper does not state
 the stopping criteria. Those used here are the constants of this module.
 
 In this module, a release is a test with proportional control only. The joint starts at rest, at the distance `step`
