@@ -79,7 +79,7 @@ def _shares(drifts: Drifts) -> tuple[str, ...]:
 
 
 def torque_table(session: ReproductionSession) -> ResultTable:
-    """Returns a table of the RMS torque errors of both models at random poses of the ground-truth arm."""
+    """Returns a table of the RMS torque errors of the paper's model and of ours at random poses."""
     mtm = session.mtm
     q = session.random_poses(PAPER_ARM, 500)
     true = mtm.truth.model.holding_torque(q)
@@ -184,9 +184,10 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     remarks = (
         mtm.truth.origin,
         f"**Ours** is identified from {sample_sizes.collected} poses, collected on the ground-truth arm with "
-        "friction, noise and encoders. Each pose was approached from both sides. The controller compensates gravity "
-        f"with this model only. **The paper's** is {_whose(session)}. Each release starts at rest, with unloaded "
-        f"friction, at a random pose inside the joint limits. Each simulation lasts {sample_sizes.duration:g} s. "
+        "friction, noise and encoders. Each pose was approached from both sides. The controller only compensates "
+        f"gravity with this model. **The paper's** is {_whose(session)}. Each release starts at rest, with unloaded "
+        "presliding springs of the friction, at a random pose inside the joint limits. Each simulation lasts "
+        f"{sample_sizes.duration:g} s. "
         f"In the first table, a joint is held if it stays within {1e3 * BAND[0]:.0f} mrad.",
         f"**Ours keeps all joints within {1e3 * BAND[0]:.0f} mrad at {share(ours.num_held, len(poses))}** of the "
         f"poses. The shares for single joints are: {_per_joint(ours)}. The paper's parameters hold all joints at "
