@@ -417,8 +417,8 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     console.print(table)
     print_note(
         console,
-        "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent share "
-        "indicates that the cables changed.",
+        "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent "
+        "share indicates that the cables changed.",
     )
 
 

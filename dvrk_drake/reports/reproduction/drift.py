@@ -187,8 +187,8 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "friction, noise and encoders. Each pose was approached from both sides. The controller only compensates "
         f"gravity with this model. **The paper's** is {_whose(session)}. Each release starts at rest, with unloaded "
         "presliding springs of the friction, at a random pose inside the joint limits. Each simulation lasts "
-        f"{sample_sizes.duration:g} s. "
-        f"In the first table, a joint is held if it stays within {1e3 * BAND[0]:.0f} mrad.",
+        f"{sample_sizes.duration:g} s. In the first table, a joint is held if it stays within {1e3 * BAND[0]:.0f} "
+        "mrad.",
         f"**Ours keeps all joints within {1e3 * BAND[0]:.0f} mrad at {share(ours.num_held, len(poses))}** of the "
         f"poses. The shares for single joints are: {_per_joint(ours)}. The paper's parameters hold all joints at "
         f"{share(paper.num_held, len(few))} of the poses. Most releases fail at {_lost(paper)}, where the torque error "

@@ -63,9 +63,9 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
     )
     with_fault, without = (oscillation_modes(theirs_arm, fault)[0].real.max() for fault in (True, False))
     remarks = (
-        "The step is from J5 = 3.13, J3 = -0.79, J2 = -0.22 rad to zero. The controller of the paper runs at 100 Hz with "
-        "the published gains, on an arm with the published masses. This controller has a fault: the damping terms of "
-        "joints 5-7 use positions instead of velocities. These terms add stiffness but no damping.",
+        "The step is from J5 = 3.13, J3 = -0.79, J2 = -0.22 rad to zero. The controller of the paper runs at 100 Hz "
+        "with the published gains, on an arm with the published masses. This controller has a fault: the damping "
+        "terms of joints 5-7 use positions instead of velocities. These terms add stiffness but no damping.",
         f"Each link has an inertia of {LINK_INERTIA:g} kg m^2, as in the PSM file of the paper. The oscillation period "
         f"of J2 confirms this value: {published.FIGURE_7_VALUES['J2 period']:.0f} s published, "
         f"{longest_period(theirs_arm):.0f} s here.",
