@@ -22,7 +22,7 @@ CONTROLLER_GRAVITY = 9.81
 NUM_GRAVITY = 10
 #: Order of the polynomials in a joint position.
 ORDER = 4
-#: Kinds of effects of the shoulder_pitch position that the first two columns of the regressor represent.
+#: Kinds of effects that the first two columns of the regressor represent, for the joint shoulder_pitch.
 _FIRST_EFFECTS = ("cable sine", "cable cosine")
 MTM_JOINTS = (
     "outer_yaw",
@@ -41,7 +41,7 @@ class CompensationOptions:
 
     Attributes:
         coulomb: Coulomb friction (7,) of the joints [N m].
-        friction_ratio: Shares (7,) of the Coulomb friction of the joints to compensate during a motion, 0 to 1.
+        friction_ratio: Share of the Coulomb friction to compensate on each joint (7,) during a motion, 0 to 1.
         dead_band, saturation: Speeds (7,) [rad/s], see `GravityCompensationFile`. The default values come from
             gravity-compensation files of the dVRK.
         tolerance: Largest accepted difference between the torques of the file and of the model [N m].
@@ -107,7 +107,7 @@ def polynomial_columns(joint: int) -> slice:
 
 
 def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Returns the torque (m, 7) that the controller computes from a file, before the torque is clipped [N m].
+    """Returns the torque (m, 7) that the controller computes from a file, before clipping to the torque limits [N m].
 
     Args:
         file: Content of the file.
@@ -279,7 +279,7 @@ def _check_errors(
     tilt = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
     limits = ["a last link balanced about its roll axis"]
     if tilt > 0.05:
-        limits.append(f"an upright base without the tilt of {tilt:.1f} deg")
+        limits.append(f"a base tilt of 0 instead of {tilt:.1f} deg")
     if np.any((model.feedforward_scale != 0) & (model.feedforward_scale != 1)):
         limits.append("feedforward scales of 0 or 1")
     reasons = {

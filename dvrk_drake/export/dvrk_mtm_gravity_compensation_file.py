@@ -49,7 +49,7 @@ class GravityCompensationFile:
         torque_lower, torque_upper: Torque limits (7,) [N m].
         dead_band: Speeds (7,) [rad/s] below which both parameter vectors have equal weight.
         saturation: Speeds (7,) [rad/s] above which the weights differ by `friction_ratio`.
-        friction_ratio: Shares (7,) of the friction of the joints to compensate during a motion, 0 to 1.
+        friction_ratio: Share of the friction to compensate on each joint (7,) during a motion, 0 to 1.
         sweep: Lower and upper joint positions (2, 7) [rad] in the recording from which the file was computed. None if
             the file does not contain these positions.
         arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if neither contains a name.

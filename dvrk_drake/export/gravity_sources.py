@@ -14,7 +14,7 @@ from dvrk_drake.dynamics.gravity_regressor import GRAVITY, SymbolicGravity
 
 
 def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) -> str:
-    """Returns base parameters, potential energy, gravity torque, regressor and link frames as LaTeX with amsmath.
+    """Returns LaTeX (package amsmath) of base parameters, potential energy, gravity torque, regressor and link frames.
 
     Args:
         gravity: Symbolic gravity torque.

@@ -116,7 +116,7 @@ def export_model(
             controller. None: 1e-6.
         friction: Coulomb friction (7,) [N m] to compensate, for "dvrk-gc". True uses the dry friction of the model's
             dynamics. False compensates no friction.
-        friction_ratio: Shares (7,) of the friction of the joints to compensate, 0 to 1, for "dvrk-gc". None uses
+        friction_ratio: Share of the friction to compensate on each joint (7,), 0 to 1, for "dvrk-gc". None uses
             typical values.
         dead_band: Speeds (7,) [rad/s] below which no friction is compensated, for "dvrk-gc". None uses typical values.
         saturation: Speeds (7,) [rad/s] above which `friction_ratio` is fully compensated, for "dvrk-gc". None uses

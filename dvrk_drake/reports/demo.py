@@ -95,6 +95,6 @@ def print_teleoperation(console: Console, result: TeleoperationResult, file: str
         console.print()
         print_note(
             console,
-            "Error: motion of the tip minus the scaled motion of the handle. Both motions start when the clutch is "
-            f"closed. Length of the path of the handle: {result.handle_path:.2f} m.",
+            "Error: motion of the tip minus the scaled motion of the handle. Both motions are measured from the "
+            f"positions at which the clutch was closed. Length of the path of the handle: {result.handle_path:.2f} m.",
         )

@@ -90,8 +90,8 @@ def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
     console.print(table)
     print_note(
         console,
-        "* ratio of the whitened RMS errors with and without payload, cross-validated over the phase of the motion. "
-        "Geometric mean over the actuators.",
+        "* whitened RMS error with payload / whitened RMS error without payload, cross-validated over the phase of the "
+        "motion. Geometric mean over the actuators.",
     )
 
 

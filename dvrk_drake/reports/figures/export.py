@@ -26,9 +26,9 @@ def plot_compensation(path: str | Path, comparison: CompensationComparison, titl
     """Plots the torques of file and model over the position of each joint, and the share of poses with each problem.
 
     Each band shows the range of the torque over the positions of all other joints. The torque of the file is drawn
-    before it is clipped to the torque limits, which are dashed lines. The grey area shows the positions of the joint in
-    the recording from which the file was computed. The problems are an active torque limit, an opposite sign, and a
-    runaway, see `JointComparison`.
+    without clipping. Dashed lines show the torque limits of the file. The grey area shows the positions of the joint in
+    the recording from which the file was computed. The attributes `clipped`, `opposed` and `runaway` of
+    `JointComparison` define the problems.
 
     Args:
         path: PNG file to write.

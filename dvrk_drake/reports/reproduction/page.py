@@ -45,7 +45,7 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class Section:
-    """Section of the page with the results for one figure, table or experiment.
+    """Section of the results page for one figure, table or experiment.
 
     Attributes:
         name: Name of the section on the command line.
