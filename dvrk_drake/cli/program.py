@@ -78,8 +78,8 @@ def run(arguments: Sequence[str] | None) -> int:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # The reader of the output (e.g. head) closed the pipe. The exit code must not be 0, because a verdict may have
-        # failed.
+        # The reader of the output (e.g. head) closed the pipe. The exit code must not be 0, because the command may
+        # have ended before it checked --require.
         sys.stderr.close()
         return 128 + signal.SIGPIPE
     except OSError as error:  # for example a full disk

@@ -156,7 +156,7 @@ def print_recalibration(
         return
     print_note(
         console,
-        f"Error: RMS of measured - predicted effort / RMS of measured effort, after the low-pass filter of the model. "
+        f"Error: RMS(measured - predicted effort) / RMS(measured effort), after the low-pass filter of the model. "
         f"Error after: {FOLDS}-fold cross-validation over the motion. Factors and offsets: fit to the whole motion.",
     )
     if result.shared:
@@ -417,8 +417,8 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     console.print(table)
     print_note(
         console,
-        "If the share of bias or friction is large, recalibrate. A large position-dependent share indicates that the "
-        "cables changed.",
+        "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent "
+        "share indicates that the cables changed.",
     )
 
 
