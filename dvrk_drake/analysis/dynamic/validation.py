@@ -91,7 +91,7 @@ class DynamicValidation(Validation):
         return {actuator.name: actuator.relative_error for actuator in self.actuators}
 
     def as_dict(self) -> dict:
-        """Returns the data of `validate --json`."""
+        """Returns the output of `validate --json` as a dictionary."""
         return {
             "verdict": self.verdict,
             "rule": rule_text(in_motion=True),
