@@ -35,7 +35,8 @@ SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
 _RELATIVE_ERROR = 0.1
 #: Assumed correlation time of the residuals [s]. Residuals are correlated because they are mainly model errors.
 _CORRELATION_TIME = 0.1
-#: Smallest share of the time that an actuator must move in each direction. Otherwise, its friction is not fitted.
+#: Smallest share of the time during which an actuator must move in each direction. Otherwise, its friction is not
+#: fitted.
 MIN_SHARE = 0.1
 #: Largest accepted relative error after the refit, as the mean over the actuators.
 MAX_ERROR = 0.7
@@ -146,8 +147,9 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     excited = fit.excited
     if not np.any(excited):
         raise RecordingError(
-            f"{recording.source or 'recording'}: no actuator moves in both directions. Each direction requires "
-            f"{100 * MIN_SHARE:.0f} % of the time and an RMS speed of {REST_SPEED[0]:g} rad/s ({REST_SPEED[1]:g} m/s)."
+            f"{recording.source or 'recording'}: no actuator moves in both directions. Required: each direction for at "
+            f"least {100 * MIN_SHARE:.0f} % of the time, and an RMS speed of at least {REST_SPEED[0]:g} rad/s "
+            f"({REST_SPEED[1]:g} m/s)."
         )
     refuse_opposite_efforts(recording, fit.names, fit.tau, fit.expected)
     before = fit.error(fit.unchanged)

@@ -191,7 +191,7 @@ def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
         qd = None if recording.qd is None else recording.qd[:, order]
         other = replace(recording, q=recording.q[:, order], qd=qd, tau=recording.measured_effort()[:, order])
         gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
-        yield _exchange(arm, (i, j), f"all signals of channels {i + 1} and {j + 1}", gain)
+        yield _exchange(arm, (i, j), f"all signals (q, qd, tau) of channels {i + 1} and {j + 1}", gain)
 
 
 def _exchanged(n: int, i: int, j: int) -> NDArray[np.int_]:
@@ -233,7 +233,10 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
         qd = None if recording.qd is None else recording.qd * signs
         other = replace(recording, q=recording.q * signs, qd=qd, tau=recording.measured_effort() * signs)
         gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
-        what = f"all signals of channel {i + 1} have the wrong sign. The arm model fits much better with opposite signs"
+        what = (
+            f"all signals (q, qd, tau) of channel {i + 1} have the wrong sign. The arm model fits much better with "
+            "opposite signs"
+        )
         advice = "Correct the columns of the file and check it again."
         yield Finding("refusal", "inverted channel", arm.joint_names[i], what, advice, (i,), gain)
 

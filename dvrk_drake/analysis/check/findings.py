@@ -16,7 +16,7 @@ class Finding:
 
     Attributes:
         severity: "note" for information, "warning" if results will be less accurate, "refusal" if results would be
-            wrong.
+            wrong. `identify` rejects a recording with a refusal.
         kind: Short, stable name of the finding, e.g. "repeated rows".
         where: Affected joints, columns or rows, or source of the recording.
         what: Description of the problem with numbers, without a final period.

@@ -1,4 +1,4 @@
-"""Validates a dynamic model on a motion, and divides the error into parts with different causes."""
+"""Validates a dynamic model on a motion, and estimates the shares of the error that have different causes."""
 
 from __future__ import annotations
 

@@ -28,7 +28,8 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Confidence level of the reported intervals.
 CONFIDENCE = 0.95
-#: Largest ratio of the cross-validated errors of two links that explain the change of the efforts equally well.
+#: Largest ratio of the cross-validated errors for payloads on two links that explain the change of the efforts equally
+#: well.
 SAME_ERROR = 1.05
 #: Smallest relative RMS difference between the efforts of two different recordings.
 MIN_DIFFERENCE = 1e-6
@@ -48,7 +49,8 @@ class PayloadActuator:
         change: Difference between the efforts of the recordings.
         payload: Effort of the payload.
         left: Residual after subtracting the payload and the changes of the drive.
-        explained: Explained share 1 - left^2 / change^2 [1], or None if the payload does not load the actuator.
+        explained: Share of the squared change that is explained, 1 - left^2 / change^2 [1], or None if the payload does
+            not load the actuator.
     """
 
     name: str
