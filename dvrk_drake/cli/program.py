@@ -119,4 +119,5 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
             message += f". {suggestion[0]}"
         elif error.argument.name == renamed.get(""):
             message += ": it was a positional argument before"
-    return f"dvrk-drake: error: {message}; see {f'dvrk-drake {name}'.rstrip()} --help"
+    see = " See" if message.endswith("?") else "; see"
+    return f"dvrk-drake: error: {message}{see} {f'dvrk-drake {name}'.rstrip()} --help"

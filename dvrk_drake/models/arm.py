@@ -158,7 +158,7 @@ class Arm:
             yield coupled_limit_fault(self, limit)
         for name, row in self.friction_coordinates.items():
             if not np.any(row):
-                yield f"friction_coordinates.{name}: all coefficients are 0; allowed: at least one other value"
+                yield f"friction_coordinates.{name}: all coefficients are 0; at least one must be nonzero"
         yield number_fault(self)
         _checked_gravity(self.gravity)
         if len(self.coupled_limits) > 1 and not can_meet_coupled_limits(self):
@@ -498,7 +498,7 @@ def _row(path: Path, key: str, terms: dict[str, float], joints: list[str]) -> ND
     for joint, coefficient in terms.items():
         row[_index(path, key, joint, joints)] = coefficient
     if not np.any(row):
-        raise ArmError(f"{path}: {key}: all coefficients are 0; allowed: at least one other value")
+        raise ArmError(f"{path}: {key}: all coefficients are 0; at least one must be nonzero")
     return row
 
 

@@ -25,8 +25,8 @@ class DriveEffect:
         kind: Kind of effect, see `dvrk_drake.dynamics.actuator_effects.EFFECT_KINDS`.
         scale: Parameter whose meaning depends on the kind: width of the smoothed sign function [rad/s, m/s], travel
             before sliding [rad, m], linear range of a spring [rad, m], or number of periods per revolution.
-        coefficient: Coefficient of the effect. The unit depends on the kind: N m, N m s/rad or N m/rad, with N and m
-            for a prismatic coordinate.
+        coefficient: Coefficient of the effect. The unit depends on the kind: N m, N m s/rad or N m/rad, or N, N s/m or
+            N/m for a prismatic coordinate.
         standard_error: Standard error of the coefficient, in the same unit; 0 if the effect was not identified.
     """
 

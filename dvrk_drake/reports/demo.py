@@ -22,7 +22,7 @@ With a real arm:
 4. Disable the gravity compensation of the dVRK controller. Otherwise gravity is
    compensated twice. Keep a hand on the emergency stop.
 5. Only if no verdict is "do not use":
-   dvrk-drake run --arm {arm} --model model.yaml --mode gravity"""
+   dvrk-drake run --arm {arm} --model model.yaml --mode damped"""
 
 
 def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: bool = False) -> None:

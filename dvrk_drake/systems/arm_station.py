@@ -298,7 +298,10 @@ class ArmStation(Diagram):
 def plant_config_fault(config: MultibodyPlantConfig) -> str:
     """Returns the reason why a configuration is not valid for a station's plant, or "" if it is valid."""
     if not 0 < config.time_step <= 0.01:
-        return f"time_step must be above 0 and at most 0.01 s (the wrist is unstable with larger steps); got {config.time_step}"
+        return (
+            f"time_step must be above 0 and at most 0.01 s (the wrist is unstable with larger steps); "
+            f"got {config.time_step}"
+        )
     if config.discrete_contact_approximation == "tamsi":
         return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
     if config.use_sampled_output_ports:

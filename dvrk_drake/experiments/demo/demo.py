@@ -58,7 +58,7 @@ class DemoPlan:
         effects: Effects of the ground-truth arm that are not in the nominal model.
         release: Pose (n,) of the release [rad, m].
         step: Start pose (n,) of the step to `home` [rad, m].
-        home: Final pose (n,) of the release and of the step [rad, m].
+        home: Desired pose (n,) at the end of both simulations, release and step [rad, m].
         step_title: Title of the plot of the step.
         closure: Method for closing the loops of the ground-truth arm's linkage, see `add_arm`.
     """

@@ -83,7 +83,7 @@ class Comparison:
     responses: Mapping[str, Response]
 
     def table(self, name: str, measure: str) -> NDArray[np.float64]:
-        """Returns one field of `StepMeasures` for the gains `name` as an array (c, p, n)."""
+        """Returns the field `measure` of `StepMeasures` for the gains with this name, as an array (c, p, n)."""
         return np.array([[getattr(m, measure) for m in poses] for poses in self.measures[name]])
 
     def best(self, names: Iterable[str]) -> str:

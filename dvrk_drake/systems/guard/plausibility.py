@@ -91,7 +91,7 @@ class PositionJump:
         self._tolerance, self._fastest, self._jitter = tolerance, 1.5 * speed_limit, settings.jitter
 
     def begin(self, sample: Sample) -> None:
-        """Returns None, because this check has no state."""
+        """Returns None as the initial state, because this check has no state."""
 
     def check(self, sample: Sample, state: None) -> tuple[None, Mask]:
         """See `Check.check`."""
