@@ -9,7 +9,8 @@ class DvrkDrakeError(Exception):
     For these errors, the command line exits with code 2.
 
     Attributes:
-        findings: Findings of `check` for the recording that caused the error. `str(finding)` is a text of one line.
+        findings: Findings of `check` for the recording that caused the error, or an empty tuple if there are none.
+            `str(finding)` is a text of one line.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -56,7 +57,7 @@ class ScenarioError(DvrkDrakeError):
 
 
 class CollectionError(DvrkDrakeError):
-    """Error for poses that cannot be reached, or a collection of measurements that cannot be continued."""
+    """Error for poses that the arm cannot reach, or for a run of `collect` that cannot be started or continued."""
 
 
 class StudyError(DvrkDrakeError):

@@ -49,7 +49,7 @@ def identify(
     Raises:
         RecordingError: The recording does not fit the arm, or `check` rejects the recording. The attribute `findings`
             of the error contains the reasons.
-        IdentificationError: The recording does not determine a model.
+        IdentificationError: No model is identifiable from the recording.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -90,8 +90,8 @@ def _friction_in_segments(result: StaticIdentification, measured: NDArray[np.boo
     if measured is None or not commanded:
         return ()
     what = (
-        "friction in low-speed segments is not separated from gravity, so the torque of "
-        f"{', '.join(commanded)} may be less accurate than zero torque at other poses"
+        "friction in low-speed segments is not separated from gravity, so at other poses, the model torque of "
+        f"{', '.join(commanded)} may be less accurate than zero torque"
     )
     advice = "Cross-validation does not detect this error. Validate the model on static poses before you use it."
     return (Finding("warning", "low-speed segments", result.recording.source or "recording", what, advice),)

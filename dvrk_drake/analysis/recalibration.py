@@ -26,16 +26,17 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Number of folds for cross-validation. A motion that repeats is divided by its phase.
+#: Number of folds for cross-validation. The folds of a periodic motion are intervals of its phase.
 FOLDS = 4
-#: Prior standard deviation of a friction factor (prior mean 1), and prior standard deviation of the change of an offset
-#: as a share of the RMS effort (prior mean 0).
+#: Prior standard deviations. The first is that of a friction factor, with prior mean 1. The second is that of the
+#: change of an offset, as a share of the RMS effort, with prior mean 0.
 SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
 #: Assumed RMS residual of the fit, as a share of the RMS effort.
 _RELATIVE_ERROR = 0.1
 #: Assumed correlation time of the residuals [s]. Residuals are correlated because they are mainly model errors.
 _CORRELATION_TIME = 0.1
-#: Smallest share of the time that an actuator must move in each direction. Otherwise, its friction is not fitted.
+#: Smallest share of the time during which an actuator must move in each direction. Otherwise, its friction is not
+#: fitted.
 MIN_SHARE = 0.1
 #: Largest accepted relative error after the refit, as the mean over the actuators.
 MAX_ERROR = 0.7
@@ -76,8 +77,8 @@ class Recalibration(ModelResult):
 
     Attributes:
         actuators: Recalibration of the actuators, in the arm's order.
-        shared: Factors by which the friction changes at coordinates that several actuators move, for example "finger_1
-            dry" [1].
+        shared: Factors by which the friction changes at coordinates that several actuators move [1]. An example of a
+            key is "finger_1 dry".
         seconds: Duration of the motion without the first and the last second [s].
     """
 
@@ -131,7 +132,7 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
 
 
 def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
-    """Fits factors of dry and viscous friction for every coordinate, and a change of the offset for every actuator.
+    """Fits factors of the dry and viscous friction at every coordinate, and a change of the offset of every actuator.
 
     Rigid bodies, springs and cables do not change. The errors are cross-validated over `FOLDS` folds of the motion. If
     the error of an actuator does not decrease, the offset of this actuator and the friction at all of its coordinates
@@ -146,8 +147,9 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     excited = fit.excited
     if not np.any(excited):
         raise RecordingError(
-            f"{recording.source or 'recording'}: no actuator moves in both directions. Each direction requires "
-            f"{100 * MIN_SHARE:.0f} % of the time and an RMS speed of {REST_SPEED[0]:g} rad/s ({REST_SPEED[1]:g} m/s)."
+            f"{recording.source or 'recording'}: no actuator moves in both directions. Required: each direction for at "
+            f"least {100 * MIN_SHARE:.0f} % of the time, and an RMS speed of at least {REST_SPEED[0]:g} rad/s "
+            f"({REST_SPEED[1]:g} m/s)."
         )
     refuse_opposite_efforts(recording, fit.names, fit.tau, fit.expected)
     before = fit.error(fit.unchanged)
@@ -209,7 +211,10 @@ def cross_validated_errors(
 
 
 class _Fit:
-    """Least-squares fit of x = (friction factors, changes of offsets), with the values of the model as prior means."""
+    """Least-squares fit of x (k + n,): k friction factors, then the changes of the n offsets.
+
+    The prior means are the values of the model.
+    """
 
     def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
         grid = motion_grid(recording, model.arm, model.section.signals)

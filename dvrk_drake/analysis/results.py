@@ -23,8 +23,8 @@ class ModelResult:
 
     Attributes:
         model: Identified or recalibrated model.
-        warnings: Findings about the recording or the fit that make the model less reliable. `str` of a finding is one
-            line.
+        warnings: Findings about the recording or the fit. They indicate that the model may be less accurate. `str` of a
+            finding is one line.
     """
 
     model: IdentifiedModel
@@ -87,7 +87,10 @@ class Validation(ABC):
     @property
     @abstractmethod
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each joint without excluded measurements [1], None if the effort is 0."""
+        """Ratio of RMS error to RMS measured effort of each joint [1], None if the effort is 0.
+
+        Excluded measurements are not used.
+        """
 
     @property
     def verdict(self) -> Verdict:
@@ -116,7 +119,8 @@ class Validation(ABC):
 
         Args:
             path: File of the model, or a new file.
-            overwrite: True to replace the verdicts of an earlier validation, or an existing file with another model.
+            overwrite: True to replace the verdicts of an earlier validation, or an existing file that contains another
+                model.
 
         Raises:
             ModelError: The model was identified from this recording, or the model already has verdicts and `overwrite`
@@ -151,7 +155,7 @@ class Prediction:
     """Result of `predict`.
 
     Attributes:
-        tau: Predicted efforts (m, n), in the coordinates of the recording [N m; N].
+        tau: Predicted efforts (m, n), in the coordinates of the recording [N m, N].
         warnings: Findings of `check`. `str` of a finding is one line.
     """
 

@@ -89,7 +89,7 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
             finished share of the step (0 to 1).
 
     Returns:
-        Result with efforts `tau` (m, n) [N m; N] in the coordinates of the recording, and `warnings`. For a motion and
+        Result with efforts `tau` (m, n) [N m, N] in the coordinates of the recording, and `warnings`. For a motion and
         a model with dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification.
         Otherwise, `tau` contains holding torques.
 

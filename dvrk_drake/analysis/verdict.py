@@ -1,4 +1,4 @@
-"""Judges from the error of a model on a recording whether the model torque of a joint may be commanded.
+"""Judges whether the model torque of a joint may be commanded, from the error of the model on a recording.
 
 docs/benchmarks.md contains the evidence for the thresholds.
 """
@@ -21,8 +21,8 @@ GOOD_RATIO = 0.35
 USABLE_RATIO_AT_REST = 1.0
 #: Largest ratio for the verdict "usable" in motion, where the model includes friction.
 USABLE_RATIO_IN_MOTION = 0.5
-#: Largest RMS error, as a share of the effort limit, for the verdict "usable" at any ratio. Friction holds the joint
-#: despite such an error.
+#: Largest RMS error, as a share of the effort limit, for the verdict "usable" at any ratio. Friction holds the joint at
+#: rest despite such an error.
 SMALL_ERROR = 0.02
 
 
@@ -30,9 +30,9 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
     """Returns the verdict on one joint.
 
     Args:
-        effort: RMS measured effort [N m; N], which is also the RMS error of zero torque. 0 if no effort was measured.
-        error: RMS of measured minus predicted effort [N m; N], NaN if unknown.
-        effort_limit: Effort limit of the joint [N m; N].
+        effort: RMS measured effort [N m, N], which is also the RMS error of zero torque. 0 if no effort was measured.
+        error: RMS of measured minus predicted effort [N m, N], NaN if unknown.
+        effort_limit: Effort limit of the joint [N m, N].
         in_motion: True if the recording is a motion and the model has dynamics.
         commanded: False if identification disabled the feedforward of this joint.
     """
@@ -66,9 +66,9 @@ def worst(verdicts: Mapping[str, Verdict]) -> tuple[Verdict, list[str]]:
 
 
 def unfit(verdicts: Mapping[str, str], required: Requirement) -> list[str]:
-    """Returns the joints that do not meet a requirement, with their verdicts.
+    """Returns the joints that do not meet a requirement, each as "name (verdict)".
 
-    The verdict "off" meets every requirement.
+    The verdict "off" meets every requirement, because the model commands no torque.
     """
     accepted = ("good", "off") if required == "good" else ("good", "usable", "off")
     return [f"{name} ({verdict})" for name, verdict in verdicts.items() if verdict not in accepted]

@@ -112,7 +112,7 @@ Key = Annotated[
     str | None,
     Parameter(
         metavar="FILE",
-        help="Key file to sign and verify messages, created by the command key. "
+        help="File with the key to sign and verify messages. dvrk-drake key creates this file. "
         "The arm and the controller need the same key.",
     ),
 ]

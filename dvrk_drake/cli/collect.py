@@ -76,7 +76,7 @@ def collect(
     After an interruption, run the same command again to continue.
 
     Args:
-        poses: Pose file. With --output, the arm moves to its poses. With --teach or --random, poses are added to it.
+        poses: Pose file. With --output, the arm moves to the poses in this file. --teach and --random add poses to it.
         output: Move the arm to each pose of the pose file, and append one row per pose to this CSV file.
         teach: Compensate gravity while you move the arm by hand. Press Enter to add the current pose to the pose file.
         random: Add N random poses to the pose file.

@@ -153,7 +153,7 @@ def validate(
 
         plot_validation(folder, validation)
     console = make_console()
-    print_validation(console, validation, model_path=model, verbose=verbose)
+    print_validation(console, validation, model_path=model, saved=save, verbose=verbose)
     if validation.note:
         console.print(validation.note)
     print_warnings(console, validation.warnings)

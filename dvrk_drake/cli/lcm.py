@@ -121,9 +121,9 @@ def run(
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
         gains: Gains file from the command tune, for the modes damped and hold. Default: the gains of the arm file.
-        friction_ratio: Share of friction to compensate in mode gravity, 0 to 0.6. It is lower if the arm could creep.
+        friction_ratio: Share of friction to compensate in mode gravity, 0 to 0.6. It is reduced if the arm could creep.
         hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
-        friction_model: Model that contains the friction, identified from a motion. Default: the model of --model.
+        friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.
     """
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
@@ -244,7 +244,7 @@ def ready_controller(
         controlled: Options of the command.
         mode: Control mode.
         friction: Compensator of friction and hysteresis. None: friction is not compensated.
-        gains: Gains for holding. None: the default gains of the arm.
+        gains: Gains for damping and pose regulation. None: the gains of the arm file.
 
     Raises:
         ModelError: The model belongs to another arm.

@@ -78,8 +78,8 @@ def run(arguments: Sequence[str] | None) -> int:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # The reader of the output (e.g. head) closed the pipe. The exit code must not be 0, because a verdict may have
-        # failed.
+        # The reader of the output (e.g. head) closed the pipe. The exit code must not be 0, because the command may
+        # have ended before it checked --require.
         sys.stderr.close()
         return 128 + signal.SIGPIPE
     except OSError as error:  # for example a full disk
@@ -119,4 +119,5 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
             message += f". {suggestion[0]}"
         elif error.argument.name == renamed.get(""):
             message += ": it was a positional argument before"
-    return f"dvrk-drake: error: {message}; see {f'dvrk-drake {name}'.rstrip()} --help"
+    see = " See" if message.endswith("?") else "; see"
+    return f"dvrk-drake: error: {message}{see} {f'dvrk-drake {name}'.rstrip()} --help"

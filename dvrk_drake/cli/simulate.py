@@ -100,7 +100,7 @@ def study(
 
     Args:
         study: YAML file of the study.
-        output: Results file, .csv or .parquet. If it contains runs of this study, only missing runs are simulated.
+        output: Results file, .csv or .parquet. If it exists, only missing runs of the study are simulated.
         workers: Number of processes on this computer, 1 to 1024. Default: one per core.
         scheduler: Address of a Dask cluster that runs the study, e.g. tcp://host:8786.
     """

@@ -92,7 +92,7 @@ def load_key(path: str | None) -> MessageKey | None:
 
 
 def check_output(path: str, *inputs: str, overwrite: bool) -> None:
-    """Checks an output path before work begins. Rejects an existing file, an input, and a path that is not writable.
+    """Checks an output path before work begins. Rejects an existing file, an input file, and an unwritable path.
 
     Args:
         path: Path of the output.
@@ -120,7 +120,7 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
 
 
 def _refuse_twice(path: str) -> None:
-    """Rejects a second output of this command with the same name."""
+    """Rejects a second output of the running command with the same path."""
     if (target := Path(os.path.realpath(path))) in _outputs:
         raise DvrkDrakeError(f"{path}: is given for two outputs; choose a different path for one of them")
     _outputs.add(target)
@@ -129,9 +129,9 @@ def _refuse_twice(path: str) -> None:
 #: Maximum number of progress bars on a terminal. Finished steps are removed first.
 MAX_BARS = 6
 
-#: Paths of the outputs of this command.
+#: Paths of the outputs of the running command.
 _outputs: set[Path] = set()
-#: Folders that this command created. Each folder precedes its parent.
+#: Folders that the running command created. Each folder precedes its parent.
 _made: list[Path] = []
 
 
@@ -261,7 +261,7 @@ class Steps:
             console=console,
             transient=True,
             disable=not console.is_terminal,
-            speed_estimate_period=600,  # one run of a study may take a minute
+            speed_estimate_period=600,  # long, because one run of a study may take a minute
         )
 
     def __enter__(self) -> Steps:

@@ -1,7 +1,7 @@
 """Models of friction, cable and spring torques in the drive. Each model is linear in one coefficient.
 
 An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`). The coordinate is the position of an
-actuator, the position of a joint, or a combination of joint positions that the arm's files name. The effect adds
+actuator, the position of a joint, or a combination of joint positions that the arm's files define. The effect adds
 coefficient * shape(x, v, state) to the effort along its coordinate. A shape that depends only on position is defined by
 an expression. A shape that depends on velocity or on a state is computed step by step.
 """
@@ -36,10 +36,11 @@ class EffectKind:
         dissipative: True if the effect dissipates energy in all motions. The coefficient of such an effect must not be
             negative.
         revolute: True if the kind is allowed for revolute coordinates only.
-        loaded: True if the shape is multiplied by the load of the coordinate [N m, N].
+        loaded: True if the shape is multiplied by the load, which is the magnitude of the effort along the coordinate
+            [N m, N].
         code: Code of the kind in `effect_step`. It is 0 for kinds that depend on position only.
         position_shape: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None.
-            Effects with this function also act at rest. The argument f provides sin, cos, Min and Max for numbers or
+            Effects of such a kind also act at rest. The argument f provides sin, cos, Min and Max for numbers or
             symbols.
     """
 
@@ -200,9 +201,9 @@ def _run_effect(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale
 
 
 def distinct_coordinates(arm: Arm) -> list[str]:
-    """Returns the names of all coordinates, except coordinates that are proportional to a preceding coordinate.
+    """Returns the names in `Arm.effect_coordinates`, without coordinates that are proportional to a previous one.
 
-    The actuators come first, so all of them are included.
+    The positions of the actuators come first, so all of them are included.
     """
     rows = arm.effect_coordinates
     kept: list[str] = []

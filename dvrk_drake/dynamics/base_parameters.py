@@ -67,13 +67,14 @@ class BaseParameters:
 def independent_columns(
     regressor: NDArray[np.float64], tolerance: float = 1e-9
 ) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
-    """Returns indices of independent columns of a regressor, and the combinations that give all columns.
+    """Returns indices of linearly independent columns of a regressor, and the combinations that give all columns.
 
     The indices `columns` (b,) and the matrix B (b, p) satisfy regressor = regressor[:, columns] B.
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
-        tolerance: Largest norm of the independent part of a dependent column, relative to the largest column norm.
+        tolerance: Relative tolerance. A column is dependent if the norm of its component that is orthogonal to the
+            chosen columns is at most `tolerance` times the largest column norm.
     """
     R, pivots = scipy.linalg.qr(regressor, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > tolerance * abs(R[0, 0])))
@@ -92,9 +93,9 @@ def reduce_to_base(
 ) -> BaseParameters:
     """Computes base parameters whose regressor columns come as early as possible in `preference`.
 
-    The method is a QR decomposition. Its pivots are chosen in the order of `preference` instead of by magnitude. For an
-    exact regressor, the order affects only the form of the base parameters. Reference: Gautier, "Numerical calculation
-    of the base inertial parameters of robots" (1991).
+    The method is a QR decomposition. Its pivots are chosen in the order of `preference` instead of by magnitude.
+    Without rounding errors, the order affects only the form of the base parameters. Reference: Gautier, "Numerical
+    calculation of the base inertial parameters of robots" (1991).
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
@@ -102,7 +103,8 @@ def reduce_to_base(
         preference: Permutation of the column indices 0 to p - 1, most preferred column first.
         lengths: Name -> coefficient, such as a length [m] or a product of lengths. In the names of base parameters, the
             name replaces the value of the coefficient.
-        tolerance: Largest norm of the independent part of a dependent column, relative to the largest column norm.
+        tolerance: Relative tolerance. A column is dependent if the norm of its component that is orthogonal to the
+            chosen columns is at most `tolerance` times the largest column norm.
     """
     scale = np.linalg.norm(regressor, axis=0).max()
     columns: list[int] = []

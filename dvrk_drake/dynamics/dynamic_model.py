@@ -25,7 +25,9 @@ from dvrk_drake.models.schema_fault import number_fault
 def effect_shapes(
     regressor: DynamicRegressor, effects: Sequence[ActuatorEffect], q: ArrayLike, v: ArrayLike
 ) -> Iterator[NDArray[np.float64]]:
-    """Yields the shape (m,) of each effect along its coordinate, starting from state 0.
+    """Yields the shape (m,) of each effect, which is its effort along its coordinate for a coefficient of 1.
+
+    Effects with a state start from state 0.
 
     The coordinate is x = h a for actuator positions a. The load of the coordinate is |h tau| / (h h). Here, tau are the
     actuator efforts that compensate gravity according to the SDF.
@@ -65,7 +67,7 @@ class DynamicModel:
 
     Attributes:
         arm: Arm of the model, with the gravity vector of `section`.
-        section: Parameters of the model.
+        section: Section of the model file that contains the parameters.
         regressor: Regressor of the rigid-body dynamics.
         parameters: Parameters phi (p,) of `regressor`.
         effects: Effects in the order of `coefficients`.

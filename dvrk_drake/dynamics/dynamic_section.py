@@ -102,6 +102,8 @@ class SignalSettings:
 class DynamicSection:
     """Identified dynamics of an arm: tau_actuator = J'^-1 Y(q, v, vd) phi + effects.
 
+    J is the matrix of `Arm.transmission`. Y and phi are the regressor and the parameters of `DynamicRegressor`.
+
     `gravity` is the gravity vector that was estimated from the motion, in the base frame [m/s^2]. `gravity_expected` is
     the vector that was assumed before identification. The two vectors differ if the base was tilted. `base_parameters`
     are the identifiable combinations of link and rotor parameters. `correlations` lists pairs of parameters that are

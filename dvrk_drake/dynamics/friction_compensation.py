@@ -25,8 +25,8 @@ HOLDING_SPEED = 0.25
 MAX_RATIO = 0.6
 #: Largest share of the hysteresis effects (see `Friction.springs_back`) that may be compensated.
 MAX_HYSTERESIS_RATIO = 0.9
-#: Assumed ratio of the largest error of the holding torque to the leave-one-out RMS error of a model. The ratio is
-#: rarely larger on simulated arms.
+#: Assumed ratio of the largest error of the holding torque to the leave-one-out RMS error of a model. On simulated
+#: arms, the actual ratio is rarely larger.
 HOLDING_ERROR_FACTOR = 2.0
 
 
@@ -147,10 +147,11 @@ def safe_ratios(
         friction: Friction of the arm.
         ratio: Requested ratio, 0 to `MAX_RATIO`.
         holding_error: Largest error (n,) of the gravity compensation [N m, N].
-        hysteresis_ratio: Requested ratio of effects with `Friction.springs_back`, 0 to `MAX_HYSTERESIS_RATIO`. Values
-            up to `ratio` are ignored. These effects do not hold a released arm at its pose, so compensating them does
-            not reduce the holding friction. The total compensation along a coordinate is at most `MAX_RATIO` times the
-            friction along this coordinate, excluding viscous friction. Hysteresis is compensated before other friction.
+        hysteresis_ratio: Requested ratio of effects with `Friction.springs_back`, 0 to `MAX_HYSTERESIS_RATIO`. If it is
+            at most `ratio`, it has no effect. These effects do not hold a released arm at its pose, so compensating
+            them does not reduce the holding friction. The total compensation along a coordinate is at most `MAX_RATIO`
+            times the friction along this coordinate, excluding viscous friction. Hysteresis is compensated before other
+            friction.
 
     Returns:
         Ratios (k,) of the effects.

@@ -63,8 +63,9 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
 
     Args:
         arm: Arm whose gravity vector specifies the orientation of the base.
-        frames: Prefix of the SDF frames in which the parameters are expressed: "dh" (dVRK) or, for an MTM, "paper".
-        serial: True to omit the links of the linkage (crank, coupler), as in the paper.
+        frames: Prefix of the SDF frames in which the parameters are expressed: "dh" for the DH frames of the dVRK or,
+            for an MTM, "paper" for the frames of Rutfield et al. (2015).
+        serial: True to omit the links of the linkage (crank, coupler), as in Rutfield et al. (2015).
 
     Raises:
         ArmError: The SDF has no frames with this prefix, gravity is less than 1 m/s^2, or `serial` is True and a joint

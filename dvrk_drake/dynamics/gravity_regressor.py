@@ -1,4 +1,7 @@
-"""Derives the gravity torque and its regressor symbolically from an arm's MultibodyPlant (paper, III.B-D, H)."""
+"""Derives the gravity torque and its regressor symbolically from an arm's MultibodyPlant.
+
+Reference: Rutfield et al., "Gravity Compensation Control of da Vinci Robot" (2015), sections III.B to III.D and III.H.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ GRAVITY = sympy.Symbol("g", positive=True)
 
 @dataclass(frozen=True, eq=False)
 class SymbolicGravity(GravityParameters):
-    """Symbolic gravity torque tau = Y(q) beta of the n independent joints, which holds the arm at rest.
+    """Symbolic torque tau = Y(q) beta that compensates gravity at the n independent joints.
 
     Attributes:
         q: Joint positions as symbols q1, ..., qn [rad, m].
@@ -48,7 +51,7 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
         arm, frames, serial: Arguments of `gravity_parameters`.
 
     Raises:
-        ArmError: `gravity_parameters` raises this error for the arguments.
+        ArmError: See `gravity_parameters`.
     """
     parameters = gravity_parameters(arm, frames, serial)
     plant = SymbolicPlant(arm, frames)

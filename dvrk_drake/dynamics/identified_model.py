@@ -80,8 +80,8 @@ class JointStatistics:
         rms_cross_validation_included: RMS error of 10-fold cross-validation without excluded measurements. The effects
             are selected again for each fold.
         num_excluded: Number of excluded measurements.
-        feedforward_scale: Factor of the joint's torque, 0 to 1. It is less than 1 if the recording does not fully
-            support a feedforward.
+        feedforward_scale: Factor of the joint's torque, 0 to 1. It is less than 1 if the model does not predict the
+            measured torque accurately, and 0 if the joint hardly moved.
         position_lower: Lower end of the position range that the recording covers.
         position_upper: Upper end of the position range that the recording covers.
         coverage: Ratio of this position range to the range of the joint limits.
@@ -110,7 +110,8 @@ class JointStatistics:
 class Provenance:
     """Origin of a model.
 
-    `sha256` is the hash of the recording's bytes. `condition_number` is inf if the regressor does not have full rank.
+    `sha256` is the hash of the recording's bytes. `poses` is the number of rows of the recording. `condition_number` is
+    inf if the regressor does not have full rank.
     """
 
     recording: str = ""
@@ -207,7 +208,8 @@ class IdentifiedModel(_Identified):
             arm: Arm whose SDF specifies the inertias.
             effects: Position-dependent effects, e.g. `arm.effects.cables + arm.effects.springs`. Not allowed together
                 with `dynamics`.
-            dynamics: True to include the full dynamics: rotors, and friction, cables and springs of `arm.effects`.
+            dynamics: True to include the full dynamics, with the rotors and with the friction, cables and springs of
+                `arm.effects`.
 
         Raises:
             ModelError: Both `effects` and `dynamics` are given.

@@ -16,7 +16,7 @@ from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_select
 
 
 def handle_frame(arm: Arm) -> str:
-    """Returns the name of the handle's frame. It is the last DH frame: dh_7 for an MTM, dh_6 for a PSM.
+    """Returns the name of the last DH frame: dh_7 (handle) for an MTM, dh_6 for a PSM.
 
     Raises:
         ArmError: The SDF has no frames dh_0, dh_1, ...
@@ -88,11 +88,12 @@ class PsmInverseKinematics:
     The solution is unique, except for full revolutions of the roll, if two conditions hold. The wrist centre is beyond
     the remote centre of motion (RCM), and |wrist_pitch| < 90 degrees.
 
-    The wrist link has the length L and connects the wrist pitch axis to the wrist yaw axis. The wrist link lies in a
-    plane with the shaft and is perpendicular to the yaw axis. Therefore the direction d of the wrist link is the
-    direction of the tip position without its component along the yaw axis. The wrist centre p_tip - L d lies on the
-    shaft, which passes through the RCM. The position of the wrist centre determines yaw, pitch and insertion. The
-    remaining rotation consists of roll, wrist pitch and wrist yaw about z, x and y.
+    The wrist centre is the intersection of the shaft and the wrist pitch axis. The tip is here the origin of the wrist
+    yaw link, which lies on the wrist yaw axis. The wrist link connects these two points and has the length L. It lies
+    in a plane with the shaft and is perpendicular to the yaw axis. Therefore its direction d is the direction of the
+    tip position without the component along the yaw axis. The wrist centre p_tip - L d lies on the shaft, which passes
+    through the RCM. The position of the wrist centre determines yaw, pitch and insertion. The remaining rotation
+    consists of roll, wrist pitch and wrist yaw about z, x and y.
 
     Lengths and the pose of the frame on its link are read from the arm's SDF.
     """

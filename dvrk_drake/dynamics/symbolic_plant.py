@@ -1,4 +1,4 @@
-"""Derives frames and potential energy of an arm as symbolic functions of the independent joint positions."""
+"""Derives link frames and potential energy of an arm as symbolic functions of the independent joint positions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SymbolicPlant:
         self._plant.SetPositions(self._context, q_plant)
 
     def frame_poses(self) -> dict[str, sympy.ImmutableDenseMatrix]:
-        """Returns label -> pose X_0F(q) (4, 4) of each link frame in frame 0 [m] (paper, II.A and III.B)."""
+        """Returns label -> pose X_0F(q) (4, 4) of each link frame in frame 0 [m] (Rutfield et al., 2015)."""
         zero = self.numeric.GetFrameByName(f"{self._frames}_0")
         X_W0 = zero.CalcPoseInWorld(self.numeric.CreateDefaultContext())
         X_0W = _exact_matrix(X_W0.inverse())

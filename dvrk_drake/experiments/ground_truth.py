@@ -1,6 +1,6 @@
-"""Ground-truth arms and the collection of static poses on them.
+"""Ground-truth arms, and functions that record static poses of a simulated arm.
 
-The links and effects of a ground-truth arm differ from the model of its controller.
+The links and effects of a ground-truth arm differ from those of the model that its controller uses.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ SAMPLE_SPACING = 0.01
 def pose_visit_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
     """Makes a trajectory through all poses, which stops at each pose for settling and sampling.
 
-    Between two poses, the trajectory is a straight line in joint space. Therefore it satisfies all linear limits that
-    the poses satisfy.
+    Between two poses, the trajectory is a straight line in joint space. If the poses satisfy the limits of the
+    arm, which are linear, the trajectory also satisfies these limits.
 
     Args:
         arm: Arm whose joint types determine the maximum speeds.
@@ -87,12 +87,12 @@ def collect_static_poses(
 ) -> Recording:
     """Moves an arm to poses under position control and records the holding effort at each pose.
 
-    These are steps 4 to 6 of section III.G of the paper.
+    These are steps 4 to 6 of section III.G of the paper (Rutfield et al., WPI 2015).
 
     Args:
         station: Simulated arm. It becomes part of a Diagram and cannot be used in another one.
         model: Model used by the controller. The integrator of the controller compensates the errors of this model.
-        poses: Poses (m, n) [rad, m] inside the limits (steps 1 to 3 of the section).
+        poses: Poses (m, n) [rad, m] inside the limits (steps 1 to 3 of section III.G).
         effort_noise: Standard deviation of the noise of one effort sample, as a share of the effort limit.
         generator: Random generator of the noise.
         progress: Function called with the finished share, 0..1.
@@ -132,7 +132,7 @@ class GroundTruth:
 
     Attributes:
         arm: Arm to simulate, with an SDF in the output folder and the `effects` of the real arm.
-        model: Exact model of the torque of gravity, cables and springs, used only for evaluation.
+        model: Exact model of the gravity, cable and spring torques, used only for evaluation.
         is_paper_arm: Whether the arm is identified from the paper's recording.
         origin: Origin of the arm, one sentence.
     """
@@ -147,10 +147,10 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
     """Identifies the paper's MTM from its recording and writes its SDF into `folder`.
 
     The links are physically consistent and have the identified gravity torque. They are as close as possible to the
-    links of our SDF. Cables and springs are those of the identified model. Static poses do not determine friction,
-    stops, encoders, motors and delays. These effects are those of `mechanisms/mtm.yaml`. Friction that is larger in one
-    direction causes a constant torque in static poses. Therefore the identified offset of joints with such friction is
-    omitted.
+    links of the SDF of this package. Cables and springs are those of the identified model. Friction, stops, encoders,
+    motors and delays are those of `mechanisms/mtm.yaml`, because static poses do not determine them. Friction that is
+    larger in one direction causes a constant torque in static poses, which is identified as an offset. The simulated
+    friction already contains this torque. Therefore the identified offset of a joint with such friction is omitted.
 
     Raises:
         RecordingError, IdentificationError, ModelError: The recording is not of an MTM at rest.
@@ -167,11 +167,11 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
     ground_truth_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (
-        "The ground-truth arm is the paper's MTM as identified from the paper's 72 poses (gravity, cables, springs), "
-        "with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are those of another "
-        "MTM. In the paper's recording, joint 6 has only friction torque. Joint 7 has a constant torque, which is the "
-        "difference of its friction between both directions. Therefore the ground-truth arm needs less compensation at "
-        "these joints than the real arm probably needs."
+        "The ground-truth arm is the paper's MTM. Its gravity, cables and springs are identified from the paper's 72 "
+        "poses. Its friction, stops, encoders, motors and delays are those of another MTM (`mechanisms/mtm.yaml`). In "
+        "the paper's recording, joint 6 has only friction torque. Joint 7 has a constant torque, which is the "
+        "difference of its friction between both directions. Therefore the ground-truth arm probably needs less "
+        "compensation at these joints than the real arm."
     )
     return GroundTruth(dataclasses.replace(ground_truth_arm, effects=effects), model, True, origin)
 
@@ -181,10 +181,10 @@ def _at_actuator(coordinate: str) -> str:
 
 
 def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
-    """Makes a ground-truth arm by random changes of the SDF's link masses by up to `SPREAD`; writes its SDF.
+    """Makes a ground-truth arm whose link masses differ randomly from the SDF by up to `SPREAD`; writes its SDF.
 
-    The perturbed MTM has no wrist spring. The spring of the arm's file balances a heavier wrist than that of the SDF.
-    With the wrist of the SDF, the torque of the spring would exceed the motor torque at many poses.
+    An MTM made by this function has no wrist spring. The spring in the arm file balances a heavier wrist than that of
+    the SDF. With the wrist of the SDF, the torque of the spring would exceed the motor torque at many poses.
     """
     arm = load_arm(name)
     links = perturbed_links(arm, np.random.default_rng(seed))
@@ -227,7 +227,10 @@ def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) 
 def damped_station(
     arm: Arm, ground_truth_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
 ) -> ArmStation:
-    """Makes a station that simulates a ground-truth arm with effects, and with joint damping instead of friction."""
+    """Makes a station for `arm` that simulates `ground_truth_arm` with viscous damping of all joints.
+
+    `effects` are simulated in addition. For `closure`, see `add_arm`.
+    """
     damping = arm.per_joint(0.03, 0.3) * arm.effort_limits
 
     def damp(plant: MultibodyPlant) -> None:
@@ -257,9 +260,9 @@ def collect(
 ) -> Recording:
     """Collects static poses of a ground-truth arm with all its effects.
 
-    Each pose is the mean over both approach directions. The controller uses the nominal model. The workers of the
-    executor collect chunks of poses in parallel. Each chunk has a separate start pose and separate noise, so the result
-    does not depend on the number of workers.
+    The arm approaches each pose from two opposite directions, and the recording contains the mean. The controller uses
+    the nominal model. The workers of the executor collect chunks of poses in parallel. Each chunk has a separate start
+    pose and separate noise, so the result does not depend on the number of workers.
     """
     arm = load_arm(name)
     poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)
@@ -273,7 +276,7 @@ def collect(
 
 
 def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
-    """Returns the means (m, 2n) of q and tau over both approach directions."""
+    """Returns rows (m, 2n) of q and tau, one per pose: means over two opposite approaches to the pose."""
     arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
     visited = np.concatenate([[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses])

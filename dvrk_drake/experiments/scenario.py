@@ -41,8 +41,8 @@ class ControllerScenario:
         model: Path of a model file. If empty, the controller uses the model of the SDF.
         compensated_effects: Effects of the arm ("cables", "springs") that are added to the model of the SDF. Not
             allowed together with `model`.
-        gains: Gains kp, kd, ki, one number per joint, instead of those of the arm. In a scenario file, this can be the
-            path of a gains file.
+        gains: Gains kp, kd, ki, one number per joint, instead of those of the arm file. In a scenario file, this can be
+            the path of a gains file.
         friction_ratio: Share of the arm's friction that is compensated, in mode "gravity" only; see `check_ratios`.
         hysteresis_ratio: Share of the wide hysteresis that is compensated, in mode "gravity" only; see `safe_ratios`.
         parameter_error: Relative error of the model. Each base parameter is multiplied by a random factor between
@@ -248,11 +248,12 @@ def check_pose(name: str, pose: list[float], arm: Arm) -> None:
 def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     """Reads a scenario, applies settings to it, and checks it.
 
-    For an arm instead of a scenario file, the controller regulates the home pose.
+    If an arm is given instead of a scenario file, the controller regulates the default start pose of `Scenario`.
 
     Args:
         arm_or_file: Path of a scenario file, name of an arm, or path of an arm file.
-        settings: Settings "key=value" in YAML. A dot separates a group from a key, e.g. "controller.mode=gravity".
+        settings: Settings "key=value", with the value in YAML. A dot separates a group from a key, e.g.
+            "controller.mode=gravity".
 
     Raises:
         ScenarioError: The file cannot be read, has an unknown key, or has an invalid value.

@@ -35,8 +35,8 @@ class Simulation:
     """Result of `simulate`.
 
     Attributes:
-        recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects` the measurements are exact, except
-            for the noise of tau.
+        recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects`, the measurements are exact,
+            except for the noise of tau.
         state_true: True state (m, 2n): positions [rad, m], then velocities [rad/s, m/s].
         hand: Torque [N m], then force [N] of the hand on the arm (m, 6) at the grasped frame, expressed in the base
             frame. Zero without a hand.
@@ -71,7 +71,7 @@ def simulate(
     """Simulates a controlled arm and records it. The same arguments give bitwise identical results.
 
     The desired motion between two poses is a cubic in time along a straight line in joint space. Therefore it stays
-    inside linear limits.
+    inside the limits of the arm, which are linear.
 
     Args:
         what: Arm that is regulated at a pose or moves to `targets`, or a scenario. With a scenario, the arguments from
@@ -90,7 +90,7 @@ def simulate(
         progress: Function called with the name of the step ("simulating") and its finished share, 0..1.
 
     Returns:
-        Recording of the measurements, true states, forces of the hand, and desired positions.
+        Measured recording, true states, forces of the hand, and desired positions.
 
     Raises:
         ScenarioError: An argument is invalid, e.g. a pose is outside the limits, or a setting is given together with a
@@ -101,7 +101,7 @@ def simulate(
         >>> import dvrk_drake as dvrk
         >>> arm = dvrk.load_arm("mtmr")
         >>> run = dvrk.simulate(arm, controller=dvrk.IdentifiedModel.from_arm(arm), effects=False, duration=0.5)
-        >>> run.recording.q.shape, bool(abs(run.recording.q).max() < 1e-3)  # regulates its home pose
+        >>> run.recording.q.shape, bool(abs(run.recording.q).max() < 1e-3)  # regulates its start pose
         ((51, 7), True)
     """
     if not isinstance(what, Arm | Scenario):
@@ -223,7 +223,7 @@ def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
 def scenario_of_arm(
     arm: Arm, effects: bool | Sequence[str], start: ArrayLike | None, targets: Sequence[tuple[float, ArrayLike]]
 ) -> Scenario:
-    """Returns the scenario of an arm for the arguments of `simulate`."""
+    """Converts an arm and other arguments of `simulate` to a scenario."""
     if isinstance(effects, bool):
         effects = ["all"] if effects else []
     return Scenario(
@@ -236,7 +236,7 @@ def scenario_of_arm(
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:
-    """Returns a trajectory that is at rest in `poses[i]` at `times[i]`, and stays at the last pose."""
+    """Returns a trajectory that is at rest at pose `poses[i]` at time `times[i]`, and stays at the last pose."""
     times, poses = np.append(times, max(duration, times[-1]) + 1.0), np.vstack([poses, poses[-1:]])
     return PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
 

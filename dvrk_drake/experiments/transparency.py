@@ -92,7 +92,7 @@ def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int =
     Args:
         arm: Arm whose limits apply.
         poses: Number of poses.
-        seconds_each: Time between two poses [s].
+        seconds_each: Time between consecutive poses [s].
         seed: Seed of the poses.
     """
     q = arm.sample_poses(poses, np.random.default_rng(seed), margin=0.25)
@@ -103,7 +103,7 @@ def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int =
 
 
 def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> PiecewisePolynomial:
-    """Returns the motion of a recording at `speed` times its original speed. Positions are clipped to the arm's limits.
+    """Returns the motion of a recording at `speed` times its original speed. Positions are clipped to the joint limits.
 
     Raises:
         ScenarioError: The recording has no times, the speed is out of range, or the motion exceeds the limits by more

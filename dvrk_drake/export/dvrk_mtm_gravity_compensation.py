@@ -1,4 +1,4 @@
-"""Implements the dVRK controller's gravity compensation of an MTM, and computes the controller's file from a model."""
+"""Gravity compensation of an MTM in the dVRK controller, and conversion of a model to the file of this controller."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONTROLLER_GRAVITY = 9.81
 NUM_GRAVITY = 10
 #: Order of the polynomials in a joint position.
 ORDER = 4
-#: Kinds of effects on shoulder_pitch that the first two columns of the regressor represent.
+#: Kinds of effects that the first two columns of the regressor represent, for the joint shoulder_pitch.
 _FIRST_EFFECTS = ("cable sine", "cable cosine")
 MTM_JOINTS = (
     "outer_yaw",
@@ -37,13 +37,13 @@ MTM_JOINTS = (
 
 @dataclass(frozen=True)
 class CompensationOptions:
-    """Entries of the controller's file that a model does not contain, and the accepted torque error.
+    """Entries of the gravity-compensation file that a model does not contain, and the largest accepted torque error.
 
     Attributes:
         coulomb: Coulomb friction (7,) of the joints [N m].
-        friction_ratio: Share of each joint's Coulomb friction (7,) that is compensated during a motion, 0 to 1.
-        dead_band, saturation: Speeds (7,) [rad/s], see `GravityCompensationFile`. The default values come from files of
-            the dVRK.
+        friction_ratio: Share of the Coulomb friction to compensate on each joint (7,) during a motion, 0 to 1.
+        dead_band, saturation: Speeds (7,) [rad/s], see `GravityCompensationFile`. The default values come from
+            gravity-compensation files of the dVRK.
         tolerance: Largest accepted difference between the torques of the file and of the model [N m].
     """
 
@@ -57,7 +57,7 @@ class CompensationOptions:
 def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
     """Returns the regressor R (m, 7, 40) at poses q (m, 7) [rad]. R times the parameters (40,) is the torque [N m].
 
-    The formula is from the class robGravityCompensationMTM of sawIntuitiveResearchKit.
+    The formula is from the class robGravityCompensationMTM of sawIntuitiveResearchKit, the software of the dVRK.
     """
     q = np.atleast_2d(np.asarray(q, dtype=np.float64))
     s4, s5, s6 = np.sin(q[:, 3:6]).T
@@ -101,13 +101,13 @@ def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
 
 
 def polynomial_columns(joint: int) -> slice:
-    """Returns the slice of the regressor columns 1, q, ..., q^4 of a joint with index 0 to 5."""
+    """Returns the slice of the five regressor columns (powers 0 to 4 of the position) of a joint with index 0 to 5."""
     first = NUM_GRAVITY + (ORDER + 1) * joint
     return slice(first, first + ORDER + 1)
 
 
 def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Returns the torque (m, 7) of the file before it is clipped to the torque limits [N m].
+    """Returns the torque (m, 7) that the controller computes from a file, before clipping to the torque limits [N m].
 
     Args:
         file: Content of the file.
@@ -131,10 +131,11 @@ def compensation_from_model(
 ) -> GravityCompensationFile:
     """Converts a model to a gravity-compensation file of the controller.
 
-    The ten gravity columns represent the gravity torque exactly if the MTM is upright and its last link is balanced
-    about the roll axis. Polynomials in the joint positions approximate the additional gravity torque of a tilted base.
-    The constant term of a polynomial represents the offset torque of its joint. The first two columns represent the
-    cable torque of shoulder_pitch. Polynomials approximate all other effects that depend on one joint position.
+    The ten gravity columns of `controller_regressor` represent the gravity torque exactly if the MTM is upright and its
+    last link is balanced about the roll axis. Polynomials in the joint positions approximate the additional gravity
+    torque of a tilted base. The constant term of each joint's polynomial represents the offset torque of this joint.
+    The first two columns represent the cable torque of shoulder_pitch. Polynomials approximate all other effects that
+    depend on one joint position.
 
     The torque limits are the range of the torque within the joint limits, including Coulomb friction. This range is
     extended by 10 % of its width at both ends, up to the effort limits of the arm. The torque of joint 7 is zero.
@@ -191,7 +192,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
 
 
 def largest_differences(file: GravityCompensationFile, model: IdentifiedModel) -> NDArray[np.float64]:
-    """Returns the largest torque difference (7,) between file and model at rest, within the joint limits [N m]."""
+    """Returns the largest torque difference (7,) between file and model at rest, at random poses [N m]."""
     poses = model.arm.sample_poses(4000, np.random.default_rng(1))
     return np.asarray(np.abs(controller_torque(file, poses) - model.holding_torque(poses)).max(axis=0))
 
@@ -205,8 +206,8 @@ def _gravity_torque(model: IdentifiedModel, q: NDArray[np.float64]) -> NDArray[n
 def _gravity_parameters(model: IdentifiedModel, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns parameters (40,) that approximate the gravity torque of the model.
 
-    The ten gravity parameters are fitted at random poses without joint limits. The polynomials approximate the residual
-    torque at `poses` (m, 7). This residual torque is small if the base is not tilted.
+    The ten gravity parameters are fitted at random poses, which may exceed the joint limits. The polynomials
+    approximate the residual torque at `poses` (m, 7). This residual torque is small if the base is not tilted.
     """
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (400, NUM_JOINTS))
     R = controller_regressor(q)[:, :, :NUM_GRAVITY]
@@ -278,7 +279,7 @@ def _check_errors(
     tilt = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
     limits = ["a last link balanced about its roll axis"]
     if tilt > 0.05:
-        limits.append(f"an upright base without the tilt of {tilt:.1f} deg")
+        limits.append(f"a base tilt of 0 instead of {tilt:.1f} deg")
     if np.any((model.feedforward_scale != 0) & (model.feedforward_scale != 1)):
         limits.append("feedforward scales of 0 or 1")
     reasons = {

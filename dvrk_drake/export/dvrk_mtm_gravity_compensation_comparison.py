@@ -28,9 +28,10 @@ _SIDE_JOINTS = slice(1, 4)
 #: For the four public files of MTMs, the error of a model of the wrong side is 1.8 to 2.1 times the error of a model of
 #: the correct side.
 _MAX_ERROR_RATIO = 0.8
-#: Smallest number of poses inside the file's sweep. With fewer poses, the sides are compared at all poses.
+#: Smallest number of poses inside the file's sweep. If fewer poses are inside, model and mirror image are compared at
+#: all poses.
 _MIN_POSES = 200
-#: Smallest torque whose sign is compared, divided by the model's largest torque on this joint.
+#: Smallest torque whose sign is compared, divided by the model's largest torque on the same joint.
 SIGN_SHARE = 0.1
 #: Number of random poses at which file and model are compared.
 POSES = 20000
@@ -40,7 +41,8 @@ POSES = 20000
 class JointComparison:
     """Comparison of the torques of file and model on one joint, at rest and within the joint limits.
 
-    Torques are in N m. Shares are numbers of poses, divided by the number of all poses.
+    Torques are in N m. Each share is a number of poses divided by the number of all poses. The sweep of the file is
+    `GravityCompensationFile.sweep`.
 
     Attributes:
         name: Name of the joint.
@@ -75,14 +77,15 @@ class JointComparison:
 
 @dataclass(frozen=True, eq=False)
 class CompensationComparison:
-    """Comparison of a file and a model at the same random poses of the joint box.
+    """Comparison of the torques of a file and a model at random poses within the joint limits.
 
     Attributes:
         file, model: File and model that are compared.
         joints: One comparison per joint.
         q: Poses (m, 7) [rad], inside the joint box and the coupled limits.
         model_torque, file_torque, clipped_torque: Torques (m, 7) at rest [N m]. `file_torque` is not clipped.
-        clipped, opposed, runaway: Masks (m, 7), True for poses that the same attribute of `JointComparison` counts.
+        clipped, opposed, runaway: Masks (m, 7), True at the poses that `JointComparison` counts in the attribute of the
+            same name.
         in_sweep: Mask (m,), True for poses at which the first six joints are inside the file's sweep.
         other_side: True if the mirror image of the model fits the file clearly better than the model. The file then
             probably belongs to an arm of the other side (left or right).
@@ -144,12 +147,12 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
     clipped = tau_raw != tau_clipped
     opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > threshold) & (np.abs(tau_clipped) > threshold)
     runaway = (tau_raw < tau_model.min(axis=0) - half_range) | (tau_raw > tau_model.max(axis=0) + half_range)
-    # A joint without gravity torque has no torque range, and the file does not compensate the last joint.
+    # Excluded: joints without gravity torque, and the last joint, which the file does not compensate.
     compared = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
     runaway, opposed = runaway & compared, opposed & compared
     in_sweep = np.zeros(len(q), dtype=bool)
     if file.sweep is not None:
-        # The torque of the file does not depend on the last joint.
+        # The torque of the file does not depend on the position of the last joint.
         in_sweep = np.all(
             (q >= file.sweep[0]) & (q <= file.sweep[1]), axis=1, where=np.arange(NUM_JOINTS) < NUM_JOINTS - 1
         )

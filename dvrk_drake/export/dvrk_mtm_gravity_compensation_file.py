@@ -1,4 +1,4 @@
-"""Gravity-compensation file `gc-MTML-<serial>.json` of the dVRK's controller for an MTM."""
+"""Gravity-compensation file of the dVRK's controller for an MTM, for example `gc-MTML-<serial>.json`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NUM_PARAMETERS = 40
 _CONTROLLER = "GC_controller"
 #: Key of the arm's name. The controller does not read this key.
 _ARM_NAME = "ARM_NAME"
-#: Field of `GravityCompensationFile` -> key in the file. "sat_vec_vec" is spelled as in the controller's source.
+#: Field of `GravityCompensationFile` -> key in the file. "sat_vec_vec" is spelled as in the controller's source code.
 _KEYS = {
     "positive": "gc_dynamic_params_pos",
     "negative": "gc_dynamic_params_neg",
@@ -49,7 +49,7 @@ class GravityCompensationFile:
         torque_lower, torque_upper: Torque limits (7,) [N m].
         dead_band: Speeds (7,) [rad/s] below which both parameter vectors have equal weight.
         saturation: Speeds (7,) [rad/s] above which the weights differ by `friction_ratio`.
-        friction_ratio: Share of each joint's friction (7,) that is compensated during a motion, 0 to 1.
+        friction_ratio: Share of the friction to compensate on each joint (7,) during a motion, 0 to 1.
         sweep: Lower and upper joint positions (2, 7) [rad] in the recording from which the file was computed. None if
             the file does not contain these positions.
         arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if neither contains a name.
@@ -125,8 +125,8 @@ class GravityCompensationFile:
 
         Args:
             path: Path of the file.
-            arm_name: Name of the arm, e.g. "MTML". The controller does not read it.
-            origin: Source of the parameters. The controller does not read it.
+            arm_name: Name of the arm, e.g. "MTML". The controller does not read this name.
+            origin: Description of the source of the parameters. The controller does not read this text.
 
         Raises:
             ModelError: `check` rejects a field.

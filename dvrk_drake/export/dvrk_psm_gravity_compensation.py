@@ -59,10 +59,10 @@ class KinematicCompensation:
         alpha, A, theta, D: DH parameters (7,) at zero joint positions [rad, m].
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
-        error: Largest torque errors (3,) of yaw, pitch and insertion within the joint limits, with a straight
-            instrument (all instrument joints at zero) [N m, N m, N].
-        wrist: Largest change (3,) of the torques of yaw, pitch and insertion due to the positions of the instrument
-            joints [N m, N m, N]. The file does not represent this change.
+        error: Largest differences (3,) between the torques of file and model on yaw, pitch and insertion [N m, N m, N].
+            They are computed within the joint limits for a straight instrument (all instrument joints at zero).
+        wrist: Largest changes (3,) of the model's torques on these joints due to the positions of the instrument
+            joints [N m, N m, N]. The file does not represent these changes.
     """
 
     alpha: NDArray[np.float64]
@@ -96,7 +96,7 @@ class KinematicCompensation:
 
 
 def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> KinematicCompensation:
-    """Converts the gravity torque of yaw, pitch and insertion, with a straight instrument, to the controller's file.
+    """Converts the gravity torque of yaw, pitch and insertion to the controller's chain, for a straight instrument.
 
     Args:
         model: Model of a PSM.
@@ -187,7 +187,7 @@ def _frames(
     D: NDArray[np.float64],
     q: ArrayLike,
 ) -> NDArray[np.float64]:
-    """Returns the poses X_0i (7, 4, 4) of the link frames at yaw, pitch and insertion q (3,)."""
+    """Returns the poses X_0i (7, 4, 4) of the link frames at the positions q (3,) of yaw, pitch and insertion."""
     chain = CHAIN_FROM_ARM @ np.asarray(q, dtype=np.float64)
     X, frames = np.eye(4), []
     for i in range(len(NAMES)):

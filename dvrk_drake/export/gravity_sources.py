@@ -14,11 +14,11 @@ from dvrk_drake.dynamics.gravity_regressor import GRAVITY, SymbolicGravity
 
 
 def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) -> str:
-    """Returns base parameters, potential energy, gravity torque, regressor and link frames as LaTeX for amsmath.
+    """Returns LaTeX (package amsmath) of base parameters, potential energy, gravity torque, regressor and link frames.
 
     Args:
         gravity: Symbolic gravity torque.
-        frame_poses: Label -> pose X_0F (4, 4) of each link frame, from `SymbolicPlant.frame_poses`.
+        frame_poses: Mapping from the label of a link frame to its pose X_0F (4, 4), from `SymbolicPlant.frame_poses`.
     """
     short = _short_angles(gravity, *frame_poses.values())
     Y = sympy.Matrix(gravity.regressor).xreplace(short)
@@ -54,9 +54,9 @@ def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) 
 
 
 def to_python(gravity: SymbolicGravity) -> str:
-    """Returns a Python module with `gravity_torque(q, g, beta, out)` and `gravity_regressor(q, g, out)`.
+    """Returns Python source of `gravity_torque(q, g, beta, out)` and `gravity_regressor(q, g, out)`.
 
-    The module has no dependencies.
+    The source imports only the module math.
     """
     torque, regressor, arguments, beta_argument = _functions(gravity)
     entries = "".join(f"    ({value!r}, {name!r}),\n" for name, value in _named_values(gravity))
@@ -133,7 +133,7 @@ def _functions(
 
 
 def _named_values(gravity: SymbolicGravity) -> list[tuple[str, float]]:
-    """Returns (name and unit, value in the SDF) of each base parameter."""
+    """Returns the name with unit, and the value in the SDF, of each base parameter."""
     base = gravity.base
     return [(f"{n} [{u}]", float(v)) for n, u, v in zip(base.names, base.units, gravity.base_values, strict=True)]
 

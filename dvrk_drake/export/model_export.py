@@ -28,7 +28,8 @@ class ModelExport:
         model: Model that is exported.
         format: Format of the file.
         origin: Source of the model, written to the file.
-        bodies: Inertias of links and rotors, and omitted effects, of an SDF or URDF. None for other formats.
+        bodies: Inertias of links and rotors in an SDF or URDF, and effects that this file omits. None for other
+            formats.
         compensation: Content of a file for the dVRK's controller. None for SDF and URDF.
     """
 
@@ -111,10 +112,11 @@ def export_model(
         format: "sdf", "urdf", "dvrk-gc" or "dvrk-kinematic-gc". The last two are the gravity-compensation files of the
             dVRK's controller for an MTM and for a PSM. None selects SDF or URDF by the file name extension.
         origin: Source of the model, written to the file.
-        tolerance: Largest accepted torque error [N m, N] of a file for the dVRK's controller. None: 1e-6.
+        tolerance: Largest accepted difference [N m, N] between the torques of the model and of a file for the dVRK's
+            controller. None: 1e-6.
         friction: Coulomb friction (7,) [N m] to compensate, for "dvrk-gc". True uses the dry friction of the model's
             dynamics. False compensates no friction.
-        friction_ratio: Share of each joint's friction (7,) that is compensated, 0 to 1, for "dvrk-gc". None uses
+        friction_ratio: Share of the friction to compensate on each joint (7,), 0 to 1, for "dvrk-gc". None uses
             typical values.
         dead_band: Speeds (7,) [rad/s] below which no friction is compensated, for "dvrk-gc". None uses typical values.
         saturation: Speeds (7,) [rad/s] above which `friction_ratio` is fully compensated, for "dvrk-gc". None uses

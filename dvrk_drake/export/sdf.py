@@ -25,7 +25,7 @@ _UNCHANGED = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class LinkChange:
-    """Change of the inertia of one link by an export.
+    """Inertia of one link before and after an export.
 
     Attributes:
         link: Name of the link.
@@ -38,7 +38,7 @@ class LinkChange:
 
 
 def changed_links(arm: Arm, links: Sequence[LinkInertia]) -> list[LinkChange]:
-    """Returns the links whose inertial parameters differ from the arm's SDF.
+    """Returns the change of each link in `links` whose inertial parameters differ from those in the arm's SDF.
 
     Raises:
         ModelError: A link does not belong to the arm or is given twice.
@@ -89,7 +89,7 @@ def write_sdf(
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
 ) -> None:
-    """Writes the SDF of `with_inertias` atomically, and copies the meshes into the folder <name>_meshes beside it.
+    """Writes the SDF of `with_inertias` atomically, and copies its meshes into the folder <name>_meshes beside it.
 
     Args:
         arm, links, rotor_inertias: Arguments of `with_inertias`.
@@ -196,12 +196,12 @@ def refuse_existing_meshes(model_path: str | Path, overwrite: bool) -> None:
 
 
 def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, Path]:
-    """Replaces every mesh `<uri>` in a composed model by a path in `mesh_folder`, relative to the model file.
+    """Replaces every mesh `<uri>` in a model by a path in `mesh_folder`, relative to the model file.
 
-    URIs of other packages are not changed.
+    URIs of other packages, and URIs that are not file paths, are not changed.
 
     Args:
-        root: Composed model, which is modified.
+        root: Model from `with_inertias`, which is modified.
         model_path: Path of the file to which the model will be written.
 
     Returns:

@@ -50,7 +50,7 @@ def write_urdf(
 
 
 def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
-    """Converts a composed SDF model to the element `<robot>`.
+    """Converts a model from `with_inertias` to the URDF element `<robot>`.
 
     Raises:
         ModelError: URDF does not support a part of the SDF, such as a `<pose>` in a joint, a joint spring or an

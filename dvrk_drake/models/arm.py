@@ -158,7 +158,7 @@ class Arm:
             yield coupled_limit_fault(self, limit)
         for name, row in self.friction_coordinates.items():
             if not np.any(row):
-                yield f"friction_coordinates.{name}: all coefficients are 0; allowed: at least one other value"
+                yield f"friction_coordinates.{name}: all coefficients are 0; at least one must be nonzero"
         yield number_fault(self)
         _checked_gravity(self.gravity)
         if len(self.coupled_limits) > 1 and not can_meet_coupled_limits(self):
@@ -186,8 +186,9 @@ class Arm:
         return rows | {name: row @ J_inverse for name, row in self.friction_coordinates.items()}
 
     def encoder_counts(self) -> NDArray[np.float64]:
-        """Returns the size (n,) of one encoder count at each joint [rad, m]. It is 0 for an arm without
-        `effects.encoder`.
+        """Returns the size (n,) of one encoder count at each joint [rad, m].
+
+        The size is 0 for an arm without `effects.encoder`.
         """
         resolution = self.effects.encoder.resolution if self.effects.encoder is not None else {}
         return np.abs(self.transmission.inverse.matrix) @ per_actuator(resolution, self.joint_names, 0.0)
@@ -202,7 +203,7 @@ class Arm:
         return dry
 
     def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Returns A, lower and upper for lower <= A q <= upper. The coupled limits are the last rows."""
+        """Returns A, lower and upper of the limits lower <= A q <= upper. The last rows are the coupled limits."""
         rows = [[limit.coefficients.get(j, 0.0) for j in self.joint_names] for limit in self.coupled_limits]
         A = np.vstack([np.eye(self.num_joints), np.array(rows).reshape(-1, self.num_joints)])
         lower = np.concatenate([self.position_lower, [limit.lower for limit in self.coupled_limits]])
@@ -226,7 +227,7 @@ class Arm:
         Args:
             count: Number of poses.
             generator: Random number generator.
-            margin: Fraction (0 to 0.5) of the range of each limit that is excluded at each end.
+            margin: Fraction (0 to 0.5) of each position range that is excluded at both ends of the range.
 
         Raises:
             ArmError: Almost no pose within the joint limits meets the coupled limits.
@@ -366,7 +367,7 @@ def _build_arm(
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     if not joints or len({*joints}) < len(joints):
-        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and each joint its own name")
+        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and all joint names must differ")
     if not mechanism.sdf:
         raise ArmError(f"{path}: the mechanism file has no sdf")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
@@ -497,7 +498,7 @@ def _row(path: Path, key: str, terms: dict[str, float], joints: list[str]) -> ND
     for joint, coefficient in terms.items():
         row[_index(path, key, joint, joints)] = coefficient
     if not np.any(row):
-        raise ArmError(f"{path}: {key}: all coefficients are 0; allowed: at least one other value")
+        raise ArmError(f"{path}: {key}: all coefficients are 0; at least one must be nonzero")
     return row
 
 

@@ -67,13 +67,16 @@ class Gains:
 class MotionSettings:
     """Settings for processing a recorded motion. Lists have one element per joint of the mechanism or instrument.
 
-    `acceleration_cut_off` is the cut-off frequency of the low-pass filter for accelerations [Hz]. `effort_delay` is the
-    delay of recorded efforts relative to the positions [s]. It is negative if the efforts are recorded earlier than the
-    positions. `known_effects` maps a drive coordinate (`Arm.effect_coordinates`) to its known effects besides friction:
-    "spring", "cable 1" (sine and cosine with one period per revolution), "cable 2" (two periods) and "asymmetric
-    friction". Two settings are used only in a mechanism file. `base_may_tilt` selects whether the direction of gravity
-    is estimated from a motion. `presliding_travels` are the breakaway displacements of elasto-plastic friction
-    elements, as multiples of the standard deviation of the position of the drive coordinate.
+    Attributes:
+        acceleration_cut_off: Cut-off frequencies of the low-pass filter for accelerations [Hz].
+        effort_delay: Delays of the recorded efforts relative to the positions [s]. A delay is negative if the effort is
+            recorded earlier than the position.
+        base_may_tilt: True to estimate the direction of gravity from a motion. Used only in a mechanism file.
+        known_effects: Mapping from a coordinate of the drive (`Arm.effect_coordinates`) to its known effects besides
+            friction: "spring", "cable 1" (sine and cosine with one period per revolution), "cable 2" (two periods) and
+            "asymmetric friction".
+        presliding_travels: Travels before sliding of the presliding friction elements, as multiples of the standard
+            deviation of the position along the coordinate. Used only in a mechanism file.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
@@ -124,8 +127,10 @@ class IdentificationSettings(MotionSettings):
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: properties that all arms of one type share.
 
-    `effort_cut_off` is the cut-off frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects`
-    are the friction, cable and sensor effects of the real arm. A simulation includes them only on request.
+    `transmission` maps an actuator to the coefficients of its position: actuator position = sum of coefficient * joint
+    position. An actuator without an entry has the position of its joint. `effort_cut_off` is the cut-off
+    frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects` are the friction, cable and
+    sensor effects of the real arm. A simulation includes them only on request.
     """
 
     sdf: str = ""
@@ -142,7 +147,7 @@ class Mechanism:
 
 @dataclass
 class Instrument:
-    """Schema of `instruments/*.yaml`: an exchangeable instrument. Its joints follow the joints of the arm.
+    """Schema of `instruments/*.yaml`: an exchangeable instrument. Its joints follow the joints of the mechanism.
 
     `joint_from_actuator` is the disc coupling as defined by the dVRK: joint position = sum of coefficient * actuator
     position. `friction_coordinates` are additional coordinates along which friction acts, besides joints and actuators.
@@ -166,10 +171,10 @@ class ArmDescription:
 
     `mechanism` and `instrument` are names of files in the folders `mechanisms` and `instruments`, or paths of YAML
     files relative to the folder of the arm file. `sdf` in a mechanism or instrument file is a path relative to the
-    folder of that file. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `mirrored_links` lists, per
-    SDF file, the links that are mirrored for this arm (x to -x in the link's frame). All other SDF files, such as one
-    exported from this arm, are used unchanged. `coupled_limits` maps the name of a coupled limit to its [lower, upper]
-    for this arm, e.g. after the calibration of a joint stop. These values replace the values of the mechanism.
+    folder of that file. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `mirrored_links` maps an SDF
+    file to its links that are mirrored for this arm (x to -x in the link's frame). SDF files without an entry, such as
+    a file exported from this arm, are used unchanged. `coupled_limits` maps the name of a coupled limit to its [lower,
+    upper] for this arm, e.g. after the calibration of a joint stop. These values replace the values of the mechanism.
     """
 
     name: str = ""
@@ -182,7 +187,9 @@ class ArmDescription:
 
 
 def load_gains(path: str | Path) -> Gains:
-    """Reads a gains file with kp, kd and ki, one number per joint. The controller checks the gains for its arm.
+    """Reads a gains file with kp, kd and ki, one number per joint.
+
+    The controller checks whether its arm accepts the gains.
 
     Raises:
         ControllerError: The file does not exist, is not a gains file, or has a gain outside the range of `Gains`.

@@ -1,4 +1,4 @@
-"""Checks coupled limits (lower <= sum of coefficient * joint position <= upper), and limits pose offsets."""
+"""Checks position limits and coupled limits, and reduces pose offsets that would violate them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def can_meet_coupled_limits(arm: Arm) -> bool:
 
 
 def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
-    """Returns a message on the first fault of two position limits, with the accepted values, or "" if there is none."""
+    """Returns a message on the first fault of a lower and an upper position limit, or "" if there is none."""
     positions, widths = (TRAVELS, TRAVEL_WIDTHS) if slides else (ANGLES, ANGLE_WIDTHS)
     if fault := positions.fault(f"{key}[0]", lower) or positions.fault(f"{key}[1]", upper):
         return fault
@@ -57,7 +57,10 @@ def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
 
 
 def offset_pose(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns pose + offset (n,), with the offset of each joint reduced so that no limit of `arm` is violated."""
+    """Returns pose + offset (n,), with the offset of each joint reduced so that no limit of `arm` is violated.
+
+    If the reduced offsets still violate a coupled limit, `pose` is returned unchanged.
+    """
     A, lower, upper = arm.limit_matrix()
     change = A @ offset
     room = np.where(change > 0, upper - A @ pose, A @ pose - lower)

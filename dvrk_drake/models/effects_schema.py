@@ -1,8 +1,6 @@
-"""Schema of `effects:` in an arm's YAML files: friction, cables, stops and sensors of the real arm.
+"""Schema of `effects:` in an arm's YAML files: friction, cables, stops and sensors of the real arm."""
 
-Postponed annotations are not used here because yaml_load_typed reads the types at run time.
-"""
-
+# This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,10 +23,10 @@ class DriveEffect:
     Attributes:
         coordinate: "actuator.<name>", "joint.<name>", or one of the arm's `friction_coordinates`.
         kind: Kind of effect, see `dvrk_drake.dynamics.actuator_effects.EFFECT_KINDS`.
-        scale: Shape parameter, which depends on the kind: width of the smoothed sign function [rad/s, m/s], breakaway
-            displacement [rad, m], or periods per revolution.
-        coefficient: Coefficient of the effect. The unit depends on the kind: N m, N m s/rad or N m/rad, with N and m
-            for a prismatic coordinate.
+        scale: Parameter whose meaning depends on the kind: width of the smoothed sign function [rad/s, m/s], travel
+            before sliding [rad, m], linear range of a spring [rad, m], or number of periods per revolution.
+        coefficient: Coefficient of the effect. The unit depends on the kind: N m, N m s/rad or N m/rad, or N, N s/m or
+            N/m for a prismatic coordinate.
         standard_error: Standard error of the coefficient, in the same unit; 0 if the effect was not identified.
     """
 
@@ -108,11 +106,11 @@ class ArmEffects:
 
     Attributes:
         friction: Dry and viscous friction, computed by the solver of the plant.
-        cables: Torques of cables that depend on the position.
-        springs: Torques of springs that depend on the position.
-        stops: Whether the arm's coupled limits are hard stops.
+        cables: Position-dependent torques of cables.
+        springs: Position-dependent torques of springs.
+        stops: True if the arm's coupled limits are hard stops.
         stretch: Mapping from an actuator to its elastic cable. Motor, encoder and actuator friction are on the motor
-            side of the cable. All other cables are rigid.
+            side of the cable. The cables of actuators without an entry are rigid.
         saturation: Mapping from an actuator to the largest effort of its motor [N m, N]. Actuators without an entry do
             not saturate.
         encoder: Quantization of positions, and estimation of velocities from the quantized positions.
@@ -156,11 +154,11 @@ class ArmEffects:
         return ArmEffects(**{name: _joined(getattr(self, name), getattr(other, name)) for name in EFFECT_NAMES})
 
     def check(self, joint_names: Sequence[str]) -> None:
-        """Checks the range of all numbers and the names of all actuators.
+        """Checks the range of all numbers, the kinds of the effects and the names of the actuators.
 
         Raises:
-            ArmError: A number or an actuator is not accepted. The message names the field, its value and the accepted
-                values.
+            ArmError: A number, a kind or an actuator is not accepted. The message names the field, its value and the
+                accepted values.
         """
         if fault := number_fault(self):
             raise ArmError(fault)
@@ -189,7 +187,7 @@ class ArmEffects:
                     raise ArmError(f'{where}: kind is "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
 
 
-#: Kinds that `friction` accepts: dissipative effects that a solver can apply at the end of a step.
+#: Kinds that `friction` accepts: friction that the solver of the plant can compute.
 FRICTION_KINDS = ("presliding", "presliding forward", "coulomb", "viscous")
 #: Kinds that `cables` and `springs` accept: effects that have a potential energy.
 POSITION_KINDS = ("offset", "spring", "cable sine", "cable cosine")

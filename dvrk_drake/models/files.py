@@ -32,7 +32,7 @@ _KINDS = {
 def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | None = None) -> FileIO:
     """Opens a regular file for reading, unbuffered.
 
-    A FIFO or a device is refused immediately.
+    A FIFO or a device is refused without waiting for data.
 
     Args:
         path: Path of the file, or of a link to it.

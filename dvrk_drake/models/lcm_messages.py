@@ -1,4 +1,8 @@
-"""Channels, authentication and decoding of the LCM messages of an arm."""
+"""Channels, authentication and decoding of the LCM messages of an arm.
+
+A status is a message lcmt_dvrk_status, which the arm's process sends. A command is a message lcmt_dvrk_command, which a
+controller sends.
+"""
 
 from __future__ import annotations
 
@@ -174,11 +178,11 @@ def describe_refusal(refusal_code: int) -> str:
 class StatusFilter:
     """Selects the statuses of one session of one arm from the messages of its status channel.
 
-    The filter keeps the first session that it receives. It ignores a status, and counts the reason, if the status is
-    not authentic, belongs to another session, or was not sent after the last accepted status. It also ignores a status
-    whose sequence number or time is too far ahead: the sequence number may increase by 2000 per second plus 100, and
-    the time by 1 ms for each of these statuses. Without this limit, one spoofed status with a large sequence number
-    would make all authentic statuses appear old.
+    A session is one run of the arm's process. The filter accepts only the first session that it receives. It ignores a
+    status, and counts the reason in `ignored`, if the status is not authentic, belongs to another session, or was not
+    sent after the last accepted status. It also ignores a status whose sequence number or time is too far ahead: the
+    sequence number may increase by 2000 per second plus 100, and the time by 1 ms for each of these statuses. Without
+    this limit, one spoofed status with a large sequence number would make all authentic statuses appear old.
 
     Attributes:
         last: Last accepted status, or None if no status has been accepted.
@@ -206,10 +210,10 @@ class StatusFilter:
         Args:
             arm_name: Name of the arm.
             num_joints: Number of joints of the arm.
-            key: Key that must have signed the statuses; None to skip verification.
+            key: Key with which the statuses must be signed; None to skip verification.
             session_id: Session to accept; 0 for the first received session.
             follow_after: Duration without a status of the session [s] after which another session, or the same session
-                after a jump, is accepted. Use it only for recordings, because a controller must not continue with a
+                after a jump, is accepted. Set it only for recordings, because a controller must not continue with a
                 restarted arm.
         """
         self.last: lcmt_dvrk_status | None = None

@@ -14,19 +14,22 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import LoopClosure
 from dvrk_drake.models.sdf_model import DRAKE
 
-#: Methods of closing the loops of a linkage: "mimic" couples joints of the tree, "ball" adds constraints where the tree
-#: cuts the loops.
+#: Methods of closing the loops of a linkage: "mimic" couples joints of the tree, "ball" adds constraints at the points
+#: where the loops are cut in the tree.
 Closure = Literal["mimic", "ball"]
 
 
 def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure) -> None:
-    """Pins frame_a of the closing bar to frame_b, and adds a distance constraint with the length of the bar.
+    """Closes a loop with a ball constraint (pin) and a distance constraint.
 
-    SAP assigns each constraint the compliance 5e-10 s^2 / m at a time step of 1 ms, where m is the effective mass of
-    the unconstrained tree at the pin. The three equations of the pin share one effective mass. A light bar that rotates
-    freely makes the pin compliant in all directions, including the direction of the bar, which carries the load of the
-    linkage. The distance constraint has the effective mass of the linkage and is stiff. With this constraint, the
-    weight of the PSM moves its remote centre by 1e-8 m instead of 2e-6 m.
+    The pin joins the origins of frame_a and frame_b. The link of frame_a is a bar. The distance constraint keeps the
+    distance between the parent joint of this bar and frame_b equal to the length of the bar.
+
+    Drake's solver SAP assigns each constraint the compliance 5e-10 s^2 / m at a time step of 1 ms, where m is the
+    effective mass of the unconstrained tree at the pin. The three equations of the pin share one effective mass. A
+    light bar that rotates freely makes the pin compliant in all directions, including the direction of the bar, in
+    which the linkage is loaded. The distance constraint has the effective mass of the linkage and is stiff. With this
+    constraint, the weight of the PSM moves its remote centre by 1e-8 m instead of 2e-6 m.
     """
     A, B = (plant.GetFrameByName(name, instance) for name in (loop.frame_a, loop.frame_b))
     p_AP, p_BQ = (frame.GetFixedPoseInBodyFrame().translation() for frame in (A, B))

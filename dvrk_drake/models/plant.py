@@ -23,7 +23,7 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 def package_map() -> PackageMap:
     """Returns a map with Drake's own packages and `dvrk_drake`, for URLs such as package://dvrk_drake/sdf/mtml.sdf.
 
-    Drake's parser finds the models with `Parser(plant).package_map().AddMap(package_map())`.
+    Call `Parser(plant).package_map().AddMap(package_map())`, so that Drake's parser finds the models.
     """
     packages = PackageMap()
     packages.AddPackageXml(str(MODELS_FOLDER / "package.xml"))
@@ -35,14 +35,14 @@ def add_arm(
 ) -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world, and sets gravity and limits.
 
-    The loop closures require Drake's SAP solver, which the contact approximations sap, similar and lagged use. If a
-    discrete plant uses the approximation tamsi, it is changed to sap. A continuous plant can be simulated only with the
+    The loop closures require Drake's SAP solver, which the contact approximations sap, similar and lagged use. The
+    approximation tamsi of a discrete plant is changed to sap. A continuous plant can be simulated only with the
     integrator CENIC. For a continuous plant, the closure "ball" requires drake 1.56 or newer.
 
     Args:
         plant: Plant, with or without a scene graph.
         arm: Arm to add.
-        closure: Method of closing the loops of the linkage.
+        closure: Method of closing the loops of the linkage, see `Closure`.
         collision_shapes: Whether to add collision shapes. Without collision shapes, the arm has no contact, and a plant
             with a scene graph needs less time per step.
 
@@ -143,8 +143,8 @@ def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: Arra
 def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:
     """Returns the torque (n,) on the independent joints that compensates gravity at the context's pose.
 
-    Drake's gravity forces tau_g do not include the forces of constraints. They are projected onto the independent
-    joints with the matrix G of the linkage: tau = -G' tau_g.
+    Drake's gravity forces tau_g do not include the forces of constraints. Therefore tau_g is projected onto the
+    independent joints with the matrix G of the linkage: tau = -G' tau_g.
     """
     tau_g = plant.CalcGravityGeneralizedForces(context)[tree_selector(plant, arm)]
     return -arm.linkage.pull_back_effort(tau_g)

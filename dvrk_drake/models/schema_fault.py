@@ -1,8 +1,8 @@
 """Checks the content of files and of Python objects. Messages name the key, its value and the accepted values.
 
 The range of a number is metadata of its field: `field(default=0.05, metadata=within(0.002, 1.0, "s"))`. It applies to
-all numbers in the field, including those in lists and mappings. `schema_fault` checks the content of a file,
-`number_fault` an object.
+all numbers in the field, including those in lists and mappings. `schema_fault` checks the content of a file, and
+`number_fault` checks an object.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Range:
         low, high: Smallest and largest accepted number.
         unit: Unit of both numbers; "rad or m" if it depends on the joint type.
         also: Additional accepted numbers, e.g. 0 or infinity.
-        either_sign: Whether low and high apply to the absolute value.
+        either_sign: True if low and high apply to the absolute value.
     """
 
     low: float

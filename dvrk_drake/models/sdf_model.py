@@ -76,7 +76,7 @@ def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | Non
     """Returns the model of the first file, extended by the links, joints and frames of the other files.
 
     Relative paths of meshes become absolute. If a file repeats a link of an earlier file, only the shapes of that link
-    are added. For example, the housing of an instrument is drawn on the carriage of the arm, without an additional
+    are added. For example, the housing of an instrument becomes a shape of the carriage of the arm, not an additional
     body.
 
     Args:

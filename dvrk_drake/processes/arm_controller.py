@@ -19,13 +19,13 @@ from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class ArmController:
-    """Controller for gravity compensation or position control of one arm, from status message to command message.
+    """Controller of one arm. It computes a command message from each status message, in one of the modes of `Mode`.
 
     The controller is a Diagram of DvrkStatusReceiver, GravityPidController, an optional FrictionCompensator, EffortRamp
     and DvrkCommandSender. Each status causes a forced update of the Diagram, so the command is available immediately.
     While the arm does not apply the commanded efforts, the controller commands the measured efforts. When the arm
-    begins to apply the commanded efforts, the controller latches the pose to hold. It then ramps from the measured
-    efforts to its own efforts.
+    begins to apply the commanded efforts, mode "hold" stores the measured pose as the pose to hold. In every mode, the
+    commanded efforts then change linearly from the measured efforts to the efforts of the mode.
 
     Attributes:
         arm: Controlled arm.
@@ -47,9 +47,9 @@ class ArmController:
             model: Model of the arm in its actual mounting.
             mode: Mode of the controller.
             period: Period of the status messages [s].
-            friction: Friction compensator for mode "gravity", which is added to the Diagram. None: friction is not
+            friction: Friction compensator for mode "gravity". It is added to the Diagram. None: friction is not
                 compensated.
-            gains: Gains for holding and braking. None: the gains of the arm are used.
+            gains: Gains for the modes "hold" and "damped". None: the gains of `arm` are used.
         """
         builder = DiagramBuilder()
         self.arm, self._mode = arm, mode
@@ -86,7 +86,7 @@ class ArmController:
 
     @property
     def acting(self) -> bool:
-        """True if the arm applied the efforts of this controller at the last status."""
+        """True if the last status shows that the arm applies the efforts of this controller."""
         return self._acting
 
     @property
@@ -102,7 +102,8 @@ class ArmController:
         Args:
             status: Received status.
             time: Time of arrival on the controller's clock [s].
-            desired_state: Desired state (2n,) in mode "hold": q_d, then v_d. None: the latched pose is held.
+            desired_state: Desired state (2n,) in mode "hold": q_d, then v_d. None: the stored pose is held; see
+                `ArmController`.
 
         Returns:
             Command for the arm.
@@ -121,9 +122,9 @@ class ArmController:
         return self._sender.get_output_port().Eval(self._sender_context)
 
     def _set_acting(self, acting: bool) -> None:
-        """Stores whether the efforts act on the arm. If they act, restarts the ramp and latches the pose to hold."""
+        """Stores whether the efforts act on the arm. If they act, restarts the ramp and stores the pose to hold."""
         self._acting = acting
         self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
-        # The change of the mode from "gravity" to "hold" latches the pose and resets the integrator.
+        # The change of the mode from "gravity" to "hold" stores the pose to hold and resets the integrator.
         controller_context = self._controller.GetMyMutableContextFromRoot(self._context)
         self._controller.SetMode(controller_context, self._mode if acting else "gravity")

@@ -1,4 +1,4 @@
-"""Moves an arm to a sequence of poses and measures holding efforts: steps 4 to 6 of section III.G of the paper."""
+"""Moves an arm to poses and measures holding torques: steps 4 to 6 of section III.G of Rutfield et al. (WPI, 2015)."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _BRAKE = 0.3
 #: Largest allowed tracking error of a joint, as a fraction of the range of the joint.
 _MAX_TRACKING_ERROR = 0.1
 #: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
-#: determines the distance of the approach. Static friction of up to half of this effort changes its sign during the
-#: approach.
+#: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
+#: the approach.
 _APPROACH = 0.3
 
 Steps = Generator[None, None, None]
@@ -46,8 +46,8 @@ class CollectionSettings:
 
     Attributes:
         traverse_time: Time in which a joint may cross its range [s]. It determines the speed between poses.
-        both_sides: If true, each pose is approached from below and from above in all joints. The average of the two
-            measurements cancels Coulomb friction. If false, each pose is measured once, as in the paper.
+        both_sides: If true, each pose is approached from below and from above in all joints. Coulomb friction cancels
+            in the average of the two measurements. If false, each pose is measured once, as in Rutfield et al.
     """
 
     traverse_time: float = field(default=5.0, metadata=within(1.0, 60.0, "s"))
@@ -61,14 +61,14 @@ class CollectionSettings:
 class Collector:
     """Computes the desired state of a controller in mode "hold" for each status, until all poses are measured.
 
-    The collection ends after the last pose. It also ends after a requested stop, for which the arm brakes. It ends with
-    an error if the guard holds the arm, if a joint does not follow its target, or if the file cannot be written.
-    `finished` is then true, and the caller commands HOLD.
+    The collection ends after the last pose. It also ends if `stopped` returns true, after the arm has braked. It ends
+    with an error if the guard holds the arm, if a joint does not follow its target, or if the file cannot be written.
+    After the end of the collection, the caller must command HOLD.
 
     Attributes:
         finished: True after the end of the collection.
         problem: Error that ended the collection early, or None.
-        unsettled: Numbers of the skipped poses at which the arm did not come to rest, starting at 1.
+        unsettled: Numbers (from 1) of the poses that were skipped because the arm did not come to rest.
         done: Boolean array (m,), true for poses that are in the file.
     """
 
@@ -86,7 +86,7 @@ class Collector:
         """Creates a collector for the arm of `controller`.
 
         Args:
-            poses: Checked poses (m, n) [rad, m]. Poses that are already in `output` are skipped.
+            poses: Poses (m, n) [rad, m], checked by `check_poses`. Poses that are already in `output` are skipped.
             controller: Controller that computes the commands.
             output: File for the measurements.
             settings: Settings of the collection.
@@ -184,7 +184,7 @@ class Collector:
                 self._report(f"pose {k + 1} measured, {count} of {len(self.done)}; about {left / 60:.1f} min left")
 
     def _begin(self) -> Steps:
-        """Waits until the efforts act and their ramp is complete. The arm holds the pose at the start of the ramp."""
+        """Waits until the efforts act and their ramp is complete. During the ramp, the target is constant."""
         began = self._time
         while not self._controller.acting:
             if self._time - began > _START:

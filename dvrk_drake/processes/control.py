@@ -75,7 +75,8 @@ class ArmLink:
             url: URL of the LCM network.
             key: Key that must have signed the statuses, and that signs the commands. None: statuses are not verified
                 and commands are not signed.
-            before: Status whose session is used. None: the first received session is used.
+            before: Status of the session that is used. A session is one run of the arm's process. None: the
+                session of the first received status is used.
             replays: True to accept statuses of any session and time, for example from a replayed log. Must be False for
                 a controller, because old statuses would determine the commands.
         """
@@ -91,7 +92,7 @@ class ArmLink:
     def close(self) -> None:
         """Stops receiving and ends LCM's receive thread, which otherwise wakes up for every message."""
         self._lcm.unsubscribe(self._subscription)
-        # The garbage collector does not detect the references of the subscription to this link and to LCM.
+        # The subscription refers to this link and to LCM, which the garbage collector does not detect.
         del self._subscription, self._lcm
 
     def now(self) -> float:
@@ -102,7 +103,7 @@ class ArmLink:
         """Returns the newest status of the session that arrives within `seconds`.
 
         Raises:
-            ControllerError: No status arrived. The message lists ignored statuses.
+            ControllerError: No status arrived. The error message lists ignored statuses.
         """
         end = time.monotonic() + seconds
         self._is_new = False

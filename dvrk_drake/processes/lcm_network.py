@@ -1,4 +1,4 @@
-"""Opens an LCM network and handles its messages. A network that is not usable causes an exception, unlike in LCM."""
+"""Opens an LCM network and handles its messages. Unlike LCM, it raises an exception for an unusable network."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class LiveStatus:
 
     Attributes:
         state: State of the guard.
-        pace: Rate, round-trip time and lost messages.
+        pace: Rate of the commands, their round-trip time, and the number of lost statuses.
         problem: Reasons why commands were refused, ignored or expired since the previous live status, or "" if there
             are none.
     """
@@ -131,7 +131,7 @@ class AnswerTimes:
             self._times.popleft()
 
     def lateness(self) -> str:
-        """Returns a description of the rate and longest interval of commands that are too infrequent, otherwise ""."""
+        """Returns a message with the rate and longest interval of the commands if they are too infrequent, or ""."""
         intervals = np.diff(np.array(self._times))
         if not len(intervals) or intervals.max() <= _LATE:
             return ""
@@ -142,11 +142,12 @@ class AnswerTimes:
 
 
 def takeover_reason(status: lcmt_dvrk_status, before: lcmt_dvrk_status, answers: AnswerTimes) -> str:
-    """Returns the reason why an arm no longer accepts commands.
+    """Returns the reason why an arm no longer applies the commands of the controller.
 
     Args:
-        status: Status in which the arm does not accept commands.
-        before: Last status in which the arm accepted commands. Earlier refusals are not considered.
+        status: Status in which the arm does not apply the commands.
+        before: Last status in which the arm applied the commands, or the first status. Earlier refusals are not
+            considered.
         answers: Times of the controller's commands.
     """
     expired, refused = status.num_expired > before.num_expired, status.num_refused > before.num_refused

@@ -1,4 +1,4 @@
-"""Displays the poses in the status messages of an arm. `arm --meshcat` runs the process `dvrk-drake view --live`."""
+"""Displays the poses in the status messages of an arm, in the process `dvrk-drake view --live`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _end_with_parent() -> None:
 
 @contextlib.contextmanager
 def live_view(arm: str, url: str) -> Iterator[subprocess.Popen]:
-    """Runs `dvrk-drake view --live` for an arm (name or path) in a process that ends with the context.
+    """Runs `dvrk-drake view --live` for an arm (name or path) in a process that ends with the `with` block.
 
     A separate process is required because drawing would delay a loop at 1 kHz. On Linux, the process also ends if the
     parent process is killed.

@@ -8,8 +8,8 @@ import os
 import time
 from collections.abc import Callable
 
-#: Priority of SCHED_FIFO. This priority is above all processes that are not real-time, and below the kernel's own
-#: threads, which have priority 99.
+#: Priority of SCHED_FIFO. It is higher than the priority of all processes that are not real-time, and lower than that
+#: of the kernel's own threads (99).
 _PRIORITY = 50
 
 #: Longest delay [s] for which a loop catches up. After a longer delay, the loop continues from the current time.
@@ -56,14 +56,14 @@ class Pace:
 
 
 def make_realtime() -> list[str]:
-    """Makes this process real-time (SCHED_FIFO, priority 50), locks its memory and prevents sleep states of the cores.
+    """Requests real-time scheduling (SCHED_FIFO, priority 50), locked memory and no sleep states of the cores.
 
     Threads that are started later, such as those of LCM, inherit the priority. A core in a sleep state needs more time
     to wake up than a controller needs to compute a command. The request to /dev/cpu_dma_latency
     (https://docs.kernel.org/power/pm_qos_interface.html) prevents sleep states until this process ends.
 
     Returns:
-        One warning for each setting that was not permitted, with the reason.
+        One warning for each request that was refused, with the reason.
     """
     warnings = []
     for step, what in (
@@ -94,6 +94,6 @@ def _keep_cores_awake() -> None:
 
 
 def settle_memory() -> None:
-    """Excludes existing objects from garbage collection, which makes collections short."""
+    """Excludes existing objects from garbage collection, which shortens each collection."""
     gc.collect()
     gc.freeze()

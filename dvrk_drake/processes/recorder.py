@@ -45,7 +45,7 @@ class Recorder:
             arm: Arm whose statuses are recorded.
             path: Path of the new file.
             url: URL of the LCM network.
-            key: Key that must have signed the statuses. None: signatures are not verified.
+            key: Key that must have signed the statuses. None: authentication codes are not verified.
 
         Raises:
             RecordingError: A new file cannot be created at `path`.

@@ -56,8 +56,8 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
 
     Args:
         arm: Simulated arm.
-        pose: Pose (n,) [rad, m]. None: the pose nearest to zero is used that has a distance of at least 10 % of the
-            range from each limit.
+        pose: Pose (n,) [rad, m]. None: each joint starts at the position nearest to zero that is at least 10 % of its
+            range away from its limits.
 
     Raises:
         StationError: `pose` does not have n entries inside the arm's limits.
@@ -163,7 +163,8 @@ class SimulatedArm:
         network = lcm.LCM(self._url)
         network.subscribe(command_channel(self.arm), self.receive).set_queue_capacity(_QUEUE)
         # The first measured period of the guard is too long, because it includes the time since the simulation was
-        # created. The status of the first step is not published, because a controller would refuse to control the arm.
+        # created. The guard therefore refuses efforts in the first step. The status of this step is not published,
+        # because a controller that receives it would refuse to control the arm.
         self.step()
         self.step()
         pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))

@@ -1,4 +1,7 @@
-"""Poses taught by hand (steps 1 to 3 of section III.G of the paper), and trajectories between poses."""
+"""Poses taught by hand, and trajectories between poses.
+
+Teaching consists of steps 1 to 3 of section III.G of Rutfield et al. (WPI, 2015).
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ class CubicTrajectory:
 
     @classmethod
     def braking(cls, state: NDArray[np.float64], duration: float) -> CubicTrajectory:
-        """Returns a trajectory with constant deceleration from `state` (2n,) to rest. The state is q, then v."""
+        """Returns a trajectory with constant deceleration from `state` (2n,), i.e. q, v, to rest in `duration` [s]."""
         q, v = np.split(state, 2)
         return cls(q, v, q + 0.5 * duration * v, duration)
 
@@ -115,7 +118,8 @@ class Teacher:
 
         Args:
             controller: Controller in mode "gravity".
-            path: Path of the file. The poses are added to an existing file. The file is complete at any time.
+            path: Path of the file. If the file exists, new poses are added to it. Each change replaces the file
+                atomically.
             at_rest: True to record each pose at which the arm is at rest for a second.
             requested: Function that returns whether to record the present pose. It is called once per status.
             report: Function that is called with one line per pose.

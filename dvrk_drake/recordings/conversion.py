@@ -69,9 +69,9 @@ def convert(
         topic: For "ros-bag": JointState topic or its namespace, see `read_joint_states`.
         rate: Sampling rate [Hz] of a CSV without time stamps. If None, the rate is 200 Hz for "wpi-csv", and a "csv"
             gets no time stamps.
-        arm: For "csv" and "wpi-csv": the joint coordinates of this arm are written. If None, the coordinates of the
-            file are written. For "lcm-log" and "ros-bag": the measurements of this arm are read. The arm is required
-            for a bag, and for a log with statuses of several arms.
+        arm: For "csv" and "wpi-csv": the data are written in the joint coordinates of this arm. If None, they are
+            written in the coordinates of the input file. For "lcm-log" and "ros-bag": the measurements of this arm are
+            read. The arm is required for a bag, and for a log with statuses of several arms.
         skip_invalid: Whether to omit invalid rows (or poses) and to count them in `notes`. If False, a file with
             invalid rows is refused.
 

@@ -102,7 +102,10 @@ class CsvReader:
                 text = decoder.decode(block, final=not block)
             except UnicodeDecodeError as error:
                 at = num_read - undecoded + error.start
-                raise RecordingError(f"{self._path} is not a UTF-8 text file: {error.reason} at byte {at}") from error
+                raise RecordingError(
+                    f"{self._path} is not a UTF-8 text file: {error.reason} at byte {at}. Allowed: CSV file, "
+                    "ROS bag or LCM log. dvrk-drake convert reads MATLAB files."
+                ) from error
             if is_start and text:
                 text, is_start = text.removeprefix("\ufeff"), False
             text = rest + text

@@ -1,4 +1,4 @@
-"""Reads LCM logs, including damaged ones, and the measurements of one arm in them.
+"""Reads LCM logs, including damaged logs, and extracts the statuses (lcmt_dvrk_status) of one arm.
 
 The format is described at https://lcm-proj.github.io/lcm/content/log-file-format.html. A log is a sequence of events.
 Each event is big-endian and consists of a magic number, the event number, a time, two lengths, channel and data.
@@ -42,7 +42,7 @@ class LcmEvent(NamedTuple):
 
 
 class LcmLogReader:
-    """Iterates over the events of a log in order, and skips damaged ones.
+    """Iterates over the events of a log in order, and skips damaged events.
 
     Attributes:
         path: Path of the log.
@@ -143,7 +143,7 @@ class StatusStream:
     Attributes:
         arm_name: Name of the arm whose statuses are used.
         num_joints: Number of joints that the statuses must have.
-        last: Last status of the arm, usable or not, or None.
+        last: Last status of the arm, including unusable statuses; None before the first status.
         num_lost: Number of statuses missing in the sequence.
         num_used: Number of used statuses.
         first_utime: Time of the first used status [us], at which t of the recording is 0.
@@ -161,7 +161,7 @@ class StatusStream:
         """Returns the status in a message, or None if it cannot be used as a measurement.
 
         Raises:
-            RecordingError: Two arms of this name send at the same time.
+            RecordingError: Two processes send statuses of the arm at the same time.
         """
         status = decode(lcmt_dvrk_status, data)
         reason = _UNREADABLE if status is None else self._examine(status)
@@ -214,7 +214,7 @@ class StatusStream:
 
 
 def measurements(status: lcmt_dvrk_status) -> tuple[float, ...]:
-    """Returns the measured q, v, tau in one tuple (3n,)."""
+    """Returns the measured positions, velocities and efforts in one tuple (3n,)."""
     return (*status.position, *status.velocity, *status.effort_measured)
 
 

@@ -1,8 +1,6 @@
-"""Files of the command `collect`: the poses to measure (YAML) and the measured poses (CSV).
+"""Files of the command `collect`: the poses to measure (YAML) and the measured poses (CSV)."""
 
-Postponed annotations are not used here because yaml_load_typed reads the types at run time.
-"""
-
+# This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 import os
 import time
 from dataclasses import dataclass, field
@@ -169,7 +167,13 @@ class CollectionFile:
         tau: NDArray[np.float64],
         friction: NDArray[np.float64] | None = None,
     ) -> None:
-        """Appends the measured q, tau (n,) of a pose (n,), and the friction (n,) from the two approach directions.
+        """Appends one row to the file, which is created for the first row.
+
+        Args:
+            pose: Requested pose (n,).
+            q, tau: Measured positions and efforts (n,).
+            friction: Half of the difference (n,) between the efforts of the two approach directions, or None if the
+                pose is approached from one direction.
 
         Raises:
             RecordingError: The row cannot be written; the previous rows are complete.

@@ -102,7 +102,8 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
     repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
     if repeats:
         notes.append(
-            f"{repeats} of {len(kept)} rows repeat the previous row (read faster than the arm measures); they are kept"
+            f"{repeats} of {len(kept)} rows repeat the previous row (sampled faster than the arm measures); "
+            "these rows are kept"
         )
     q, qd, tau = np.split(kept, 3, axis=1)
     return Recording(

@@ -1,6 +1,6 @@
 """Defines `Recording`: positions and efforts of a motion or of static poses.
 
-A recording is read from a CSV or an LCM log, and written to a CSV.
+A recording is read from a CSV, a ROS bag or an LCM log, and written to a CSV.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class Recording:
         q: Positions (m, n).
         tau: Efforts (m, n) applied by the motors, or None.
         qd: Velocities (m, n), or None.
-        t: Times (m,), or None for static poses.
+        t: Times (m,) [s], or None for static poses.
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
         lines: Line number (m,) of each row in the source, or None. For an LCM log, `lines` contains event numbers; for
             a MATLAB array, it contains pose numbers.
         sha256: SHA-256 of the source, or "".
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
-        line_label: Name of the numbers in `lines`, for messages: "line", "event" or "pose".
+        line_label: Name of the numbers in `lines`, for messages: "line", "event", "message" or "pose".
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -274,7 +274,8 @@ def read_recording(
         progress: Callback that receives the name of the step ("reading") and the completed fraction (0 to 1).
 
     Returns:
-        Recording with SHA-256 and line numbers. Its attribute `notes` contains the omitted rows and messages.
+        Recording with SHA-256 and line numbers. Its attribute `notes` lists the omitted rows of a CSV, or counts the
+        omitted messages of a log.
 
     Raises:
         RecordingError: The file cannot be read as a recording. The message names the file, line and column.

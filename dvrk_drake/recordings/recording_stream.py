@@ -1,6 +1,7 @@
-"""Writes recordings while statuses are received. If the process ends, the file ends with a complete row.
+"""Writes the statuses of an arm to a CSV or an LCM log while they are received.
 
-Written rows survive the termination of the process. The last rows before a power failure may be lost.
+If the process is terminated, the file ends with the last complete row. The last rows before a power failure may be
+lost.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.recording import column_names
 
-#: Columns of a CSV after the columns of a Recording. They identify the status of each row.
+#: Additional columns of a CSV, after the columns of a Recording. They identify the status of each row.
 _ORIGIN = ("utime", "sequence", "guard_state")
 
 
@@ -63,7 +64,7 @@ def check_stream_output(path: str | Path) -> None:
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:
-    """Creates the file at `path`. A .csv contains the statuses that `stream` uses, a .log every message as received.
+    """Creates the file at `path`. A .csv contains the statuses that `stream` accepts. A .log contains all messages.
 
     Raises:
         RecordingError: See `check_stream_output`; additionally if the file cannot be written.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import re
 from array import array
 from collections.abc import Callable, Iterator
@@ -60,9 +61,9 @@ class JointStates(NamedTuple):
 
 def is_ros_bag(path: str | Path) -> bool:
     """Returns whether a path is a ROS bag: a file that begins like one, or a folder with `metadata.yaml`."""
-    path = Path(path)
-    if path.is_dir():
-        return (path / _METADATA).is_file()
+    # Unlike pathlib, os.path returns False for a path that is not valid.
+    if os.path.isdir(path):
+        return os.path.isfile(os.path.join(path, _METADATA))
     try:
         with open_input(path, RecordingError) as file:
             return file.read(16).startswith(_MAGIC)

@@ -22,7 +22,7 @@ With a real arm:
 4. Disable the gravity compensation of the dVRK controller. Otherwise gravity is
    compensated twice. Keep a hand on the emergency stop.
 5. Only if no verdict is "do not use":
-   dvrk-drake run --arm {arm} --model model.yaml --mode gravity"""
+   dvrk-drake run --arm {arm} --model model.yaml --mode damped"""
 
 
 def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: bool = False) -> None:
@@ -32,7 +32,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
         console: Console to print to.
         result: Result of the demo.
         folder: Output folder of the demo.
-        verbose: Whether to print the identified parameters and the steps for a real arm.
+        verbose: Whether to print the identified parameters, and instructions for a real arm.
     """
     arm = result.arm
     drifts = list(result.drift.values())
@@ -95,6 +95,6 @@ def print_teleoperation(console: Console, result: TeleoperationResult, file: str
         console.print()
         print_note(
             console,
-            "Error: motion of the tip minus the scaled motion of the handle, since the clutch was closed. Path of the "
-            f"handle: {result.handle_path:.2f} m.",
+            "Error: motion of the tip minus the scaled motion of the handle. Both motions are measured from the "
+            f"positions at which the clutch was closed. Length of the path of the handle: {result.handle_path:.2f} m.",
         )

@@ -78,7 +78,12 @@ def _source(recording: Recording) -> str:
 
 
 def print_validation(
-    console: Console, validation: Validation, *, model_path: str = "MODEL.yaml", verbose: bool = False
+    console: Console,
+    validation: Validation,
+    *,
+    model_path: str = "MODEL.yaml",
+    saved: bool = False,
+    verbose: bool = False,
 ) -> None:
     """Prints the verdict on a recording and the error of each joint.
 
@@ -86,17 +91,20 @@ def print_validation(
         console: Console to print to.
         validation: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
+        saved: Whether the verdicts are stored in the model file, where the command run expects them.
         verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
     """
     verdicts, model = validation.verdicts, validation.model
     source = _source(validation.recording)
-    next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode gravity"
+    next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode damped"
     if validation.of_same_recording:
         next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     elif validation.verdict == "do not use":
         next_command = f"dvrk-drake check {source} --arm {model.arm.source}"
         if isinstance(validation, DynamicValidation):
             next_command = f"dvrk-drake recalibrate {source} --model {model_path} --output NEW.yaml"
+    elif not saved:
+        next_command = f"dvrk-drake validate {source} --model {model_path} --save"
     if isinstance(validation, DynamicValidation):
         error = f"Mean relative effort error: {_percent(validation.mean_relative_error)}."
         _print_verdict(console, verdicts, error, next_command)
@@ -156,7 +164,7 @@ def print_recalibration(
         return
     print_note(
         console,
-        f"Error: RMS of measured - predicted effort / RMS of measured effort, after the low-pass filter of the model. "
+        f"Error: RMS(measured - predicted effort) / RMS(measured effort), after the low-pass filter of the model. "
         f"Error after: {FOLDS}-fold cross-validation over the motion. Factors and offsets: fit to the whole motion.",
     )
     if result.shared:
@@ -417,8 +425,8 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     console.print(table)
     print_note(
         console,
-        "If the share of bias or friction is large, recalibrate. A large position-dependent share indicates that the "
-        "cables changed.",
+        "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent "
+        "share indicates that the cables changed.",
     )
 
 

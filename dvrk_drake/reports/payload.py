@@ -23,13 +23,13 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 def print_payload(
     console: Console, result: PayloadIdentification, *, model_path: str | None = None, verbose: bool = False
 ) -> None:
-    """Prints the mass and the link of the payload, then its mass and position with confidence intervals.
+    """Prints the mass and the link of the payload, then a table of mass and position with confidence intervals.
 
     Args:
         console: Console to print to.
         result: Result to print.
-        model_path: Path of the model, for the suggested next command. None if the model was
-            identified from the reference recording.
+        model_path: Path of the model, for the suggested next command. None if the model was identified from the
+            reference recording.
         verbose: Whether to print the estimate for each link, and the efforts that the payload explains.
     """
     payload, estimates = result.payload, result.estimates
@@ -90,8 +90,8 @@ def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
     console.print(table)
     print_note(
         console,
-        "* ratio of the whitened RMS errors with and without payload, cross-validated over the phase of the motion. "
-        "Geometric mean over the actuators.",
+        "* whitened RMS error with payload / whitened RMS error without payload, cross-validated over the phase of the "
+        "motion. Geometric mean over the actuators.",
     )
 
 
@@ -107,11 +107,11 @@ def _print_efforts(console: Console, payload: Payload) -> None:
 
 def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
     """Returns a message with the upper limit of the mass, or with another link on which a payload is possible."""
-    answer = f"No payload found on {payload.link}: the interval of its mass includes 0. "
+    answer = f"No payload found on {payload.link}: the confidence interval of the payload mass includes 0. "
     if elsewhere:
         first = elsewhere[0]
         share = f"{100 * first.relative_error:.1f} %"
-        return answer + f"A payload on {first.link} explains the change (cross-validated error {share})."
+        return answer + f"A payload on {first.link} explains the change of the efforts (cross-validated error {share})."
     if payload.largest_at_com > MAX_MASS:
         return answer + "With this motion, a payload at the centre of mass of the link cannot be detected."
     largest = f"{1e3 * payload.largest_at_com:.3g} g ({100 * CONFIDENCE:.0f} %)"

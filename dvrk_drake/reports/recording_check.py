@@ -11,7 +11,7 @@ _STYLES = {"refusal": "red", "warning": "yellow", "note": ""}
 
 
 def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM", verbose: bool = False) -> None:
-    """Prints whether a recording is usable, the warnings, and the range and effort of each joint.
+    """Prints whether a recording is usable, the warnings, and the position range and effort of each joint.
 
     Refusals are not printed, because the command prints them on stderr. docs/checking_a_recording.md defines all
     quantities.

@@ -13,7 +13,7 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer
 def print_simulation(
     console: Console, simulation: Simulation, arm: Arm, *, scenario: str | None = None, verbose: bool = False
 ) -> None:
-    """Prints the largest tracking error or, without desired positions, the largest motion from the start.
+    """Prints the largest tracking error or, without desired positions, the largest distance from the initial position.
 
     Args:
         console: Console to print to.

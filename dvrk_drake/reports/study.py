@@ -18,14 +18,13 @@ _MAX_COUNT = 3
 def print_study(
     console: Console, study: Study, rows: Mapping[int, Row], *, study_path: str | None = None, verbose: bool = False
 ) -> None:
-    """Prints the first measure of each variation, then all measures, and the errors of failed runs.
+    """Prints the values of the first measure, then those of all measures, and the error messages of failed runs.
 
     Args:
         console: Console to print to.
         study: Study to summarize.
-        rows: Results by number of the case.
-        study_path: Path of the study, for the suggested next command. None if the command has
-            already written figures.
+        rows: Mapping from the number of a case to its results.
+        study_path: Path of the study, for the suggested next command. None if the command has already written figures.
         verbose: Whether to print all failed runs.
     """
     summaries = summarise(study, rows)

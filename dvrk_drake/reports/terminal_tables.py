@@ -47,7 +47,7 @@ class TableConsole(Console):
         raise BrokenPipeError
 
     def _width_of(self, table: Table, folded: bool = False) -> int:
-        """Returns the width that a table needs so that no number is broken. If `folded` is False, no name is broken."""
+        """Returns the width at which a table breaks no number. If `folded` is False, it breaks no name either."""
         free = self.options.update(max_width=10 * TABLE_WIDTH)
         width = 2 * (len(table.columns) - 1)
         for column in table.columns:

@@ -46,7 +46,7 @@ def print_transparency(console: Console, arm: Arm, forces: Sequence[OperatorForc
 
 
 def write_transparency(path: Path, forces: Sequence[OperatorForces]) -> None:
-    """Writes the values of the table to a CSV file in SI units. The file is written atomically."""
+    """Writes a CSV file with the values of `print_transparency` in SI units. Replaces the file atomically."""
     with atomic_write(path) as stream:
         rows = csv.writer(stream, lineterminator="\n")
         rows.writerow(["compensation", *_numbers(forces[0])])

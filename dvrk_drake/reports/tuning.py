@@ -26,7 +26,7 @@ def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = N
         console: Console to print to.
         tuning: Tuning to print.
         gains_path: Path of the written gains, for the suggested next command. None if the gains were not written.
-        verbose: Whether to print the tuning steps, and the comparison for each joint and pose.
+        verbose: Whether to print the results of each tuning method, and the comparison for each joint and each pose.
     """
     comparison, name = tuning.comparison, tuning.arm.source
     best = comparison.best(tuning.found)
@@ -84,7 +84,8 @@ def _print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, .
     print_note(
         console,
         "dead zone: dry friction / ultimate Kp. growth: ratio of successive amplitudes. >: oscillations decay at "
-        "this Kp, and the effort saturates at larger Kp. residual: error after the step; * during an oscillation.",
+        "this Kp, and the effort saturates at larger Kp. residual: position error after the step; *: no Kv damped the "
+        "oscillation.",
     )
     _print_gains(console, f"{arm.name}, gains of the paper's procedure", arm, joints)
 

@@ -135,8 +135,8 @@ class ArmStation(Diagram):
         Args:
             arm: Arm that defines the names of the ports. Controllers of this station use the same arm.
             plant_config: Configuration of the plant. None: `arm_plant_config()`.
-            meshcat: Meshcat in which the arm is drawn, below the path of its lower-case name. `SetTransform("mtml",
-                X_WB)` places the arm. None: the arm is not drawn.
+            meshcat: Meshcat in which the arm is drawn. The path in Meshcat begins with the arm's lower-case name.
+                `SetTransform("mtml", X_WB)` places the arm. None: the arm is not drawn.
             closure: Method that closes the loops of the linkage; see `add_arm`.
             plant_arm: Arm to simulate. Its gravity direction or SDF may differ from that of `arm`, but its joints must
                 be the same. None: `arm`.
@@ -298,7 +298,10 @@ class ArmStation(Diagram):
 def plant_config_fault(config: MultibodyPlantConfig) -> str:
     """Returns the reason why a configuration is not valid for a station's plant, or "" if it is valid."""
     if not 0 < config.time_step <= 0.01:
-        return f"time_step must be above 0 and at most 0.01 s (the wrist is unstable above); got {config.time_step}"
+        return (
+            f"time_step must be above 0 and at most 0.01 s (the wrist is unstable with larger steps); "
+            f"got {config.time_step}"
+        )
     if config.discrete_contact_approximation == "tamsi":
         return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
     if config.use_sampled_output_ports:

@@ -19,8 +19,9 @@ from dvrk_drake.models.plant import add_arm, set_arm_positions
 DIRECTION, ZOOM = (1.1, 1.0, 0.3), 2.8
 #: Half the height of the view at distance 1 from the camera. Aspect ratio (width / height) of a common browser window.
 HALF_HEIGHT, ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2
-#: Joint displacement from home in the poses inside the view, as a fraction of the distance to the joint limit. With the
-#: whole distance, the arm would appear small. Ratio of the size of the view to the size that these poses require.
+#: Displacement of a joint from home in the poses that must be inside the view, as a fraction of the distance from home
+#: to the joint limit. With a fraction of 1, the arm would appear small. Ratio of the size of the view to the size that
+#: these poses require.
 SHARE, MARGIN = 0.75, 1.05
 
 
@@ -28,7 +29,7 @@ def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns positions (3,) [m] of a camera and of its target in the base frame, so that the arm fills the view.
 
     The view contains the arm at home. It also contains the poses in which one joint is displaced towards one of its
-    limits by the fraction `SHARE` of the distance.
+    limits, by the fraction `SHARE` of the distance to this limit.
 
     Raises:
         ArmError: The arm has no visual geometry.
@@ -44,7 +45,7 @@ def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def geometry_corners(arm: Arm) -> NDArray[np.float64]:
-    """Returns the corners (k, 3) [m] of boxes around the visual geometry at all poses in the view, in the base frame.
+    """Returns the corners (k, 3) [m] of boxes around the visual geometry, in the base frame, for all poses of the view.
 
     Raises:
         ArmError: The arm has no visual geometry.
@@ -87,7 +88,7 @@ def start_meshcat(
         camera: Position (3,) [m] of the camera, for a view without an arm.
         target: Position (3,) [m] of the camera's target, for a view without an arm.
         zoom: Magnification relative to Meshcat's default view angle of 75 degrees.
-        port: Port in 1024..65535. None: a free port.
+        port: Port in 1024..65535. None: a free port is used.
 
     Raises:
         DvrkDrakeError: The port cannot be opened.
@@ -133,7 +134,7 @@ class ArmView:
         Args:
             arm: Arm to draw.
             meshcat: Meshcat in which the arm is drawn.
-            role: Role of the drawn geometry.
+            role: Role of the drawn geometry: visual (kIllustration) or collision (kProximity).
 
         Raises:
             ArmError: The arm has no geometry with this role.

@@ -23,8 +23,8 @@ def add_closed_loop(
         station: Station of the arm.
         controller: Controller of an arm with the same joints: a `GravityPidController`, or a System with an input port
             `state_estimated` (2n) and an output port `effort` (n).
-        desired: Source with one output port (2n): q_d, then v_d. None: the controller regulates the initial pose.
-        friction: Compensator for a share of the arm's friction. None: no compensation.
+        desired: System with one output port (2n): q_d, then v_d. None: the controller regulates the initial pose.
+        friction: Compensator for a share of the arm's friction. None: friction is not compensated.
 
     Example:
         >>> import dvrk_drake as dvrk

@@ -31,9 +31,10 @@ class FrictionCompensator(LeafSystem):
     - `state_estimated` (2n): q, then v.
     - `effort_wanted` (n): effort of a controller, e.g. GravityPidController.
     - `effort` (n): effort_wanted + friction_effort, inside the effort limits.
-    - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k' over the elements k of the identified friction;
-      see `dvrk_drake.dynamics.actuator_effects`. Dry friction is compensated as a hysteresis that depends on the travel
-      of the joint. The sign of the velocity is not used, because noise determines it near zero velocity.
+    - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k' over the elements k of the identified friction.
+      shape_k is the effort of the element for a coefficient of 1. The element acts along the coordinate row_k q; see
+      `dvrk_drake.dynamics.actuator_effects`. Dry friction is compensated as a hysteresis that depends on the travel of
+      the joint. The sign of the velocity is not used, because noise determines it near zero velocity.
 
     **Passivity.** An elasto-plastic friction element with coefficient c slips after a travel d, and then dissipates the
     energy c |slip|. The compensating element slips after `widening` >= 1 times this travel, so it never slips more than
@@ -106,7 +107,7 @@ class FrictionCompensator(LeafSystem):
 
     @property
     def ratios(self) -> NDArray[np.float64]:
-        """Compensated share (k,) of each friction effect."""
+        """Compensated share of each element of the identified friction, one number per element."""
         return self._ratios.copy()
 
     def _restart(self, context: Context, state: DiscreteValues) -> None:

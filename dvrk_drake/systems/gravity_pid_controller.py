@@ -26,9 +26,10 @@ class GravityPidController(LeafSystem):
     """Compensates gravity and, in "hold" mode, regulates the arm's pose.
 
     The control law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), with e = q_d - q and de = v_d - v for every joint.
-    It is equation 11 of Rutfield et al. (WPI, 2015). G(q) is the model's static torque: gravity and joint effects,
-    scaled by each joint's feedforward scale. Gains are diagonal. In "gravity" mode tau = G(q). In "damped" mode tau =
-    G(q) - Kd v, so an error of G causes a slow motion that does not accelerate.
+    It is equation 11 of Rutfield et al. (WPI, 2015). G(q) is the predicted holding torque of the model: gravity,
+    cables, springs and offsets. The holding torque of each joint is multiplied by its feedforward scale. The gain
+    matrices are diagonal. In "gravity" mode tau = G(q). In "damped" mode tau = G(q) - Kd v, so an error of G causes a
+    slow motion that does not accelerate.
 
     .. pydrake_system::
 
@@ -44,10 +45,10 @@ class GravityPidController(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `state_estimated` (2n): q, then v. Not connected: ControllerError at initialization.
-    - `desired_state` (2n): q_d, then v_d, read only in "hold" mode. Unconnected: "hold" mode regulates the pose
-      measured at initialization, at the last change to "hold", or at the end of the last fault.
+    - `desired_state` (2n): q_d, then v_d, used only in "hold" mode. Unconnected: "hold" mode regulates the pose
+      measured at initialization, at the change to "hold", or at the end of a fault, whichever was last.
     - `effort` (n): commanded effort inside the effort limits.
-    - `gravity_effort` (n): G(q) alone, before the limits.
+    - `gravity_effort` (n): G(q) alone, not clamped to the effort limits.
     - `fault` (1): 1 while a number in `state_estimated` is not finite or its magnitude exceeds 1e6, else 0. In "hold"
       mode, `desired_state` is checked as well.
 

@@ -43,7 +43,7 @@ class Grip:
 
 
 class Hand(LeafSystem):
-    """Hand of an operator that pulls a frame G of an arm with base B towards a desired pose.
+    """Operator's hand. It pulls a frame G of an arm with base B towards a desired pose.
 
     .. pydrake_system::
 
@@ -65,10 +65,10 @@ class Hand(LeafSystem):
 
         (1 + h (D + h K) J M^-1 J') F = K (e - h V) - D V
 
-    - h: time step of the station
+    - h: time step of the plant
     - e: difference from the present to the desired pose (rotation vector, then translation)
-    - V: spatial velocity of the frame
-    - M: mass matrix of the arm
+    - V: spatial velocity of the frame, J: its Jacobian (6, n) with respect to the joint velocities
+    - M: mass matrix (n, n) of the arm
     - K, D: stiffness and damping
 
     Therefore a stiff hand causes no numerical oscillations of a light wrist, for any stiffness and damping. As h goes

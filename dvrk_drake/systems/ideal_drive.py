@@ -57,7 +57,7 @@ class PlantJoints:
 
 @dataclass(frozen=True)
 class DrivePorts:
-    """Ports that a drive provides to its station; see `ArmStation`. Vectors are in the arm's order of joints."""
+    """Ports of a drive that its station exports; see `ArmStation`. Vectors are in the arm's order of joints."""
 
     effort_commanded: InputPort
     effort_disturbance: InputPort

@@ -34,7 +34,7 @@ class ArmConfig:
 
     Attributes:
         arm: Name of an arm, or path of the arm's YAML file relative to the working directory.
-        closure: Method that closes the loops of the linkage: "ball" or "mimic".
+        closure: Method that closes the loops of the linkage: "ball" or "mimic"; see `add_arm`.
         gravity: Gravity vector (3,) in the base frame [m/s^2]. None: the gravity vector of the arm.
         effects: Additional position-dependent effects in the drive of the simulated arm. Controllers do not model them.
         stretch: Additional elastic cables of the simulated arm, by name of the actuator.

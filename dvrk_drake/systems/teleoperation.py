@@ -60,9 +60,10 @@ class Teleoperation(LeafSystem):
     compensation has no controller for this motion.)
 
     **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits. Each commanded position
-    then moves towards the clamped position within the velocity limit of the joint. If a desired pose has no solution,
-    e.g. at and above the remote centre of motion, only the jaw moves. If the handle moves beyond a limit, the tip stops
-    at the limit. When the handle returns, the tip moves again as defined by the control law.
+    then moves towards the clamped position within the velocity limit of the joint. If the inverse kinematics has no
+    solution for a desired pose, e.g. at and above the remote centre of motion, only the jaw moves. If the handle moves
+    beyond a limit, the tip stops at the limit. When the handle returns, the tip moves again as defined by the control
+    law.
 
     **Hold.** `desired_state` is constant with zero rates in any of these cases:
 
@@ -70,7 +71,7 @@ class Teleoperation(LeafSystem):
     - A number of an input is not finite, or its magnitude exceeds 1e6.
     - A joint of the follower is farther from its commanded position than its velocity limit times `MAX_LAG`. The jaw is
       not checked, because it may press on an object.
-    - The instrument is inside the cannula, i.e. less than `MIN_DEPTH` beyond the remote centre.
+    - The instrument is inside the cannula, i.e. its wrist centre is less than `MIN_DEPTH` beyond the remote centre.
 
     After each of these cases, X_MG and X_FT are stored again, as when the clutch closes. If the follower was moved
     externally while the clutch was open, the command is set to the measured position. Before the first finite

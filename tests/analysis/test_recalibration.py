@@ -135,7 +135,7 @@ def test_wrong_sign_is_rejected_in_short_recordings(name, seconds):
     for j, joint in enumerate(truth.arm.joint_names):
         tau = recording.tau.copy()
         tau[:, j] *= -1
-        with pytest.raises(RecordingError, match=rf"opposite to the efforts of the model \(correlation\): {joint} \(-"):
+        with pytest.raises(RecordingError, match=rf"opposite to the efforts of the model: {joint} \(correlation -"):
             refit_friction(model, dataclasses.replace(recording, tau=tau))
     assert refit_friction(model, recording).seconds > 0
 

@@ -44,9 +44,9 @@ def refused(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["modl"], 'Unknown command "modl". Did you mean "model"?; see dvrk-drake --help'),
+        (["modl"], 'Unknown command "modl". Did you mean "model"? See dvrk-drake --help'),
         (["--overwrite"], 'Unknown command "--overwrite"; see dvrk-drake --help'),
-        (["predict", "r.csv", "--mdel", "m.yaml"], "--model is required. Did you mean --model instead of --mdel?; see"),
+        (["predict", "r.csv", "--mdel", "m.yaml"], "--model is required. Did you mean --model instead of --mdel? See"),
         (["check", "r.csv", "--arm", "psm", "--arm", "psm"], "Parameter --arm specified multiple times; see"),
         (["arm", "--arm", "psm", "--pose", "-0.1", "-2e-1"], "a pose of PSM is 7 finite numbers"),
         (["identify", "--nonsense"], "Unknown option: --nonsense; see dvrk-drake identify --help"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,25 +18,6 @@ def document_functions() -> dict[str, object]:
     for block in re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL):
         exec(block, namespace)
     return namespace
-
-
-def test_documented_code_for_measured_js(tmp_path):
-    q, qd, tau = np.random.default_rng(4).normal(size=(3, 6, 8))
-    messages = [
-        SimpleNamespace(
-            header=SimpleNamespace(stamp=SimpleNamespace(sec=100, nanosec=10_000_000 * i)),
-            position=q[i],
-            velocity=qd[i],
-            effort=tau[i],
-        )
-        for i in range(6)
-    ]
-    document_functions()["write_measured_js"](messages, tmp_path / "ros.csv")
-    recording = read_recording(tmp_path / "ros.csv")
-    np.testing.assert_array_equal(recording.q, q[:, :7])
-    np.testing.assert_array_equal(recording.qd, qd[:, :7])
-    np.testing.assert_array_equal(recording.tau, tau[:, :7])
-    np.testing.assert_allclose(recording.t, np.arange(6) / 100, atol=1e-9)
 
 
 @pytest.mark.parametrize("average", [False, True])

@@ -1,4 +1,7 @@
-"""Checks a recording for channels that are exchanged, inverted, scaled or shifted."""
+"""Checks a recording for channels that are exchanged, inverted, scaled or shifted.
+
+Channel i of a recording consists of its columns qi, qdi and taui.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,9 @@ from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
-#: Smallest gain in log-likelihood at which a hypothesis is accepted. On the unmodified public motions, no exchange of
-#: channels has a positive gain. On public motions with one added error, the correct hypothesis has a gain of at least
-#: 25, and in most cases of more than 100.
+#: Smallest gain in log-likelihood at which a hypothesis of `check_channels` is accepted. On the unmodified public
+#: motions, no exchange of channels has a positive gain. On public motions with one added error, the correct hypothesis
+#: has a gain of at least 25, and in most cases of more than 100.
 MIN_GAIN = 20.0
 #: Smallest gain at which inverted channels are accepted. An arm is almost symmetric under reflection. Inverted channels
 #: therefore have gains of up to 46 on the unmodified public motions.
@@ -31,24 +34,25 @@ MIN_GAIN_AT_REST, MIN_EFFORT_GAIN_AT_REST = 30.0, 40.0
 SIMILAR_GAIN = 10.0
 #: Factors by which the recorded effort is multiplied for a test of the scale.
 SCALES = (0.5, 2.0)
-#: Largest ratio between the dissipated friction power and the friction power expected from the arm file. The public
+#: Largest accepted ratio of the dissipated friction power to the friction power expected from the arm file. The public
 #: recordings of one PSM on two days have ratios between 0.96 and 1.54.
 FRICTION_FACTOR = 1.7
 #: Smallest reported position offset [rad], [m], and smallest ratio of a reported offset to its standard error.
 MIN_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
-#: The offset of a joint is checked only if an offset of this size would be significant [rad], [m].
+#: The offset of a joint is checked only if an offset of this size [rad], [m] would be significant.
 MAX_UNDETECTED_OFFSET = 0.1, 0.01
-#: Largest duration of a segment [s]. Longer motions are divided into equal segments, which bounds the memory of a fit.
+#: Largest duration of a segment [s]. A longer motion is divided into equal segments, because the memory of a fit is
+#: proportional to the duration.
 MAX_SEGMENT_DURATION = 120.0
-#: Largest increase of the excess beyond a joint limit due to exchanged or inverted channels [rad], [m]. With a larger
-#: increase, the hypothesis is impossible.
+#: Largest accepted increase of the excess beyond a joint limit if channels are exchanged or inverted [rad], [m]. A
+#: hypothesis with a larger increase is rejected.
 LIMIT_MARGIN = 0.02, 0.002
 
 
 def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
-    """Tests hypotheses about the channels of a recording and reports those that fit the recording clearly better.
+    """Tests hypotheses about errors in the channels of a recording, and reports the likely errors.
 
-    The hypotheses are:
+    Channel i of a recording consists of its columns qi, qdi and taui. The hypotheses are:
 
     - The efforts of two channels are exchanged.
     - All signals of two channels are exchanged.
@@ -66,8 +70,8 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         arm: Arm that was recorded.
 
     Returns:
-        One refusal for exchanged or inverted channels. Otherwise, warnings for scales and offsets, and notes with the
-        joints whose effort scale or position offset is not identifiable from the recording.
+        One refusal for exchanged or inverted channels. Otherwise, warnings for wrong effort scales and for position
+        offsets, and notes with the joints whose effort scale or position offset is not identifiable from the recording.
 
     Raises:
         RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too coarsely.
@@ -105,7 +109,10 @@ def _segments(recording: Recording) -> list[Recording]:
 
 
 def _hypotheses(fit: ChannelFit) -> list[Finding]:
-    """Returns the hypotheses of exchanged and inverted channels. The size of each is its gain in log-likelihood."""
+    """Returns the hypotheses of exchanged and inverted channels.
+
+    The `size` of each finding is its gain in log-likelihood.
+    """
     findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
     return [*findings, *_full_inversions(fit)] if fit.moves else findings
 
@@ -184,7 +191,7 @@ def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
         qd = None if recording.qd is None else recording.qd[:, order]
         other = replace(recording, q=recording.q[:, order], qd=qd, tau=recording.measured_effort()[:, order])
         gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
-        yield _exchange(arm, (i, j), f"all signals of channels {i + 1} and {j + 1}", gain)
+        yield _exchange(arm, (i, j), f"all signals (q, qd, tau) of channels {i + 1} and {j + 1}", gain)
 
 
 def _exchanged(n: int, i: int, j: int) -> NDArray[np.int_]:
@@ -226,7 +233,10 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
         qd = None if recording.qd is None else recording.qd * signs
         other = replace(recording, q=recording.q * signs, qd=qd, tau=recording.measured_effort() * signs)
         gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
-        what = f"all signals of channel {i + 1} have the wrong sign. The arm model fits much better with opposite signs"
+        what = (
+            f"all signals (q, qd, tau) of channel {i + 1} have the wrong sign. The arm model fits much better with "
+            "opposite signs"
+        )
         advice = "Correct the columns of the file and check it again."
         yield Finding("refusal", "inverted channel", arm.joint_names[i], what, advice, (i,), gain)
 
@@ -234,7 +244,7 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
 def _gain_of(other: Recording, fit: ChannelFit) -> float:
     """Returns the gain in log-likelihood of a recording with exchanged, inverted or shifted channels.
 
-    If the recording is in actuator coordinates, the times of `fit` are used again.
+    If the recording is in actuator coordinates, the true times of the rows are those of `fit`.
     """
     clock = fit.clock if fit.recording.coordinates == "actuator" else None
     return ChannelFit(other, fit.arm, clock).log_likelihood - fit.log_likelihood
@@ -274,7 +284,10 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields a wrong effort scale for each actuator at rest. The size of each is its gain in log-likelihood."""
+    """Yields the most likely wrong effort scale of each actuator, for poses at rest.
+
+    The `size` of each finding is its gain in log-likelihood.
+    """
     for i in map(int, fit.used):
         scale, gain = _best_scale(fit, i)
         what = f"tau{i + 1} is about {1 / scale:g} times the effort expected from gravity"
@@ -305,8 +318,9 @@ def _uncertain_scale(arm: Arm, joints: list[int]) -> Iterator[Finding]:
 def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
     """Returns the largest accepted ratio (n,) of dissipated to expected friction power for each actuator.
 
-    In joint coordinates, the result includes the gear ratio of an actuator that moves only one joint. Reason: the roll
-    position in the recording that identified the PSM's friction may be that of the instrument disc or of the joint.
+    In joint coordinates, the result includes the gear ratio of an actuator that moves only one joint. Reason: the
+    friction in the PSM's arm file was identified from a recording whose roll position may be that of the instrument
+    disc or that of the joint.
     """
     if fit.recording.coordinates == "actuator":
         return np.full(fit.arm.num_joints, FRICTION_FACTOR)
@@ -316,7 +330,7 @@ def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
 
 
 def _offsets(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields a warning of the most likely position offset, and a note with the joints whose offset is not identifiable.
+    """Yields a warning for the most likely position offset, and a note on offsets that are not identifiable.
 
     Offsets of joints with parallel axes have similar effects, so the warning also lists the other possible joints.
     """

@@ -25,8 +25,9 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 #: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of the size of each
 #: parameter or coefficient.
 LINK_DEVIATION, EFFECT_DEVIATION = 0.3, 0.5
-#: Prior standard deviation of additional effects, as a share of the RMS effort: for viscous and Coulomb friction, and
-#: for offsets, springs and cables without a coefficient in the arm file.
+#: Prior standard deviations of the efforts of additional effects, as shares of the RMS effort. The first applies to
+#: viscous and Coulomb friction. The second applies to offsets, and to springs and cables without a coefficient in the
+#: arm file.
 FRICTION_DEVIATION, POSITION_DEVIATION = 0.1, 1.0
 #: Prior standard deviation of the base tilt [rad] and of a position offset [rad], [m].
 TILT_DEVIATION, OFFSET_DEVIATION = 0.05, (0.1, 0.01)
@@ -50,11 +51,12 @@ _STEP = 1e-3
 
 
 class ChannelFit:
-    """Linear model of a recording's efforts with priors for rigid bodies, base tilt and drive effects of the arm file.
+    """Linear model of a recording's efforts, with priors for its parameters.
 
-    All quantities are in actuator coordinates. A motion is low-pass filtered at the arm's `effort_cut_off` and sampled
-    at the lowest possible rate, so that a fit takes milliseconds. The model of poses at rest has gravity, springs,
-    cables and offsets only.
+    The parameters are those of the rigid bodies, of the base tilt, and of the drive effects in the arm file. All
+    quantities are in actuator coordinates. A motion is low-pass filtered at the arm's `effort_cut_off` and sampled at a
+    low rate (`OVERSAMPLING`), so that a fit takes milliseconds. The model of poses at rest has gravity, springs, cables
+    and offsets only.
 
     Attributes:
         recording: Recording that is fitted.

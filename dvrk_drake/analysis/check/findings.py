@@ -16,9 +16,9 @@ class Finding:
 
     Attributes:
         severity: "note" for information, "warning" if results will be less accurate, "refusal" if results would be
-            wrong.
+            wrong. `identify` rejects a recording with a refusal.
         kind: Short, stable name of the finding, e.g. "repeated rows".
-        where: Affected joints, channels or rows.
+        where: Affected joints, columns or rows, or source of the recording.
         what: Description of the problem with numbers, without a final period.
         advice: Sentences with the consequence and the recommended action, or "".
         joints: Indices of the affected joints, starting at 0.
@@ -39,9 +39,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class JointSignals:
-    """Statistics of the signals of one joint, or of its actuator for motor and sensor quantities.
+    """Statistics of the signals of one joint and of the actuator with the same name.
 
-    An attribute is None if it does not apply.
+    The attributes `range`, `coverage`, `effort` and `peak_effort` are those of the joint. All other statistics are
+    those of the actuator. An attribute is None if it does not apply.
 
     Attributes:
         name: Name of the joint.

@@ -258,7 +258,7 @@ def _noise(
     if period is None:
         what = "the motion does not repeat, so the repeatability of the efforts cannot be computed"
         advice = (
-            "Run an excitation motion at least twice. Repeatability is about the smallest possible error of a model."
+            "Run an excitation motion at least twice. Repeatability approximates the smallest possible model error."
         )
         return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
     floor = repeatability_floor(tau, rate, period, arm.identification.effort_cut_off)
@@ -266,7 +266,7 @@ def _noise(
     what = f"the period is {period:.4f} s ({1 / period:.4f} Hz), and the recording has {len(tau) / rate / period:.1f}"
     what += " periods"
     advice = (
-        "Compare the period with the commanded period. Repeatability is about the smallest possible error of a model."
+        "Compare the period with the commanded period. Repeatability approximates the smallest possible model error."
     )
     findings = [Finding("note", "repetition", "motion", what, advice, size=period)]
     for j, name in enumerate(arm.joint_names):
@@ -275,7 +275,7 @@ def _noise(
                 f"tau{j + 1} has noise between {band.lower:.0f} and {band.upper:.0f} Hz "
                 f"({100 * band.share:.0f} % of its RMS)"
             )
-            advice = "Low-pass filter the effort below this band before a fit."
+            advice = "Before a fit, low-pass filter the effort with a cut-off below this band."
             findings.append(Finding("note", "narrow-band noise", name, what, advice, (j,), band.share))
     return replace(
         report, joints=tuple(joints), period=period, floor_cut_off=arm.identification.effort_cut_off

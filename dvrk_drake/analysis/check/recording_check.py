@@ -34,13 +34,13 @@ IMPOSSIBLE_EXCESS = 0.3
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
 #: Largest relative error of the recorded times, estimated from q and qd. A larger error indicates a wrong unit or rate.
 TIME_TOLERANCE = 0.05
-#: Number of rows between two compared positions.
+#: Number of rows between two positions whose difference is compared with the integral of qd.
 BLOCK = 20
 _ORDER: dict[Severity, int] = {"refusal": 0, "warning": 1, "note": 2}
 
 
 def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
-    """Checks poses or a motion, without testing for exchanged channels.
+    """Checks poses or a motion, without the tests of `check_channels`.
 
     Limits are checked in joint coordinates. Sensors, motors and friction are checked in actuator coordinates. Problems
     of the recording are returned as findings. They are never raised as errors.
@@ -317,10 +317,11 @@ def require_usable(
 
 
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
-    """Checks a recording with `check_recording`, and its channels with `check_channels` if there are no other refusals.
+    """Checks a recording with `check_recording`, then its channels with `check_channels`.
 
-    Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels therefore
-    replaces the refusals for wrong signs.
+    The channels are not checked if `check_recording` reports a refusal, except for efforts with a wrong sign. Exchanged
+    channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels therefore replaces the
+    refusals for wrong signs.
     """
     report = check_recording(recording, arm)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]

@@ -70,7 +70,8 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     """Returns the mandatory effects of the model.
 
     These are the offset of every actuator and the viscous friction along every coordinate. For every coordinate that
-    moves, Coulomb and presliding friction and the effects in the arm file (`motion.known_effects`) are also mandatory.
+    moves, they also include the Coulomb friction, the presliding friction, and the effects that the arm file lists
+    (`motion.known_effects`).
 
     Raises:
         ArmError: The arm file contains an unknown coordinate, an unknown effect, or a cable effect of a prismatic

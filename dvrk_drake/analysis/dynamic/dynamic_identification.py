@@ -1,4 +1,4 @@
-"""Identifies the full dynamics of an arm from one motion: physically consistent links, rotors and drive effects."""
+"""Identifies the full dynamics of an arm from one motion: physically consistent link parameters, rotors and effects."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MIN_EFFECT = 1e-4
 class DynamicIdentification(Identification):
     """Model identified from a motion.
 
-    The model contains `dynamics`. The base parameters of gravity are computed from the identified links.
+    The model contains `dynamics`. The base parameters of gravity are computed from the identified link parameters.
 
     Attributes:
         grid: Resampled motion.
@@ -70,12 +70,12 @@ def identify_dynamic(
 
     The link parameters are physically consistent. For parameters that the recording does not identify, the estimates
     are the values of the SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a
-    base tilt. The cross-validated errors are prediction errors on held-out phases (`cross_validate`).
+    base tilt. The cross-validated errors are prediction errors on held-out folds (`cross_validate`).
 
     Args:
         recording: Motion with t and tau, in joint or actuator coordinates.
         arm: Arm that was recorded.
-        progress: Callback that receives the completed fraction, 0 to 1.
+        progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
         RecordingError: The recording does not match the arm, has no efforts, or is not a motion.
@@ -162,7 +162,7 @@ def motion_problem(
 def residuals(problem: DynamicProblem, effects: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
     """Returns the effort residuals (r, n) of a fit at the rows of `problem` [N m, N].
 
-    The fit can be based on other rows.
+    The rows used for the fit may be different.
 
     Args:
         problem: Problem that contains the rows.

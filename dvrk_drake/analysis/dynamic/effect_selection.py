@@ -26,7 +26,7 @@ class EffectSelection:
 
     Attributes:
         problem: Regression problem with the estimated gravity direction.
-        selection: Stepwise selection that uses all phases. If the base may tilt, the last two unknowns are the
+        selection: Stepwise selection that uses all folds. If the base may tilt, the last two unknowns are the
             components of the tilt.
         mandatory: Indices (s,) of the mandatory effects and of the tilt, in this order.
         selected: Indices (f,) of all included effects and of the tilt, in ascending order.
@@ -57,7 +57,7 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
 
     Args:
         problem: Regression problem of the motion.
-        progress: Callback that receives the completed fraction, 0 to 1.
+        progress: Callback that receives the finished share, 0 to 1.
     """
     tilts = len(problem.columns.tilts)
     mandatory = np.append(np.arange(problem.num_mandatory), problem.num_effects + np.arange(tilts))
@@ -78,15 +78,15 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
 def cross_validate(
     selection: EffectSelection, phi: NDArray[np.float64], progress: Callable[[float], object] = lambda _: None
 ) -> NDArray[np.float64]:
-    """Returns the sums of squared prediction errors (n,) of the actuators over all held-out phases.
+    """Returns the sums of squared prediction errors (n,) of the actuators over all held-out folds.
 
     One group of `NUM_HELD_OUT_FOLDS` adjacent folds is held out at a time. The effects are selected again without the
-    held-out phases. The direction of gravity and the physically consistent parameters are also estimated again.
+    held-out folds. The direction of gravity and the physically consistent parameters are also estimated again.
 
     Args:
-        selection: Selection that uses all phases.
-        phi: Rigid-body parameters (p,) that are used in the products with the tilt.
-        progress: Callback that receives the completed fraction, 0 to 1.
+        selection: Selection that uses all folds.
+        phi: Rigid-body parameters (p,), for the products of tilt and link parameters in the efforts.
+        progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
         IdentificationError: The solver did not converge.
@@ -105,8 +105,8 @@ def cross_validate(
     errors = np.zeros(len(problem.efforts))
     for first, (effects, weights, tilt) in zip(firsts, results, strict=True):
         progress(0.4 + 0.6 * first / equations.folds)
-        # Correct the efforts for the difference between the tilt of all phases and the tilt without the held-out
-        # phases.
+        # Correct the efforts for the difference between the tilt estimated from all folds and the tilt estimated
+        # without the held-out folds.
         T = np.zeros((size + 1, problem.num_rigid + len(effects) + 1))
         T[:b, : problem.num_rigid] = problem.columns.base
         T[b + np.searchsorted(used, effects), problem.num_rigid + np.arange(len(effects))] = 1.0

@@ -73,7 +73,8 @@ class ParameterUncertainty:
 #: Largest time lag at which effort errors are assumed to be correlated [s]. If the motion repeats, errors at lags near
 #: whole periods are also correlated.
 CORRELATION_TIME = 1.0
-#: Ratio of the sampling rate of the rows that are used to twice the cut-off frequency of the low-pass filter.
+#: Ratio of two rates: the rate of the rows from which the covariance is computed, and twice the cut-off frequency of
+#: the low-pass filter.
 _OVERSAMPLING = 2.0
 #: Smallest overlap of a motion with the same motion shifted by one period, as a share of the duration of the motion.
 #: With a smaller overlap, the errors that repeat are not estimated.
@@ -95,14 +96,15 @@ def parameter_covariance(
         A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
 
     where P is the Hessian of the priors, and X_i are the columns and w_i the weight of actuator i. Omega_i (r, r) is
-    the covariance matrix of the errors of actuator i at the rows. It is estimated from the residuals. Therefore slowly
+    the covariance matrix of the errors of actuator i at the rows. It is estimated from the residuals. Therefore, slowly
     varying errors, for example of the friction model, count as few measurements. Errors that repeat in every period
     count once, regardless of the number of periods.
 
-    For errors e and the hat matrix H, the residuals of a fit are (1 - H) e, which is smaller than e. The residuals of
-    held-out phases are (1 - H)^-1 e, which is larger by the same factor. The covariance is therefore estimated without
-    bias from products of a fit residual and a held-out residual (MacKinnon and White, "Some
-    heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
+    For independent errors with variance s^2, the residuals of a fold have the covariance (I - H) s^2, where H is the
+    block of the hat matrix for the fold. The residuals of a fold that is held out have the covariance (I - H)^-1 s^2.
+    The covariance of the errors is therefore estimated from products of a fit residual and a held-out residual, whose
+    expected value has no such factor (MacKinnon and White, "Some heteroskedasticity-consistent covariance matrix
+    estimators", 1985: HC2).
 
     Args:
         problem: Problem that was solved.
@@ -134,7 +136,8 @@ def _held_out_residuals(
 ) -> NDArray[np.float64]:
     """Returns the held-out residuals (r, n). The rows of each fold are predicted by a fit to the other folds.
 
-    This fit is one Newton step from `fit`, without a change of the parameters that are at their lower bounds.
+    The fit to the other folds is one Newton step from `fit`. It does not change parameters that are at their lower
+    bounds.
     """
     held_out = residuals.copy()
     free = np.flatnonzero(fit.x > fit.lower)
@@ -289,7 +292,7 @@ def base_parameter_estimates(
     """Returns the base parameters of gravity with standard errors, computed from the links of `section`.
 
     Args:
-        arm: Arm with the gravity direction of the section.
+        arm: Arm with the gravity direction of `section`.
         section: Identified dynamics.
         covariance: Covariance of all identified parameters. The link parameters come first.
     """

@@ -29,9 +29,9 @@ LINK_DEVIATION = 0.3
 #: Smallest prior standard deviation of a rotor inertia [kg m^2], and lower bound of a rotor inertia as a share of its
 #: value in the SDF.
 MIN_ROTOR_DEVIATION, MIN_ROTOR_SHARE = 3e-6, 0.1
-#: Prior standard deviations of the torque of an effect about 0, as shares of the RMS effort. The first applies to
-#: friction, which is a sum of several effects. The second applies to known position-dependent torques, which may
-#: balance gravity. The third applies to all other effects.
+#: Prior standard deviations of the torque of an effect, as shares of the RMS effort. The prior means are 0. The first
+#: applies to friction, which is a sum of several effects. The second applies to springs and cables that the arm file
+#: lists, because they may balance gravity. The third applies to all other effects.
 FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
 #: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
 TILT_DEVIATION = 0.05
@@ -140,8 +140,9 @@ class DynamicProblem:
         """Returns the stepwise selection of effects, with rigid-body unknowns in identifiable directions only.
 
         Args:
-            phi: Rigid-body parameters (p,) that are used in the products with the tilt. If the base may tilt, the two
-                components of the tilt are unknowns after the effects. If `phi` is None, the tilt is constant.
+            phi: Rigid-body parameters (p,), for the products of tilt and link parameters in the efforts. If the base
+                may tilt, the two components of the tilt are unknowns after the effects. If `phi` is None, the tilt is
+                constant.
             folds: If False, all rows are in one fold. This is sufficient for fits to the whole motion.
         """
         base, tilts = self.columns.base, len(self.columns.tilts) if phi is not None else 0
@@ -281,8 +282,8 @@ class ConsistentProgram:
         """Returns x (p + e,) for weighted sums of products (p + e + 1, p + e + 1), whose last column is the effort.
 
         The sums are scaled to units of the prior standard deviations. A Cholesky decomposition then reduces them to a
-        triangular matrix. In these units, no eigenvalue is below 1. Therefore the result is as accurate as that of a QR
-        decomposition of the rows.
+        triangular matrix. In these units, the normal matrix has no eigenvalue below 1. Therefore, the result is as
+        accurate as that of a QR decomposition of the rows.
 
         Raises:
             IdentificationError: The solver did not converge.

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalE
 
 #: Smallest reduction of the cross-validated relative error for which an effect is added. The error is averaged over the
 #: actuators. Smaller reductions are due to chance. On the public motions, a lower threshold adds different effects for
-#: different held-out phases, and increases the errors on these phases.
+#: different held-out folds, and increases the errors on these folds.
 MIN_GAIN = 0.005
 #: Number of candidate effects that are cross-validated in each step.
 NUM_TRIALS = 8
@@ -98,7 +98,7 @@ class StepwiseSelection:
         Args:
             mandatory: Indices of the effects that are always included. Index 0 is the first effect.
             candidates: Indices of the effects that may be added. Index 0 is the first effect.
-            progress: Callback that receives the estimated completed fraction, 0 to 1.
+            progress: Callback that receives the estimated finished share, 0 to 1.
 
         Returns:
             Indices (f,) of the mandatory and the added effects.

@@ -1,4 +1,4 @@
-"""Validates a dynamic model on a motion, and divides the error into parts with different causes."""
+"""Validates a dynamic model on a motion, and estimates the shares of the error that have different causes."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class DynamicValidation(Validation):
         return {actuator.name: actuator.relative_error for actuator in self.actuators}
 
     def as_dict(self) -> dict:
-        """Returns the data of `validate --json`."""
+        """Returns the output of `validate --json` as a dictionary."""
         return {
             "verdict": self.verdict,
             "rule": rule_text(in_motion=True),

@@ -19,13 +19,13 @@ from dvrk_drake.recordings.recording import Recording
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """Whitening filter x[t] - sum_k coefficients[k - 1] x[t - k step] for each channel.
+    """Whitening filter x[t] - sum_k coefficients[k - 1] x[t - k step] for each actuator.
 
     The step is half a period of the cut-off frequency of the low-pass filter. Samples at this interval contain the full
     bandwidth of the filtered signals.
 
     Attributes:
-        coefficients: Coefficients (n, order) of the channels.
+        coefficients: Coefficients (n, order) of the actuators.
         step: Number of rows between two values that the filter combines.
     """
 
@@ -60,7 +60,7 @@ class Whitening:
         return self.coefficients.shape[1] * self.step
 
     def __call__(self, x: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
-        """Returns the filtered rows (r - num_removed, ...) for the rows x (r, ...) of one channel."""
+        """Returns the filtered rows (r - num_removed, ...) for the rows x (r, ...) of one actuator."""
         y = x[self.num_removed :].copy()
         for k, a in enumerate(self.coefficients[channel], start=1):
             y -= a * x[self.num_removed - k * self.step : len(x) - k * self.step]
@@ -187,7 +187,7 @@ def _interpolate(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[
 
 
 def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recording: Recording) -> float:
-    """Returns the time shift [s] with the smallest difference of the positions in units of standard deviations."""
+    """Returns the time shift [s] that minimises the differences of the positions, divided by standard deviations."""
     deviation = np.std(other.q, axis=0)
     moving = deviation > 1e-3
     x, y = (grid.q[:, moving] / deviation[moving] for grid in (reference, other))

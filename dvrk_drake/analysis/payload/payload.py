@@ -28,7 +28,8 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Confidence level of the reported intervals.
 CONFIDENCE = 0.95
-#: Largest ratio of the cross-validated errors of two links that explain the change of the efforts equally well.
+#: Largest ratio of the cross-validated errors for payloads on two links that explain the change of the efforts equally
+#: well.
 SAME_ERROR = 1.05
 #: Smallest relative RMS difference between the efforts of two different recordings.
 MIN_DIFFERENCE = 1e-6
@@ -48,7 +49,8 @@ class PayloadActuator:
         change: Difference between the efforts of the recordings.
         payload: Effort of the payload.
         left: Residual after subtracting the payload and the changes of the drive.
-        explained: Explained share 1 - left^2 / change^2 [1], or None if the payload does not load the actuator.
+        explained: Share of the squared change that is explained, 1 - left^2 / change^2 [1], or None if the payload does
+            not load the actuator.
     """
 
     name: str
@@ -71,7 +73,7 @@ class Payload:
         largest_at_com: Upper end of the confidence interval for a mass at the link's own centre of mass [kg].
         position_in_base: Position (3,) of the payload in the base frame, with all joint positions at 0 [m].
         relative_error: Cross-validated RMS error with the payload divided by the error without a payload [1], as the
-            geometric mean over the actuators. The folds are parts of the phase of the motion.
+            geometric mean over the actuators. The folds are intervals of the phase of the motion.
         actuators: Efforts of the actuators, in the arm's order.
         shift: Time shift between the two recordings [s].
     """
@@ -132,19 +134,20 @@ def estimate_payload(
     """Estimates a point mass on each link from the change of the efforts. The best link is first.
 
     The model of the change of an actuator's effort has two parts: the ten regressor columns of the link with the
-    parameters of a point mass, and possible changes of the drives (`MotionDifference.changes`). The payload is assumed
-    to be small compared with its distance from the joint axes. This assumption separates mass and position on a link
-    that rotates about a fixed point. For such a link, only m p and the inertia m p p' are identifiable.
+    parameters of a point mass, and possible changes of the drives (`MotionDifference.changes`). The dimensions of
+    the payload are assumed to be small compared with its distance from the joint axes. On a link that rotates about a
+    fixed point, only m p and the inertia m p p' are identifiable for a mass m at position p. Because of the assumption,
+    m and p are nevertheless identifiable separately.
 
     The residual of each actuator is whitened (`Whitening`), because errors of offsets, friction and cables vary slowly,
     whereas inertia affects the high frequencies. The standard errors are computed by a delete-one jackknife over the
-    folds of `phase_folds`, because errors that repeat with the motion do not average out over the periods. They are at
-    least the standard errors for independent rows.
+    folds of `phase_folds`, because errors that repeat with the motion do not average out over the periods. The standard
+    errors are at least those for independent rows.
 
     Args:
         reference: Motion with efforts, without the payload.
         loaded: The same motion with the payload.
-        model: Model of the arm without the payload. It predicts the shape of Coulomb friction, and the effect of small
+        model: Model of the arm without the payload. It predicts the dry friction at each row, and the effect of small
             differences between the two motions.
         links: Names of the links. None means all moving links.
         progress: Callback that receives the finished share, 0 to 1.
@@ -152,7 +155,7 @@ def estimate_payload(
     Raises:
         RecordingError: A recording is not a motion of this arm, the recordings are not of the same motion, or their
             efforts are identical.
-        ModelError: A link does not exist.
+        ModelError: A link does not exist or does not move.
     """
     regressor = model.regressor
     names = [link.link for link in regressor.links]
@@ -227,7 +230,7 @@ def payload(
     Raises:
         RecordingError: `check` rejects a recording, or the two motions differ. The attribute `findings` of the error
             contains the reasons.
-        ModelError: The model has no dynamics, or the link does not exist.
+        ModelError: The model has no dynamics, or the link does not exist or does not move.
         IdentificationError: The model of the arm is not identifiable from `reference`.
 
     Example:

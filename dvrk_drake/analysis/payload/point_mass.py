@@ -62,8 +62,8 @@ class PointMassProblem:
     """Regression tau_i = Y_i phi(m, p) + N_i x_i for every actuator i.
 
     tau_i is the difference of the efforts, Y_i is the regressor of the link, and phi(m, p) are the inertial parameters
-    of the point mass. The nuisance parameters x_i are the coefficients of possible changes of the drive N_i, with
-    normal priors of mean 0.
+    of the point mass. The columns N_i describe possible changes of the drive. Their coefficients x_i are nuisance
+    parameters with normal priors of mean 0.
 
     Attributes:
         equations: Normal equations. The ten columns of the link come first, then the nuisance parameters.
@@ -159,7 +159,7 @@ class PointMassProblem:
     def budget(
         self, body: PointMass, weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the sums of squares (n,) of the efforts, of the efforts of the point mass, and of the residuals."""
+        """Returns the sums of squares (n,) of tau, of the efforts of the point mass, and of the residuals."""
         phi, total = body.parameters, self._total
         of_body = np.einsum("a,nab,b->n", phi, total[:, :_RIGID, :_RIGID], phi)
         return total[:, -1, -1], np.maximum(of_body, 0.0), self._residual_squares(total, total, phi, weights)

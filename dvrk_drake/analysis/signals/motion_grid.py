@@ -33,7 +33,7 @@ class MotionSignals:
         vd: Accelerations (m, n), low-pass filtered [rad/s^2, m/s^2].
         tau: Efforts (m, n), not filtered [N m, N]. Use the same filter for efforts and regressors, see `low_pass`.
         rows: Indices (k,) of the rows of the recording that are used. Rows that repeat the previous row are not used.
-        row_times: True times (k,) of these rows [s].
+        row_times: True times (k,) of these rows, see `true_time` [s].
         differentiated: Mask (n,) of the joints whose v is dq/dt, because qd is missing or disagrees with dq/dt.
     """
 
@@ -100,7 +100,7 @@ class MotionGrid:
         q: Positions (m, n) of the joints [rad, m].
         v: Velocities (m, n) of the joints [rad/s, m/s].
         vd: Accelerations (m, n) of the joints [rad/s^2, m/s^2].
-        row_times: True times (r,) of all rows of the recording [s].
+        row_times: True times (r,) of all rows of the recording, see `true_time` [s].
         rate: Mean rate of the rows [Hz].
         clock: True times of the rows that do not repeat the previous row.
     """
@@ -151,8 +151,8 @@ def default_settings(arm: Arm) -> SignalSettings:
 def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock: TrueTime | None = None) -> MotionGrid:
     """Resamples a motion to the grid.
 
-    Actuator positions are filtered and differentiated, because each actuator has its own encoder and cut-off. Recorded
-    velocities are used only for the times, see `true_time`.
+    Positions are filtered and differentiated in actuator coordinates, because each actuator has its own encoder and
+    cut-off. Recorded velocities are used only to estimate the true times of the rows, see `true_time`.
 
     Args:
         recording: Motion with t and efforts, in joint or actuator coordinates.

@@ -70,7 +70,7 @@ def repeatability_floor(
     Args:
         tau: Efforts (m, n) of the actuators at a constant rate [N m, N].
         rate: Sampling rate [Hz].
-        period: Period T of the motion [s], rounded to whole samples.
+        period: Period T of the motion [s]. The function rounds it to whole samples.
         cut_off: Cut-off of the low-pass filter [Hz].
 
     Returns:
@@ -102,8 +102,8 @@ def phase_folds(
 ) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
     """Assigns each inner row to a fold and marks the rows at the edges of the folds.
 
-    A periodic motion is divided by its phase, so that the other folds contain no repetitions of a held-out fold. Any
-    other motion is divided by time.
+    The folds of a periodic motion are intervals of its phase, so that the other folds contain no repetitions of a
+    held-out fold. The folds of any other motion are intervals of time.
 
     Args:
         grid: Resampled motion.

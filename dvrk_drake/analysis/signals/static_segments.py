@@ -74,7 +74,8 @@ def stationary_runs(
 ) -> Iterator[NDArray[np.int_]]:
     """Yields the row indices of each segment with low speed.
 
-    A segment ends at the row at which the distance of q exceeds `max_distance`. The next segment begins at this row.
+    A segment ends before the first row at which the distance of q from the start of the segment exceeds `max_distance`.
+    The next segment begins at this row.
 
     Args:
         still: Mask (m,) of the rows with low speed.

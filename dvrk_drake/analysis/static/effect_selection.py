@@ -62,7 +62,7 @@ class StaticProblem:
         self.sigma_floor = SIGMA_FLOOR * arm.effort_limits
 
     def subset(self, rows: NDArray[np.bool_]) -> StaticProblem:
-        """Returns the problem for the poses of a mask (m,)."""
+        """Returns the problem for the poses in the mask `rows` (m,)."""
         return StaticProblem(self.arm, self.q[rows], self.tau[rows], self.usable[rows])
 
     def regressor(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:

@@ -41,7 +41,7 @@ def find_excluded(
 
     Args:
         recording: Recording in joint coordinates, with efforts.
-        arm: Arm with the limits.
+        arm: Arm whose limits are used.
         measured: Mask (m, n) of the efforts that are holding torques. Only these efforts can be excluded. None: all
             efforts are holding torques.
     """

@@ -1,4 +1,4 @@
-"""Identifies the static model from poses and holding torques (Rutfield et al., 2015, III.I, with extensions)."""
+"""Identifies the static model from holding torques at poses (Rutfield et al., 2015, section III.I, with extensions)."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ class StaticIdentification(Identification):
 
     Attributes:
         excluded: Excluded measurements and the reasons for the exclusion.
-        residuals: Measured minus fitted efforts (m, n) [N m; N].
-        leave_one_out_residuals: Measured efforts minus predictions (m, n) of a fit to all other poses [N m; N].
+        residuals: Measured minus fitted efforts (m, n) [N m, N].
+        leave_one_out_residuals: Measured efforts minus predictions (m, n) of a fit to all other poses [N m, N].
         measured: Mask (m, n) of the efforts that are holding torques.
     """
 
@@ -80,11 +80,11 @@ def identify_static(
 
     Method "paper" is unweighted least squares on the base parameters (Rutfield et al., 2015, eq. 9-10).
 
-    Method "robust" (default) weights each joint by the reciprocal of its residual variance. It excludes measurements at
-    joint stops and outliers. Effects are selected by leave-one-out cross-validation. A prior from the effort limits
-    shrinks all parameters towards zero. The feedforward scale of a joint is reduced if the model's leave-one-out error
-    is not smaller than the error of zero torque, or if the joint hardly moved. Repeated samples of one pose are
-    averaged first, because they are not independent.
+    Method "robust" (default) weights each joint by the reciprocal of its residual variance. It excludes poses at a
+    joint stop, efforts beyond their limit, and outliers. Effects are selected by leave-one-out cross-validation. A
+    prior from the effort limits shrinks all parameters towards zero. The feedforward scale of a joint is reduced if the
+    model's leave-one-out error is not smaller than the error of zero torque, or if the joint hardly moved. Repeated
+    samples of one pose are averaged first, because they are not independent.
 
     Args:
         recording: Poses with efforts, in joint or actuator coordinates.

@@ -58,7 +58,7 @@ class StaticValidation(Validation):
     Attributes:
         joints: Errors of the joints, in the arm's order.
         poses: Number of poses.
-        residuals: Measured minus predicted efforts (m, n), in the coordinates of the recording [N m; N].
+        residuals: Measured minus predicted efforts (m, n), in the coordinates of the recording [N m, N].
         excluded: Measurements that the verdicts do not use, and the reasons for the exclusion.
         measured: Mask (m, n) of the efforts that are holding torques.
     """
@@ -76,7 +76,10 @@ class StaticValidation(Validation):
 
     @property
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each joint without excluded measurements [1], None if the effort is 0."""
+        """Ratio of RMS error to RMS measured effort of each joint [1], None if the effort is 0.
+
+        Excluded measurements are not used.
+        """
         return {joint.name: joint.relative_error_included for joint in self.joints}
 
     def as_dict(self) -> dict:

@@ -1,4 +1,4 @@
-"""Runs the complete workflow on a simulated arm: collection, identification, validation, release and step response."""
+"""Runs the complete workflow on a simulated arm: pose collection, identification, validation, release and step."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class DemoPlan:
         effects: Effects of the ground-truth arm that are not in the nominal model.
         release: Pose (n,) of the release [rad, m].
         step: Start pose (n,) of the step to `home` [rad, m].
-        home: Final pose (n,) of the release and of the step [rad, m].
+        home: Desired pose (n,) at the end of both simulations, release and step [rad, m].
         step_title: Title of the plot of the step.
         closure: Method for closing the loops of the ground-truth arm's linkage, see `add_arm`.
     """
@@ -108,16 +108,16 @@ class DemoResult:
     Attributes:
         arm: Arm of the demo.
         identification: Identification from the collected poses.
-        fresh: Errors of the identified model at new poses, which are not used for identification.
-        fresh_paper: Errors at these new poses of the model that the paper's least-squares method identified.
+        fresh: Errors of the identified model at fresh poses, which are not used for identification.
+        fresh_paper: Errors at the fresh poses for the model identified by the paper's least-squares method.
         release_time: Times (m,) of the release [s].
         released: Positions (m, n) during the release with the identified model [rad, m].
         released_nominal: Positions (m, n) during the release with the nominal model [rad, m].
-        drift: Largest distance (n,) of the released arm from the release pose [rad, m], by name of the model:
+        drift: Largest distance (n,) of each joint from its release position [rad, m], by name of the model:
             "identified" or "nominal".
         step_time: Times (k,) of the step [s].
-        step: Positions (k, n) of the step to the home pose [rad, m].
-        step_error: Final distance (n,) from the home pose [rad, m].
+        step: Positions (k, n) during the step to the home pose [rad, m].
+        step_error: Distance (n,) of each joint from its home position at the end of the step [rad, m].
     """
 
     arm: Arm
@@ -149,7 +149,7 @@ def run_demo(
         progress: Function called with the current step and its finished share, 0..1.
 
     Raises:
-        ArmError: The demo has no plan for this arm.
+        ArmError: The demo does not support this arm.
     """
     if arm_name not in PLANS:
         raise ArmError(f'the demo does not support the arm "{arm_name}"; allowed: {", ".join(PLANS)}')

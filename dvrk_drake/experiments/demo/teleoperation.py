@@ -1,4 +1,4 @@
-"""Teleoperation of a PSM by a master arm in a Meshcat scene, with a simulated hand or with live controls."""
+"""Teleoperation of a PSM (follower) by an MTML (master) in Meshcat, with a simulated hand or with live controls."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
-#: Ratio of the displacement of the tip to the displacement of the handle.
+#: Ratio of the displacement of the instrument tip to the displacement of the handle.
 SCALE = 0.4
-#: Start poses of the arms [rad, m]: the handle in front of the operator, the instrument in the middle of its range.
+#: Start poses of the arms [rad, m]: handle in front of the operator, instrument in the middle of its range.
 START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
 START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
-#: Positions of the bases in the world frame [m]. The orientations are equal.
+#: Positions of the bases in the world frame [m]. Both bases have the same orientation.
 BASE_POSITIONS = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
 CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
 #: Time intervals of the simulated motion in which the clutch is closed [s].
@@ -39,10 +39,11 @@ BLUE, GREEN, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.1, 0.7, 0.2), Rgba(0.55, 0.55,
 
 @dataclass(frozen=True)
 class TeleoperationResult:
-    """Tracking errors of the tip over all samples (one per `PERIOD`) with a closed clutch.
+    """Tracking errors of the instrument tip relative to the handle. Only samples with a closed clutch are evaluated.
 
     The position error is the difference between the tip's displacement and the handle's scaled displacement since the
-    clutch closed. The rotation error is the angle between the rotations of tip and handle since then.
+    clutch closed. The rotation error is the angle between the rotations of tip and handle since then. There is one
+    sample per `PERIOD`.
 
     Attributes:
         handle_path: Length of the handle's path with a closed clutch [m].
@@ -64,9 +65,9 @@ class _Samples:
     """Samples at every `PERIOD`.
 
     Attributes:
-        following: Whether the follower follows the master.
+        following: Whether the follower follows the master, for each sample.
         X_MG: Poses of the handle in the base frame of the master.
-        X_FT: Poses of the tip in the base frame of the follower.
+        X_FT: Poses of the instrument tip in the base frame of the follower.
     """
 
     following: list[bool]
@@ -118,8 +119,8 @@ def play_teleoperation(
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     """Simulates teleoperation in real time with controls for hand, clutch, jaw and scale in Meshcat.
 
-    The button Stop ends the simulation, or it ends after `duration` [s]. A sphere above the master is green while the
-    follower follows the master, else grey.
+    The simulation ends after `duration` [s], or earlier if the user clicks the button Stop. A sphere above the master
+    is green while the follower follows the master, and grey otherwise.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 
@@ -201,7 +202,7 @@ def _jaw_motion() -> PiecewisePolynomial:
 
 
 def _segments(following: list[bool]) -> list[range]:
-    """Returns the ranges of samples with the same state of the clutch."""
+    """Returns the ranges of consecutive samples with the same value of `following`."""
     changes = np.flatnonzero(np.diff(np.array(following, float))) + 1
     bounds = [0, *changes.tolist(), len(following)]
     return [range(a, b) for a, b in pairwise(bounds)]
@@ -249,7 +250,7 @@ def _points(poses: list[RigidTransform], segment: range) -> NDArray[np.float64]:
 
 
 def _draw_paths(meshcat: Meshcat, samples: _Samples) -> None:
-    """Draws the paths of handle and tip, blue while the clutch is closed and grey while it is open."""
+    """Draws the paths of handle and tip, blue while the follower follows the master and grey otherwise."""
     for k, segment in enumerate(_segments(samples.following)):
         color = BLUE if samples.following[segment[0]] else GREY
         for name, poses in (("mtml", samples.X_MG), ("psm", samples.X_FT)):

@@ -1,1 +1,4 @@
-"""Reproduction of the paper's experiments; `reports.reproduction` compares them with the published numbers."""
+"""Reproduction of the paper's experiments (Rutfield et al., WPI 2015).
+
+`reports.reproduction` compares the results with the published numbers.
+"""

@@ -27,7 +27,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 
 #: Sample period [s].
 SAMPLE_PERIOD = 0.02
-#: Duration of a release [s]; maximum distance from the release pose at which a joint counts as held [rad], [m].
+#: Duration of the motion after a release [s]; maximum distance of a held joint from its release position [rad], [m].
 DURATION = 10.0
 BAND = 0.015, 0.0015
 #: Approach to the release pose: distance [rad], [m], duration [s], and settling time at the release pose [s].
@@ -43,11 +43,13 @@ class Release:
         ground_truth_arm: Arm to simulate.
         parts: Names of the simulated effects, see `ArmEffects.only`.
         model: Path of the controller's model file.
-        start: Release pose (n,) [rad, m]. Without an approach, the friction is unloaded there.
-        with_approach: Whether the arm first moves to the pose from a distance of `APPROACH`, which loads the friction.
+        start: Release pose (n,) [rad, m]. Without an approach, the presliding springs carry no force at this pose.
+        with_approach: Whether the arm first moves to the pose from a distance of `APPROACH`. This motion loads the
+            presliding springs.
         damped: Whether the controller damps the motion in addition to compensating gravity (mode "damped").
-        hysteresis_ratio: Compensated share of the wide hysteresis, which moves a released arm back.
-        duration: Duration [s].
+        hysteresis_ratio: Compensated share of the wide hysteresis. After an approach, this hysteresis moves the
+            released arm back.
+        duration: Duration of the motion after the release [s].
         seed: Seed of the effects' noise.
     """
 
@@ -119,24 +121,24 @@ def release_all(
 
 @dataclass(frozen=True, eq=False)
 class Drifts:
-    """Results of releases of `arm`: `positions` (cases, samples, n) [rad, m]."""
+    """Positions (cases, samples, n) of `arm` after several releases [rad, m]."""
 
     arm: Arm
     positions: NDArray[np.float64]
 
     @property
     def final(self) -> NDArray[np.float64]:
-        """Final displacements (cases, n) from the release poses."""
+        """Final displacements (cases, n) from the release poses [rad, m]."""
         return self.positions[:, -1] - self.positions[:, 0]
 
     @property
     def largest(self) -> NDArray[np.float64]:
-        """Largest distances (cases, n) from the release poses."""
+        """Largest distances (cases, n) from the release poses [rad, m]."""
         return np.abs(self.positions - self.positions[:, :1]).max(axis=1)
 
     @property
     def held(self) -> NDArray[np.bool_]:
-        """Returns a mask (cases, n): True for a joint that always stayed within `BAND` of its release position."""
+        """Mask (cases, n): True for a joint that always stayed within `BAND` of its release position."""
         return self.largest <= self.arm.per_joint(*BAND)
 
     @property

@@ -1,4 +1,4 @@
-"""Evaluates the mechanisms of the simulated arms: DH parameters of the MTM, remote centre and wrist axes of the PSM."""
+"""Evaluates the mechanisms of the simulated arms: DH table of the MTM; remote centre and wrist axes of the PSM."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from dvrk_drake.experiments.reproduction.published import LENGTHS, TableRow
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 
-#: Number of poses from which the rows of the table are computed.
+#: Number of random poses from which the rows of the DH table are computed.
 POSES = 20
 
 
 def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
-    """Computes the DH table from the motion of the plant.
+    """Computes the DH table of an MTM from the motion of the plant's frames `paper_0` to `paper_7`.
 
-    The frames `paper_0..7` are fixed to the links, and the plant determines their relative motion. Therefore a joint
-    axis that differs from its row of the table causes an error.
+    These frames are fixed to the links. If the motion between two consecutive frames is not that of a DH
+    joint, the returned error is large.
 
     Returns:
-        Table (n, 5) with the columns sign, offset [rad], d [m], alpha [rad], a [m], and the largest difference between
-        an entry of the table's transformation matrices and the plant's (translations in m).
+        - Table (n, 5) with the columns sign, offset [rad], d [m], alpha [rad] and a [m].
+        - Error: largest difference between an entry of the DH matrices and of the plant's transforms (translations in
+          m).
     """
     plant = make_arm_plant(arm)
     poses = np.vstack([np.zeros(arm.num_joints), arm.sample_poses(POSES, np.random.default_rng(0))])
@@ -47,7 +48,7 @@ def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
 
 
 def _transforms(plant: MultibodyPlant, arm: Arm, q: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Returns the transforms (4, 4) between consecutive frames of the table, one per joint."""
+    """Returns the transforms (4, 4) between consecutive frames `paper_0` to `paper_7`, one per joint."""
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, q)
     frames = [plant.GetFrameByName(f"paper_{i}") for i in range(arm.num_joints + 1)]
@@ -61,7 +62,7 @@ def _dh_transform(theta: float, d: float, alpha: float, a: float) -> NDArray[np.
 
 
 def published_row(row: TableRow) -> NDArray[np.float64]:
-    """Returns a row (5,) of Table I with the real lengths: sign, offset [rad], d [m], alpha [rad], a [m]."""
+    """Returns a row (5,) of Table I with numbers for its lengths: sign, offset [rad], d [m], alpha [rad], a [m]."""
     d, a = ((-1) ** symbol.startswith("-") * LENGTHS[symbol.lstrip("-")] + 0.0 for symbol in (row.d, row.a))
     return np.array([row.sign, row.offset, d, row.alpha, a])
 
@@ -74,8 +75,8 @@ def mechanism_errors(arm: Arm) -> tuple[float, float]:
     """Evaluates the mechanism of the PSM at random poses.
 
     Returns:
-        Maximum distance of the shaft axis from the remote centre [m], and minimum angle between the axes of wrist pitch
-        and wrist yaw [rad].
+        Maximum distance of the axis of the instrument shaft from the remote centre [m], and minimum angle between the
+        wrist pitch axis and the wrist yaw axis [rad].
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()

@@ -1,4 +1,4 @@
-"""Published numbers and recordings of the paper, and conversion of its parameters to a model for our controller.
+"""Numbers and recordings that the paper's team published, and conversion of its parameters to a model.
 
 Source: Rutfield, Zia, Boos, Santoso, Sujumnong, "Gravity Compensation Control of da Vinci Robot", WPI 2015, and the
 team's repository WPI-AIM/dvrk_gravity_comp. Drifts are digitised from the team's plots.
@@ -23,7 +23,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.recordings.recording import Recording, read_recording
 
-#: Real lengths of the symbols in Table I [m]. L1 does not affect any joint and is 0 in the SDF.
+#: Values of the length symbols in Table I for the real arm [m]. L1 does not affect any joint and is 0 in the SDF.
 LENGTHS = {"0": 0.0, "L1": 0.0, "L2": 0.2794, "L3": 0.3645, "L4": 0.1506}
 
 
@@ -54,7 +54,7 @@ TABLE_1 = (
     TableRow(-1, 0.0, "0", 0.0, "0"),
 )
 
-#: The twelve parameters [kg m] in the paper's order, identified with g = 9.9 m/s^2 and used with 9.81.
+#: The paper's twelve parameters [kg m] in its order, identified with g = 9.9 m/s^2. Its controller uses 9.81 m/s^2.
 PARAMETERS = (0.0414, -0.0192, 0.0328, 0.0095, -0.0033, -0.0003, -0.0071, -0.0188, -0.0015, -0.0003, -0.0001, 0.0005)
 #: First moment that each parameter represents: link (from 1), and axis of its frame in Table I. Each parameter also
 #: contains other first moments with the same effect on the torques.
@@ -78,8 +78,8 @@ IDENTIFICATION_GRAVITY, CONTROL_GRAVITY = 9.9, 9.81
 #: Mean squared errors of Fig. 4 over the 72 poses [(N m)^2], J2..J7.
 FIGURE_4_MEANS = (8.14e-3, 7.96e-3, 1.97e-3, 4.62e-4, 3.98e-5, 1.92e-5)
 
-#: Final drift [rad], J2..J7: trials of Fig. 5 and 6, and mean absolute drift over the team's five trials of each
-#: figure.
+#: Final drift [rad], J2..J7: the trials shown in Fig. 5 and Fig. 6; for each figure, mean absolute drift over the
+#: team's five trials.
 FIGURE_5 = (0.0102, 0.0051, -0.0138, -0.174, -0.021, 0.0)
 FIGURE_6 = (0.0101, -0.0099, 0.0050, -0.003, -0.316, -0.071)
 FIGURE_5_MEANS = (0.070, 0.020, 0.0085, 1.29, 0.315, 0.730)
@@ -126,7 +126,7 @@ def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETER
 
 
 def paper_model(arm: Arm) -> IdentifiedModel:
-    """Returns a model whose torque equals `paper_torque`. Our base parameters can represent these torques."""
+    """Returns a model whose torque equals `paper_torque`. The base parameters can represent these torques exactly."""
     q = arm.sample_poses(_POSES, np.random.default_rng(0))
     model = IdentifiedModel.from_arm(arm)
     Y = model.static_model.regressor(q)
@@ -149,14 +149,14 @@ def with_zero_torque(model: IdentifiedModel, joints: Sequence[int]) -> Identifie
 STATIC, FIGURE_4 = "mtm_2015_good72.csv", "paper_fig4_squared_errors.csv"
 #: Recorded arm. The first moment of its wrist brackets shows that it is an MTMR (docs/public_recordings.md).
 PAPER_ARM = "mtmr"
-#: Environment variable with the folder that contains data/mtm_static, also used by the tests.
+#: Environment variable: path of the folder that contains data/mtm_static. The tests also use it.
 VARIABLE = "DVRK_DRAKE_SHARED"
 _INSTRUCTIONS = "To create it from the team's repository, see docs/public_recordings.md."
 
 
 @dataclass(frozen=True)
 class PaperRecordings:
-    """Files of the paper's recordings in `folder`, which is None if the files are not available."""
+    """Files of the paper's recordings in `folder`. The folder is None if the files are not available."""
 
     folder: Path | None
 

@@ -1,4 +1,4 @@
-"""Resources that the figures of one run share: folder, recordings, workers, and identified arms."""
+"""Data that the figures of one reproduction share: output folder, recordings, workers, and identified arms."""
 
 from __future__ import annotations
 
@@ -37,9 +37,8 @@ class SampleSizes:
     Attributes:
         collected: Number of poses for the identification of an arm.
         releases: Number of random release poses for our model.
-        paper_releases: Number of these poses, from the first one, that are also used for the paper's parameters.
-        hand_guided_releases: Number of these poses, from the first one, that are also used for our model after an
-            approach.
+        paper_releases: Number of the first release poses that are also used for the paper's parameters.
+        hand_guided_releases: Number of the first release poses that are also used for our model with an approach.
         psm_releases: Number of random release poses of the PSM.
         path_poses: Number of poses on the path of an operator.
         duration: Duration of a release [s].
@@ -73,10 +72,10 @@ class IdentifiedArm:
 
 @dataclass(eq=False)
 class ReproductionSession:
-    """Session of the reproduction. All resources are created at their first use.
+    """Reproduction of the paper's experiments. `mtm`, `psm` and `paper_file` are created at their first use.
 
     Attributes:
-        folder: Folder of the results.
+        folder: Output folder.
         recordings: Recordings of the paper's arm.
         executor: Executor of the simulations.
         progress: Function called with the step and its finished share, 0..1.
@@ -110,7 +109,7 @@ class ReproductionSession:
     def paper_file(self) -> Path:
         """Path of the model file with the paper's parameters.
 
-        For a perturbed ground-truth arm, the paper's method identifies this model from the poses of our model.
+        For a perturbed ground-truth arm, the paper's method identifies this model from the same poses as our model.
         """
         mtm, path = self.mtm, self.folder / "paper_model.yaml"
         if mtm.truth.is_paper_arm:
@@ -200,7 +199,7 @@ class OperatorCase:
         arm: Arm to simulate.
         model: Path of the controller's model file, or "" for unpowered motors.
         friction_ratio: Compensated share of the friction.
-        poses: Number of random poses on the path.
+        poses: Number of random poses that define the path.
         seed: Seed of the path and of the effects' noise.
     """
 

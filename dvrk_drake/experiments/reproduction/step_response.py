@@ -30,7 +30,8 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 DURATION, OUR_DURATION = 60.0, 10.0
 #: Period of the paper's controller and sample period of all results [s].
 PERIOD = 0.01
-#: Inertia of each link about each axis in the paper's model [kg m^2], from the team's PSM file and the period of J2.
+#: Inertia of each link about each axis in the paper's model [kg m^2], from the PSM file of the paper's team and the
+#: period of J2 in Fig. 7.
 LINK_INERTIA = 1.0
 #: Mass [kg] and inertia [kg m^2] of linkage bars and rotors, which the paper's model does not have.
 _NEGLIGIBLE = 1e-6
@@ -57,13 +58,13 @@ def simulate_paper_controller(
     """Simulates the paper's controller (equation 11).
 
     Joints 6 and 7 start at their published amplitudes, since the published start pose does not excite them. In the
-    paper's Gazebo simulation an unknown disturbance excited them.
+    paper's Gazebo simulation, an unknown disturbance excited them.
 
     Args:
         arm: Arm of `paper_simulated_arm`.
         duration: Duration [s].
-        faulty: Whether the damping terms of some joints use positions instead of velocities, as in the team's
-            controller.
+        faulty: Whether the damping terms of some joints use positions instead of velocities, as in the
+            controller that the paper's team published.
         progress: Function called with the finished share, 0..1.
 
     Returns:

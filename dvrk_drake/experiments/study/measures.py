@@ -1,4 +1,4 @@
-"""Measures of a simulated run: numbers, e.g. settling time, and boolean criteria, e.g. whether the pose is held.
+"""Measures of a simulated run: numbers, e.g. the settling time, and boolean measures, e.g. `held`.
 
 This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
@@ -25,7 +25,7 @@ class Measure:
         kind: Kind of the measure, one of `KINDS`.
         name: Column in the results. Default: the kind.
         band: Tolerance band [rad, m]. Default: that of the kind.
-        time: Duration [s]. Default: that of the kind.
+        time: Duration of the evaluated interval [s]. Default: that of the kind.
         joints: Names of the evaluated joints. Default: all.
     """
 
@@ -47,12 +47,12 @@ class Measure:
 
     @property
     def is_boolean(self) -> bool:
-        """Returns whether the measure is boolean."""
+        """True for a boolean measure."""
         return isinstance(self.worst, bool)
 
     @property
     def worst(self) -> float | bool:
-        """Value for a run that could not be simulated to its end."""
+        """Value for a failed run, i.e. a run that could not be simulated to its end."""
         return KINDS[self.kind].worst
 
     def check(self, scenario: Scenario) -> None:
@@ -79,8 +79,8 @@ class Measure:
         if kind.time is not None and not 2 * scenario.sample_period <= self._time <= rest + 1e-9:
             raise StudyError(
                 f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s. The "
-                "minimum is two sample periods. The maximum is the duration after the last target and the release "
-                "by the hand."
+                "minimum is two sample periods. The maximum is the duration after the last target or the release by "
+                "the hand, whichever is later."
             )
         if self.kind == "overshoot" and not scenario.targets:
             raise StudyError("overshoot requires a scenario with targets")
@@ -196,8 +196,8 @@ class Kind(NamedTuple):
         compute: Function that computes the measure from a run, band and time.
         unit: Unit of the value, "" for shares and boolean measures.
         band: Default tolerance band [rad, m]; None if the kind has no band.
-        time: Default duration [s]; None if the kind has no duration.
-        worst: Value for a run that failed.
+        time: Default duration of the evaluated interval [s]; None if the kind has no such interval.
+        worst: Value for a failed run.
     """
 
     compute: Callable[[_Run, float, float], float | bool]
@@ -218,8 +218,8 @@ class Kind(NamedTuple):
 #: drift: Maximum distance, in the last `time`, from the pose at the start of this interval.
 #: drift_rate: Absolute slope of a line fitted to the positions in the last `time`.
 #: effort_share: Maximum effort divided by the joint's limit.
-#: held: Whether the arm stays within `band` of the desired pose for `time` after the last target or the release.
-#: ran_away: Whether the distance from the desired pose ever exceeds `band`.
+#: held: Whether all joints stay within `band` of the desired pose for `time` after the last target or the release.
+#: ran_away: Whether the distance of any joint from the desired pose ever exceeds `band`.
 KINDS = {
     "settling_time": Kind(_settling_time, "s", 1e-3, None, math.inf),
     "overshoot": Kind(_overshoot, "rad", None, None, math.inf),

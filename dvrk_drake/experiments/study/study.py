@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from distributed import Client
 
 Result = TypeVar("Result")
-#: Function called with the number of available rows and the number of all cases.
+#: Function called with the number of finished cases and the number of all cases.
 Progress = Callable[[int, int], None]
 
 
 def run_study(
     study: Study, executor: Executor, output: str | Path, progress: Progress = lambda done, all_cases: None
 ) -> dict[int, Row]:
-    """Runs the missing cases of `output`. The results depend neither on the executor nor on interruptions.
+    """Runs the cases that are not yet in `output`. The results depend neither on the executor nor on interruptions.
 
     Args:
         study: Study to run.
@@ -51,7 +51,7 @@ def run_study(
 
     Raises:
         StudyError: The study or the output is invalid, or workers were lost. After a loss, the output contains the
-            finished cases, and the same call runs the missing cases. The `__cause__` of the error is the exception of
+            finished cases, and a repeated call runs the missing cases. The `__cause__` of the error is the exception of
             the first loss.
         ScenarioError, ArmError, ModelError: The scenario or one of its variations is invalid.
     """
@@ -118,7 +118,7 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
     """Runs a study on this computer, see `run_study`. If a worker is killed, a new pool runs the missing cases.
 
     Raises:
-        StudyError: `run_study` raises it for another reason than lost workers, or `MAX_POOLS` pools lost a worker.
+        StudyError: See `run_study`. For killed workers, it is raised only if `MAX_POOLS` pools lost a worker.
     """
     for pool in range(MAX_POOLS):
         try:
@@ -134,8 +134,8 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
     """Provides worker processes on this computer, by default one per core.
 
-    The workers end at the end of the block. After an error, they end immediately. They also end if this process is
-    killed. The workers are spawned, so a script that uses this function needs `if __name__ == "__main__":`.
+    The workers end at the end of the `with` block. After an error, they end immediately. They also end if this process
+    is killed. The workers are spawned, so a script that uses this function needs `if __name__ == "__main__":`.
     """
     # Workers read these variables at their start. More BLAS threads per worker would compete for the cores.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -187,8 +187,8 @@ def dask_executor(address: str) -> Iterator[Executor]:
     disabled.
 
     Raises:
-        StudyError: The package distributed is not installed, the scheduler does not answer, or it has no suitable
-            workers.
+        StudyError: The package distributed is not installed, the scheduler cannot be reached, or it has no
+            workers with the same software versions.
     """
     if not re.fullmatch(r"tcp://\S+:\d+", address):
         raise StudyError(f'"{address}" is not the address of a scheduler; allowed: tcp://HOST:PORT')

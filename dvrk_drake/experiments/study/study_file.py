@@ -80,8 +80,8 @@ class Study:
         set: Settings "key=value" of the scenario, as for `dvrk-drake simulate --set`.
         poses: Start poses, one list of n numbers [rad, m] each. Default: the start of the scenario.
         random_poses: Random start poses, instead of `poses`.
-        seeds: Seeds. The seed of a run is computed from one of these seeds and the number of the pose, so that runs are
-            independent. All variations use the same seeds.
+        seeds: Seeds. The seed of a run is computed from one of these seeds and the number of the pose, so that runs of
+            one variation are independent. All variations use the same seeds.
         variations: Variations of the scenario. Default: the unchanged scenario.
         measures: Measures that are computed for each run.
     """
@@ -110,7 +110,7 @@ class Study:
 
     @cached_property
     def cases(self) -> tuple[Case, ...]:
-        """All cases, ordered by pose, so that the first cases form a smaller study."""
+        """All cases, ordered by pose, so that an incomplete study contains all variations of its first poses."""
         starts = self._starts()
         runs = [(k, seed, v.name) for k in range(len(starts)) for seed in self.seeds for v in self.variations]
         return tuple(Case(i, v, k, _seed_of_run(seed, k), tuple(starts[k])) for i, (k, seed, v) in enumerate(runs))

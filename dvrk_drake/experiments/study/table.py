@@ -114,7 +114,7 @@ class StudyTable:
             where = f"{self._path}, line {line}"
             if header != self._header or cells[:1] != [self._study.fingerprint]:
                 raise StudyError(
-                    f"{where}: the results are from a different study. The files of the study or "
+                    f"{where}: the results are from a different study, or the files of the study or "
                     "the installed versions have changed since then. Give another output."
                 )
             if len(cells) != len(header) or not cells[1].isdigit() or int(cells[1]) >= len(self._study.cases):

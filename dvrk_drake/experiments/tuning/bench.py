@@ -55,9 +55,9 @@ def ideal_model(arm: Arm) -> IdentifiedModel:
     return IdentifiedModel.from_arm(arm, [*arm.effects.cables, *arm.effects.springs])
 
 
-#: Maximum holding effort in tuning poses, as a share of the motor's maximum effort. In other poses a motor may saturate
-#: for any gains. For example, in a part of the joint box, the torque of an MTM's wrist spring exceeds the maximum
-#: torque of the motor.
+#: Maximum holding effort at tuning poses, as a share of the motor's maximum effort. At other poses, a motor may
+#: saturate for any gains. For example, in a part of the joint box, the torque of an MTM's wrist spring exceeds the
+#: maximum torque of the motor.
 MAX_HOLDING_SHARE = 0.5
 
 
@@ -81,7 +81,7 @@ def tuning_poses(arm: Arm, count: int, seed: int) -> NDArray[np.float64]:
 
 
 def middle_pose(arm: Arm) -> NDArray[np.float64]:
-    """Returns the tuning pose (n,) nearest to the middle of the joint box, relative to the joint ranges."""
+    """Returns the tuning pose (n,) nearest to the middle of the joint box. Distances are shares of the joint ranges."""
     poses = tuning_poses(arm, 200, 0)
     width = arm.position_upper - arm.position_lower
     middle = 0.5 * (arm.position_upper + arm.position_lower)
@@ -190,7 +190,10 @@ class Bench:
         self._inertias = _scaled_links(self._station.plant, condition.inertia)
 
     def step(self, q: NDArray[np.float64], q_desired: NDArray[np.float64], gains: Gains, duration: float) -> Response:
-        """Simulates a step from q (n,), at rest and with unloaded friction, to q_desired (n,) at time 0."""
+        """Simulates a step at time 0 from q (n,) to q_desired (n,).
+
+        The arm starts at rest, and the presliding springs carry no force.
+        """
         root = self._diagram.CreateDefaultContext()
         station = self._station.GetMyMutableContextFromRoot(root)
         controller = self._controller.GetMyMutableContextFromRoot(root)

@@ -19,8 +19,8 @@ from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_pos
 DAMPING_RATIO = 0.8
 #: Minimum phase margin [rad] and minimum gain margin, at the smallest and the largest inertia of the joint.
 PHASE_MARGIN, GAIN_MARGIN = np.pi / 6, 2.0
-#: Maximum effort due to one encoder count, as a share of the maximum effort. An effort up to the dry friction is always
-#: allowed.
+#: Maximum change of the effort due to one encoder count, as a share of the maximum effort. A change up to the dry
+#: friction is always allowed.
 MAX_COUNT_EFFORT = 0.05
 #: Maximum time until the integral term moves a joint that sticks at the edge of its settling band [s].
 BREAK_AWAY_TIME = 0.25
@@ -64,7 +64,7 @@ class JointDesign:
     Attributes:
         kp, kd, ki: Gains [N m/rad, N m s/rad, N m/(rad s)], with N/m instead of N m/rad for a prismatic joint.
         frequency: Natural frequency of the closed loop at the largest inertia [rad/s].
-        margins: Margins at the smallest and at the largest inertia.
+        margins: Stability margins at the smallest and at the largest inertia.
         limited_by: Requirement that the next higher frequency violates.
     """
 
@@ -95,8 +95,8 @@ def design_arm(arm: Arm) -> ArmDesign:
     """Designs the gains of each joint separately, then checks the stability of all joints together.
 
     The closed loop of all joints must be stable at all checked poses, with one additional period of delay and 20 % less
-    inertia. While it is unstable, the function reduces the natural frequency of the joint with the largest share of the
-    unstable mode's energy by 10 %.
+    inertia. While it is unstable at a pose, the function reduces the natural frequency of one joint by 10 %: the joint
+    with the largest share of the unstable mode's energy.
 
     Raises:
         ControllerError: No gains satisfy the requirements, for one joint or for all joints together.
@@ -187,7 +187,10 @@ def sampling_of(arm: Arm, period: float = 1e-3) -> Sampling:
 
 
 def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Computes the mass matrices (m, n, n) at poses (m, n), including the linkage and the rotors: G' M G."""
+    """Computes the mass matrices (m, n, n) at poses (m, n), including the linkage and the rotors.
+
+    They are G' M G with the mass matrix M of the joints `arm.tree_joint_names` and G = `arm.linkage.matrix`.
+    """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     tree, G = tree_selector(plant, arm), arm.linkage.matrix
@@ -199,7 +202,7 @@ def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def joint_properties(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointProperties, ...]:
-    """Returns the properties of each joint from `masses` (m, n, n) at poses of the whole joint box."""
+    """Returns the properties of each joint. `masses` (m, n, n) are mass matrices at poses of the whole joint box."""
     least = 1.0 / np.max(np.diagonal(np.linalg.inv(masses), axis1=1, axis2=2), axis=0)
     largest = np.max(np.diagonal(masses, axis1=1, axis2=2), axis=0)
     columns = (

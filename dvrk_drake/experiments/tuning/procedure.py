@@ -1,8 +1,11 @@
-"""Tuning procedure of the paper (section III.J).
+"""Tuning procedure of the paper (Rutfield et al., WPI 2015, section III.J).
 
 The procedure raises Kp until the joint oscillates, then Kv until the oscillation is damped, and then Ki until the
-remaining position error (offset) is inside the settling band. The paper does not state the stopping criteria. Those
-used here are the constants of this module.
+remaining position error (offset) is inside the settling band. Kv is the paper's name for kd. The paper does not state
+the stopping criteria. Those used here are the constants of this module.
+
+In this module, a release is a test with proportional control only. The joint starts at rest, at the distance `step`
+from its desired position.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ class Oscillation:
     """Oscillation of a joint. A swing is the motion from one turning point to the next.
 
     Attributes:
-        swings: Number of swings. The first swing is not evaluated, since friction and integral are zero at its start.
+        swings: Number of swings. The first swing is not evaluated, since friction is zero at its start.
         growth: Mean ratio of the amplitudes of consecutive swings; 0 for too few swings.
         period: Period of the oscillation, i.e. duration of two swings [s]; infinite for too few swings.
     """
@@ -42,7 +45,7 @@ MIN_EVALUATED_SWINGS = 3
 
 
 def evaluate_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold: float) -> Oscillation:
-    """Evaluates the oscillation of positions x (m,) at times t (m,) after a release from rest.
+    """Evaluates the oscillation of positions x (m,) at times t (m,) in a release.
 
     Motions smaller than `threshold` [rad, m] are not counted as swings.
     """
@@ -81,8 +84,8 @@ KP_FACTOR, NUM_BISECTIONS = 2.0, 5
 OVERSHOOT, OVERSHOOT_WITH_INTEGRAL = 0.05, 0.15
 #: Factor by which Kv and Ki are raised; factor by which Kp is reduced if no Kv damps the joint.
 KV_KI_FACTOR, KP_REDUCTION = 1.5, 0.7
-#: Range of the damping ratio that determines Kv; range of Ki, divided by the ratio of Kp to the period of the ultimate
-#: oscillation.
+#: Range of the damping ratio that determines Kv; range of Ki T / Kp, where T is the period of the oscillation
+#: at the ultimate gain.
 DAMPING_RATIOS, KI_SHARES = (0.05, 3.0), (0.02, 1.0)
 
 
@@ -150,11 +153,12 @@ def tune_joint(joint: JointUnderTest) -> JointProcedure:
 
 
 def find_ultimate_gain(joint: JointUnderTest) -> Ultimate:
-    """Raises Kp until the oscillation after a release from `joint.step` is sustained, then refines Kp by bisection.
+    """Raises Kp until the oscillation in a release is sustained, then refines Kp by bisection.
 
-    With dry friction F the joint moves only if Kp step > F. Near the ultimate gain of such a joint, small oscillations
-    decay and large ones grow. Therefore the result is valid only for the given step. At the largest tested Kp, the
-    motor saturates at a position error of a twentieth of the step. A higher Kp would have almost no effect.
+    With dry friction F, the joint moves only if Kp `joint.step` > F. Near the ultimate gain of such a joint, small
+    oscillations decay and large ones grow. Therefore the result is valid only for the initial distance `joint.step`. At
+    the largest tested Kp, the motor saturates at a position error of a twentieth of this distance. A higher Kp would
+    have almost no effect.
     """
 
     duration = RELEASE_DURATION

@@ -59,9 +59,10 @@ class Margins:
 class SampledLoop:
     """Linear closed loop of n joints with mass matrix M, viscous friction b and a PID controller.
 
-    Between two samples M vd = u - b v. The effort is u = Kp e + Kd de + Ki sum(e) h with e = -q, as in
-    GravityPidController. The effort is computed from the measurement `ticks` periods earlier, and is constant for one
-    period. Gravity is compensated exactly. The velocity is estimated as in `systems.arm_effects.drive_step.DriveStep`.
+    Between two samples M vd = u - b v. The effort is u = -Kp q - Kd v_e - Ki h sum(q) with the velocity estimate
+    v_e and the sample period h, as in GravityPidController for the desired position 0. It is computed from the
+    measurement `ticks` periods earlier, and is constant for one period. Gravity is compensated exactly. v_e is computed
+    as in `systems.arm_effects.drive_step.DriveStep`.
     """
 
     def __init__(self, M: ArrayLike, sampling: Sampling, viscous: ArrayLike = 0.0) -> None:
@@ -109,7 +110,7 @@ class SampledLoop:
         return bool(np.max(np.abs(np.linalg.eigvals(self.closed_loop(gains)))) < 1.0)
 
     def least_damped_mode(self, gains: Gains) -> tuple[float, NDArray[np.float64]]:
-        """Returns the growth factor of the least damped mode per period, and each joint's share (n,) of its energy.
+        """Returns the growth factor per period of the least damped mode, and each joint's share (n,) of its energy.
 
         The energy is the kinetic energy without the coupling terms of the mass matrix.
         """
@@ -149,7 +150,7 @@ def place(
     """Computes kp and kd for a given natural frequency and damping ratio of one joint, including the delays.
 
     To second order in s, a lag T of the position reduces the damping by Kp T, and a lag T_v of the velocity reduces
-    the inertia by Kd T_v: (M - Kd T_v + Kp T^2 / 2) s^2 + (b + Kd - Kp T) s + Kp = 0. This equals
+    the inertia by Kd T_v: (M - Kd T_v + Kp T^2 / 2) s^2 + (b + Kd - Kp T) s + Kp = 0. The left side equals
     m (s^2 + 2 z w s + w^2) if m (1 + (2 z w + w^2 T) T_v - w^2 T^2 / 2) = M + b T_v, Kp = m w^2, and
     Kd = 2 z w m + Kp T - b. A negative kd is replaced by zero.
 

@@ -1,4 +1,4 @@
-"""Tunes an arm and compares the gains, in parallel on all cores."""
+"""Tunes an arm and compares the resulting gains with other gains. Uses all cores."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ class StepMeasures:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Comparison of the gains of an arm.
+    """Comparison of several sets of gains for one arm.
 
     Attributes:
-        arm: Arm of the gains.
+        arm: Arm to which the gains apply.
         gains: Gains by name.
         conditions: Conditions (c,) of the arm.
         poses: Start poses (p, n) of the steps.
@@ -83,11 +83,11 @@ class Comparison:
     responses: Mapping[str, Response]
 
     def table(self, name: str, measure: str) -> NDArray[np.float64]:
-        """Returns one field of `StepMeasures` for the gains `name` as an array (c, p, n)."""
+        """Returns the field `measure` of `StepMeasures` for the gains with this name, as an array (c, p, n)."""
         return np.array([[getattr(m, measure) for m in poses] for poses in self.measures[name]])
 
     def best(self, names: Iterable[str]) -> str:
-        """Returns the name of the gains with the fewest joints that do not settle.
+        """Returns the name of the gains for which the fewest joints do not settle.
 
         If several gains have the same number, the name of those with the smallest mean settling time is returned.
         """
@@ -145,7 +145,7 @@ class Tuning:
         arm: Arm that was tuned.
         procedure: Results of the paper's procedure for the joints. None if not requested.
         design: Result of the model-based design. None if not requested.
-        comparison: Comparison of these gains with the gains of the arm's file and the published gains.
+        comparison: Comparison of the resulting gains with the gains of the arm file and the published gains.
     """
 
     arm: Arm
@@ -167,13 +167,13 @@ def tune_arm(
     conditions: tuple[Condition, ...] = CONDITIONS,
     poses: int = POSES,
 ) -> Tuning:
-    """Tunes an arm and compares the gains. The result is deterministic.
+    """Tunes an arm and compares the resulting gains with other gains, see `Tuning`. The result is deterministic.
 
     Args:
         name: Name of an arm, or path of its YAML file.
         methods: Tuning methods.
         progress: Function called with the finished share of the run, 0..1.
-        conditions: Conditions of the arm in the comparison. The first condition has no model errors.
+        conditions: Conditions of the arm in the comparison. The first condition must have no model errors.
         poses: Number of start poses in the comparison.
 
     Raises:

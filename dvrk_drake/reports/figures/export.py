@@ -23,11 +23,12 @@ _NUM_PANELS = 6  # the file has no torque for joint 7
 
 
 def plot_compensation(path: str | Path, comparison: CompensationComparison, title: str) -> None:
-    """Plots the torques of file and model over the position of each joint, and the share of poses with a problem.
+    """Plots the torques of file and model over the position of each joint, and the share of poses with each problem.
 
-    Each band shows the range of the torque over the positions of all other joints. The torque of the file is not
-    limited. Dashed lines show the torque limits of the file. The grey area shows the positions of the joint in the
-    recording from which the file was computed.
+    Each band shows the range of the torque over the positions of all other joints. The torque of the file is drawn
+    without clipping. Dashed lines show the torque limits of the file. The grey area shows the positions of the joint in
+    the recording from which the file was computed. The attributes `clipped`, `opposed` and `runaway` of
+    `JointComparison` define the problems.
 
     Args:
         path: PNG file to write.

@@ -15,13 +15,13 @@ from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO
 
 
 def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm: Arm) -> bool:
-    """Writes spectra.png with the effort spectra and the cut-off frequency of the low-pass filter of each joint.
+    """Writes spectra.png: the effort spectrum, the noise spectrum and the cut-off frequency of each joint.
 
-    Rows are treated as evenly spaced, so the spectra of a motion with gaps are approximate.
+    Above the cut-off frequency, the noise exceeds the effort signal. Rows are treated as evenly spaced in time, so the
+    spectra of a motion with gaps are approximate.
 
     Returns:
-        True if the file was written. False for static poses and for motions without efforts, because spectra require
-        a motion with efforts.
+        True if the file was written. False for static poses and for motions without efforts.
     """
     if report.rate is None or report.joints[0].effort_cut_off is None:
         return False

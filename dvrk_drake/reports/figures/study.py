@@ -18,7 +18,7 @@ COLOURS = (MODEL_COLOUR, MEASURED_COLOUR, "#edae49", "#66a182", "#2e4057", "#8d5
 
 
 def plot_study(path: Path, study: Study, rows: Mapping[int, Row]) -> None:
-    """Plots each measure in one panel: shares with confidence intervals, or cumulative distributions."""
+    """Plots yes-or-no measures as shares with confidence intervals, and all others as cumulative distributions."""
     summaries, count = summarise(study, rows), len(study.measures)
     columns = math.ceil(math.sqrt(count))
     figure, axes = plt.subplots(

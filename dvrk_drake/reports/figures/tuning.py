@@ -27,7 +27,7 @@ def plot_steps(path: Path, comparison: Comparison) -> None:
             goal = 1e3 * abs(response.q_desired[j] - response.q[0, j])
         half = 1e3 * band(arm)[j]
         ax.axhspan(goal - half, goal + half, color="#1f6f8b", alpha=0.15, linewidth=0)
-        # Limits the axis, so that an unstable response does not flatten the others.
+        # Limits the axis, so that an unstable response does not flatten the other curves.
         ax.set_ylim(-0.1 * goal, 1.6 * goal)
         ax.set_title(f"J{j + 1} {name}", fontsize=9)
         ax.set_ylabel(f"displacement [{unit}]", fontsize=8)

@@ -79,7 +79,7 @@ def _shares(drifts: Drifts) -> tuple[str, ...]:
 
 
 def torque_table(session: ReproductionSession) -> ResultTable:
-    """Returns a table of the RMS torque errors of both models at random poses of the ground-truth arm."""
+    """Returns a table of the RMS torque errors of the paper's model and of ours at random poses."""
     mtm = session.mtm
     q = session.random_poses(PAPER_ARM, 500)
     true = mtm.truth.model.holding_torque(q)
@@ -185,9 +185,10 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         mtm.truth.origin,
         f"**Ours** is identified from {sample_sizes.collected} poses, collected on the ground-truth arm with "
         "friction, noise and encoders. Each pose was approached from both sides. The controller compensates gravity "
-        f"with this model only. **The paper's** is {_whose(session)}. Each release starts at rest, with unloaded "
-        f"friction, at a random pose inside the joint limits. Each simulation lasts {sample_sizes.duration:g} s. "
-        f"In the first table, a joint is held if it stays within {1e3 * BAND[0]:.0f} mrad.",
+        f"with this model and applies no other torque. **The paper's** is {_whose(session)}. Each release starts at "
+        "rest, with unloaded presliding springs of the friction, at a random pose inside the joint limits. Each "
+        f"simulation lasts {sample_sizes.duration:g} s. In the first table, a joint is held if it stays within "
+        f"{1e3 * BAND[0]:.0f} mrad.",
         f"**Ours keeps all joints within {1e3 * BAND[0]:.0f} mrad at {share(ours.num_held, len(poses))}** of the "
         f"poses. The shares for single joints are: {_per_joint(ours)}. The paper's parameters hold all joints at "
         f"{share(paper.num_held, len(few))} of the poses. Most releases fail at {_lost(paper)}, where the torque error "
@@ -231,9 +232,9 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
         f"at {share(paper.num_held, len(few))} of the poses. With ours, all joints are held at "
         f"{share(ours.num_held, len(few))}. Joint 5 still falls at poses where its gravity and spring torque exceeds "
         "its friction.",
-        "The gravity torque of joints 6 and 7 is identified from the recording of 72 poses and is similar to their "
-        "friction. Therefore these joints drift less than in the published trials. Fig. 5 describes the ground-truth "
-        "arm.",
+        "The gravity torque of joints 6 and 7 is identified from the recording of 72 poses and is about as large as "
+        "their friction. Therefore these joints drift less than in the published trials. Fig. 5 describes the "
+        "ground-truth arm.",
     )
     return Section("fig6", "Fig. 6: drift after release, zero torque on joints 5-7", remarks, (table,), figures)
 

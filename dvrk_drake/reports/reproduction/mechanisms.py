@@ -25,7 +25,7 @@ from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, 
 
 
 def reproduce_table_1() -> Section:
-    """Compares Table I with the DH parameters of the plant."""
+    """Compares Table I of the paper with the DH parameters of the simulated MTM."""
     arm = load_arm(PAPER_ARM)
     ours, worst = recomputed_table(arm)
     published = np.array([published_row(row) for row in TABLE_1])
@@ -77,7 +77,7 @@ _FILE = "psm_release.png"
 
 
 def reproduce_psm(session: ReproductionSession) -> Section:
-    """Compares the PSM models, and simulates releases of a PSM."""
+    """Compares the paper's model of the PSM with ours, and simulates releases of a PSM."""
     psm, sample_sizes = session.psm, session.sample_sizes
     poses = session.random_poses("psm", sample_sizes.psm_releases)
     ours = session.release("psm", psm.truth, psm.file, poses, "PSM: releasing ours")
@@ -97,7 +97,7 @@ def reproduce_psm(session: ReproductionSession) -> Section:
     )
     remarks = (
         "The paper shows a model of the PSM without an experiment. The masses of this model are placeholders. The "
-        "first table compares the file of the paper with our plant.",
+        "first table compares the file of the paper with our model.",
         f"{psm.truth.origin} Ours is identified from {sample_sizes.collected} poses of this arm. Each release starts "
         f"at a random pose inside the joint limits and lasts {sample_sizes.duration:g} s with gravity compensation "
         f"only. **All joints stay within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "

@@ -45,7 +45,7 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class Section:
-    """Result of reproducing one figure of the paper.
+    """Section of the results page for one figure, table or experiment.
 
     Attributes:
         name: Name of the section on the command line.

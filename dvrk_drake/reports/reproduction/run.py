@@ -47,8 +47,8 @@ def reproduce(
         folder: Existing folder for the results.
         recordings: Recordings of the paper. Without them, Fig. 4 is omitted if other sections are requested, and
             Fig. 5 and 6 use a different ground-truth arm.
-        progress: Function called with a step, for example "fig5: releasing", and the finished share of
-            this step, 0 to 1.
+        progress: Function called with a step, for example "fig5: releasing", and the finished share of this step (0
+            to 1).
         sample_sizes: Numbers of poses and releases. None: the default numbers.
         seed: Seed of ground-truth arms, poses and noise.
 

@@ -63,9 +63,9 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
     )
     with_fault, without = (oscillation_modes(theirs_arm, fault)[0].real.max() for fault in (True, False))
     remarks = (
-        "The step is from J5 = 3.13, J3 = -0.79, J2 = -0.22 rad to zero, at 100 Hz, with the published gains and "
-        "masses. The controller of the paper has a fault: the damping terms of joints 5-7 use positions instead of "
-        "velocities. These terms add stiffness but no damping.",
+        "The step is from J5 = 3.13, J3 = -0.79, J2 = -0.22 rad to zero. The controller of the paper runs at 100 Hz "
+        "with the published gains, on an arm with the published masses. This controller has a fault: the damping "
+        "terms of joints 5-7 use positions instead of velocities. These terms add stiffness but no damping.",
         f"Each link has an inertia of {LINK_INERTIA:g} kg m^2, as in the PSM file of the paper. The oscillation period "
         f"of J2 confirms this value: {published.FIGURE_7_VALUES['J2 period']:.0f} s published, "
         f"{longest_period(theirs_arm):.0f} s here.",
@@ -87,7 +87,8 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
         rows,
     )
     shows = (
-        "Step to zero: the paper's controller on its arm (top), ours on the ground-truth arm (bottom); right: enlarged"
+        "Step to zero: the paper's controller on the paper's arm (top), ours on the ground-truth arm (bottom); "
+        "right: enlarged"
     )
     return Section("fig7", "Fig. 7: step to zero", remarks, (table,), {_FILE: shows})
 
@@ -100,7 +101,7 @@ def _late(q: NDArray[np.float64], from_time: float | None = None) -> NDArray[np.
 def _plot(path: Path, faulty: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(13, 7.5), layout="constrained")
     for row, (q, label) in enumerate(
-        ((faulty, "the paper's controller on its arm"), (ours, "ours on the ground-truth arm"))
+        ((faulty, "the paper's controller on the paper's arm"), (ours, "ours on the ground-truth arm"))
     ):
         t = PERIOD * np.arange(len(q))
         for column, ax in enumerate(axes[row]):

@@ -83,11 +83,12 @@ def reproduce_figure_4(
         "paper's method is larger than the error of zero torque, even at the fitted poses. The torques of joints 2 "
         "and 3 are ten to a hundred times larger than the torques of these joints, and therefore determine the "
         "parameters.",
-        "Our method differs in four points. Joints are weighted by their residual variance. Offsets, springs and "
-        "cables are added if they improve cross-validation. A joint gets zero torque if the model does not reduce "
-        f"its error. Finally, {int(np.sum(~included))} measurements at joint stops and outliers are excluded (crosses "
-        "in the figure). With all measurements, the paper's method has a smaller error on J2 than ours, because the "
-        "paper's method fits the torque of the joint stop together with gravity.",
+        "Our method differs in four points. Each joint is weighted by its inverse residual variance. Offsets, "
+        "springs and cables are added if they reduce the cross-validation error. A joint gets zero torque if the "
+        f"model does not reduce its error. Finally, {int(np.sum(~included))} measurements are excluded, because they "
+        "were made at joint stops or are outliers (crosses in the figure). With all measurements, the paper's method "
+        "has a smaller error on J2 than ours, because the paper's method fits the torque of the joint stop together "
+        "with gravity.",
     )
     shows = "Squared torque error of joints 2-7 at 72 poses, leave-one-out; errors below 1e-9 are drawn at 1e-9"
     return Section("fig4", "Fig. 4: torque errors", remarks, (squared, left_out), {_FILE: shows})

@@ -1,4 +1,4 @@
-"""Computes the interaction force at the handle (transparency) with each compensation."""
+"""Simulates the interaction force at the handle (transparency) with each kind of gravity and friction compensation."""
 
 from __future__ import annotations
 

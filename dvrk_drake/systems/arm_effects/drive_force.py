@@ -22,10 +22,12 @@ class Motors:
     """Conversion of commanded joint efforts to motor efforts.
 
     The command is clamped to the effort limits of the joints and converted to actuator efforts J^-T tau [N m, N]. The
-    actuator efforts are rounded to multiples of `effort.command_resolution` and limited to `saturation`.
+    actuator efforts are rounded to multiples of `effort.command_resolution` and limited to `saturation`; see
+    `ArmEffects`.
 
     Attributes:
-        constants: Effort limits of the joints, command resolution and saturation, as rows of an array (3, n).
+        constants: Array (3, n). Its rows are the effort limits of the joints, the resolutions of the commands, and the
+            saturation efforts.
         to_motors: Matrix J^-T (n, n) from joint efforts to actuator efforts.
     """
 
@@ -116,7 +118,7 @@ class EffortSensor(LeafSystem):
 
 
 class DriveForce(LeafSystem):
-    """Computes the sum of the efforts of motors, cables, springs and disturbance. One system is faster than several.
+    """Computes the sum of motor, cable, spring and disturbance efforts. One system is faster than several systems.
 
     .. pydrake_system::
 

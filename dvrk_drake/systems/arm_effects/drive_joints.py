@@ -112,7 +112,7 @@ class DriveJoints:
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
     def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
-        """Returns a new joint parallel to coaxial joints whose angles add up to row q, or None without such joints."""
+        """Returns a new joint whose angle row q is the sum of the angles of coaxial joints; None if there are none."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
         for name in names:
@@ -144,7 +144,7 @@ class DriveJoints:
         p_PR: NDArray[np.float64],
         last: RevoluteJoint,
     ) -> Joint:
-        """Returns a new joint about the axis of `last`.
+        """Adds a body and its joint about the axis of `last`. Returns the joint.
 
         Args:
             row: Row (n,) of the coordinate.
@@ -178,7 +178,10 @@ class DriveJoints:
     def _couple_rotation(
         self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64], cable: Cable
     ) -> None:
-        """Couples the rotations of A and B about a common axis by a rod between two points 90 degrees apart."""
+        """Couples the rotations of A and B about a common axis by a rod between them.
+
+        Seen along the axis, the ends of the rod on A and B are 90 degrees apart.
+        """
         e = np.eye(3)[np.argmin(np.abs(axis))]
         f = np.cross(axis, e)
         # The distance of the rod from the axis is RADIUS / sqrt(2).

@@ -70,15 +70,15 @@ def add_friction(
     """Adds friction to a plant that is not finalized.
 
     The solver evaluates each element at the end of the step. The element therefore dissipates energy in every step, for
-    any stiffness. The kinds of friction are listed below. The coefficient is c, the scale s, the position along the
-    coordinate x and the velocity v.
+    any stiffness. The kinds of friction are listed below, where c is the coefficient, s the scale, x the value of the
+    coordinate, and v the rate of x.
 
     - "presliding": effort -c clip((x - x_s + T v) / s, -1, 1). x_s is the anchor from `DriveStep`, and T is
       `RELAXATION`. If the applied effort is below c, the joint sticks without creep. With a fall speed w, the limit of
       the effort is c exp(-(v/w)^2) (Stribeck friction). T is then 0, because this limit applies only to the spring.
     - "presliding forward": as "presliding" with the limits 0 and 1 and T = 0. It represents the additional friction in
       the direction +x, compared with -x. A negative coefficient exchanges the directions.
-    - "coulomb": effort -c clip(v / s, -1, 1), which contains a smoothed sign function as in the identification. If the
+    - "coulomb": effort -c clip(v / s, -1, 1). The clip is a smoothed sign function, as in the identification. If the
       applied effort is below c, the joint creeps with a speed of up to s.
     - "viscous": effort -c v.
 

@@ -61,7 +61,7 @@ class CommandGuard:
     - HOLD: The arm's position controller regulates to a latched pose. HOLD is the initial state and needs no commands.
     - STARTING: The arm behaves as in HOLD. The POSITION or EFFORT commands of a sender are monitored but do not act
       yet.
-    - POSITION, EFFORT: The last accepted command acts inside the limits of `GuardLimits`.
+    - POSITION, EFFORT: The last accepted command, called the command in force, acts inside the limits of `GuardLimits`.
     - FAULT: The arm behaves as in HOLD. After a measurement fault, the guard regulates only joints with a valid
       position. All other joints get the gravity effort at their last valid position. If the motors had no power before
       the fault, the arm behaves as in OFF.
@@ -99,13 +99,14 @@ class CommandGuard:
     **Refused commands**: A command is refused if a number is not finite, or if the command has expired on arrival, is
     out of order or is a duplicate. It is also refused after a jump of the sender's sequence or clock, and if its mode
     is not accepted in the present state. `lcmt_dvrk_status.REFUSAL_*` lists all reasons. A refused command does not
-    act, and the expiry of the command in force does not change. If all new commands are refused, the state therefore
-    changes to HOLD.
+    act, and the expiry of the command in force does not change. If all new commands are refused, the command in force
+    therefore expires and the state changes to HOLD.
 
-    **Ignored messages**: A message is ignored if it is unreadable or not authentic, or if it has another arm, number of
-    joints or session. Messages of a second sender are ignored while commands of the first sender are accepted. Ignored
-    messages have no effect. They are not included in the number of refused commands. Without a key, only the sender_id
-    identifies a sender, and any process on the network can copy this number.
+    **Ignored messages**: A message is ignored if it is unreadable or not authentic, or if it states another arm, number
+    of joints or session. A session is one run of the arm's process. Messages of a second sender are ignored while
+    commands of the first sender are accepted. Ignored messages have no effect. They are not included in the number of
+    refused commands. Without a key, only the sender_id identifies a sender, and any process on the network can copy
+    this number.
 
     **OFF**: An arm without brakes falls when its motors are off. OFF must be listed in `modes`. A single message is not
     sufficient, because the state must be HOLD and the sender's last command must have been HOLD. In FAULT, the guard
@@ -117,16 +118,16 @@ class CommandGuard:
     - Commanded efforts must be near the measured efforts.
     - Commanded positions must be near the measured positions. The same applies to the commanded position plus Kd/Kp
       times the commanded velocity.
-    - For EFFORT, the measured pose must not exceed a position limit by more than half of the margin. The measured
-      effort must be near the gravity effort of the model, and may exceed the limit for commands by at most
-      `start_effort`.
+    - For EFFORT, the measured pose must not exceed a position limit by more than half of the setting `margin`. The
+      measured effort must be near the gravity effort of the model, and may exceed the limit of commanded efforts by at
+      most the setting `start_effort`.
 
     A controller that was restarted, or whose state does not match the arm's state, therefore does not move the arm.
 
     **Faults**: A fault is latched. The causes of a fault are:
 
     - measurements that are not plausible, not finite or too old,
-    - a pose that exceeds a position limit by more than half of the margin while efforts act,
+    - a pose that exceeds a position limit by more than half of the setting `margin` while efforts act,
     - a joint that does not follow its target or is pushed away from the target,
     - commanded efforts that oscillate,
     - an arm clock that goes backwards or stands still,
@@ -138,9 +139,9 @@ class CommandGuard:
 
     **Bumpless transfer**: After STARTING, HOLD keeps the target of the position controller. After POSITION or FAULT,
     HOLD keeps this target only if the arm is near the target. Otherwise, HOLD latches the measured pose as the target.
-    POSITION starts at the target of HOLD, and EFFORT at the measured effort. If the arm is inside a soft wall when
-    EFFORT starts, the effort of the wall increases over `start_time`. Commanded targets and efforts are limited in
-    rate.
+    POSITION starts at the target of HOLD, and EFFORT at the measured effort. If the arm is inside a soft wall (see
+    `GuardLimits`) when EFFORT starts, the effort of the wall increases over `start_time`. Commanded targets and efforts
+    are limited in rate.
 
     **Clocks**: The sender's clock and the arm's clock need not be synchronised. The guard compares only the times that
     elapse on these clocks between two commands. After a jump of the sender's clock, commands are refused until the
@@ -161,7 +162,8 @@ class CommandGuard:
 
         Args:
             arm: Arm whose limits are enforced.
-            session_id: Random identifier of the session, not 0. Every start of the arm requires a new identifier.
+            session_id: Random identifier of the session, not 0. Each run of the arm's process requires a new
+                identifier.
             model: Model of the arm with its actual base orientation, e.g.
                 `ControlModel(IdentifiedModel.from_arm(arm))`. With an identified model, the guard detects more faults.
             settings: Settings of the guard. None: the defaults of `GuardSettings` are used.
@@ -257,7 +259,8 @@ class CommandGuard:
     def blocked_reason(self) -> str:
         """Reason why POSITION and EFFORT are refused although there is no fault, or "" if they are accepted.
 
-        The reason is `hold_reason` until an operator resumes. Otherwise, it is a period of the guard that is too long.
+        The reason is `hold_reason` until an operator resumes. Otherwise, the reason is that a period of the guard was
+        too long.
         """
         return self.hold_reason or self._period.fault
 
@@ -343,7 +346,7 @@ class CommandGuard:
         return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
-        """Latches a fault that the arm's driver reports. Call this method before each `step` while the fault lasts.
+        """Latches a fault. A driver that reports a fault calls this method before each `step` while the fault lasts.
 
         Args:
             text: Description of the fault, including measured values. The description of the first fault is kept until

@@ -32,9 +32,9 @@ class CommandInbox:
     also checks the authentication code. A message that fails a check is counted and dropped. Only a limited number of
     the other messages is kept. `deliver` decodes the kept messages and passes them to the guard.
 
-    Commands of the sender in control are kept in a separate list, so a flood from other senders does not displace these
-    commands. If this list is full, the command with the lowest sequence is dropped. A flood of copies of earlier
-    commands therefore does not displace new commands.
+    Commands of the sender in control (see `CommandStream`) are kept in a separate list, so a flood from other senders
+    does not displace these commands. If this list is full, the command with the lowest sequence is dropped. A flood of
+    copies of earlier commands therefore does not displace new commands.
     """
 
     def __init__(self, guard: CommandGuard, key: MessageKey | None = None, capacity: int = _CAPACITY) -> None:

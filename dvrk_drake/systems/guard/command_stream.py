@@ -10,8 +10,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.limits import Vector
 
-#: Refusals of messages that do not belong to the session or to the sender in control. The guard counts these messages
-#: as ignored, not as refused.
+#: Reasons of refusals of messages that do not belong to the session or to the sender in control. The guard counts these
+#: messages as ignored, not as refused.
 FOREIGN = frozenset(
     {
         lcmt_dvrk_status.REFUSAL_UNREADABLE,
@@ -25,8 +25,8 @@ FOREIGN = frozenset(
     }
 )
 
-#: Refusals of commands that do not continue the sender's stream, such as copies and replays. Such commands do not end
-#: STARTING.
+#: Reasons of refusals of commands that do not continue the sender's stream, such as copies and replays. Such commands
+#: do not end the state STARTING.
 OUT_OF_STREAM = frozenset(
     {
         lcmt_dvrk_status.REFUSAL_STALE,
@@ -135,7 +135,7 @@ class CommandInForce:
 class CommandStream:
     """Stream of the commands of one sender. All times are in us. Times of arrival refer to the arm's clock.
 
-    A sender is in control while its commands are accepted. Commands of a second sender are refused until `expiry` has
+    A sender is in control while its commands are accepted. Commands of a second sender are ignored until `expiry` has
     elapsed since the last accepted command of the first sender. Refused commands of the first sender do not extend this
     time. Otherwise, a process that repeats one command could prevent an operator from resuming.
 
@@ -145,8 +145,8 @@ class CommandStream:
     sequence, the commands of this sender are accepted again when `expiry` has elapsed since the last accepted command.
 
     Attributes:
-        expiry: Time since the last accepted command after which another sender is accepted. After the same time, a
-            command is no longer compared with the last accepted command.
+        expiry: Time since the last accepted command, after which another sender is accepted. After this time, a new
+            command is also no longer compared with the last accepted command.
         clock_tolerance: Allowed difference between the times that elapse on the sender's clock and on the arm's clock
             from one accepted command to the next.
         sequence_jump: Largest difference in sequence between two accepted commands.

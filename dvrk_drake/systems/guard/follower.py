@@ -55,7 +55,8 @@ class Follower:
     def latch(self, q: Vector, v: Vector) -> None:
         """Sets the target to the measured pose q (n,) [rad, m] of an arm that moves with v (n,) [rad/s, m/s].
 
-        The filtered target starts ahead of q in the direction of v, so that the motion during braking causes no fault.
+        The filtered target (see `following_fault`) starts ahead of q in the direction of v, so that the motion during
+        braking causes no fault.
         """
         self.target = q.copy()
         speed = self._limits.speed

@@ -43,7 +43,7 @@ class GuardLimits:
 
     **Effort commands.** The position limits lower <= A q <= upper are the limits of the joints and the coupled limits.
     A soft wall acts before each position limit. The wall is a virtual spring and damper along the coordinate c = A_k q
-    of limit k. At an upper limit, its effort is:
+    of limit k, where A_k is row k of A. At an upper limit, its effort is:
 
         lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda
 
@@ -238,7 +238,7 @@ class GuardLimits:
         return inside, flags | limited
 
     def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
-        """Returns the limited feedforward velocity (n,) at `target` (n,). It is zero where `flags` is not zero."""
+        """Returns the limited feedforward velocity (n,) at `target` (n,), which is zero for joints with `flags`."""
         velocity = np.where(flags == 0, clip(command, -self.speed, self.speed), 0.0)
         lead = self._look_ahead * velocity
         ahead, _ = self._inside(target + lead, target)

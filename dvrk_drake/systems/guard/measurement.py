@@ -76,8 +76,9 @@ class Measurement:
             q: Positions (n,) [rad, m].
             v: Velocities (n,) [rad/s, m/s].
             effort: Applied motor efforts (n,) [N m, N].
-            implausible_pose: Function that returns the reason why a pose is implausible, or "" for a plausible pose. It
-                is given for a measurement that is not compared with an earlier one. None: the pose is not checked.
+            implausible_pose: Function that returns the reason why a pose is implausible, or "" for a plausible pose.
+                The caller passes this function for a measurement that will not be compared with an earlier one. None:
+                the pose is not checked.
 
         Returns:
             Reason why the measurement is invalid, or "" for a valid measurement.

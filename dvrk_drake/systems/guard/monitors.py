@@ -25,7 +25,7 @@ class PeriodMonitor:
     """Monitor of the time between two steps of the guard. It checks the last period and the median of 100 periods.
 
     Attributes:
-        fault: Description of the fault of the last periods, or "" without a fault.
+        fault: Description of the fault in the last periods, or "" if they are valid.
     """
 
     def __init__(self, settings: GuardSettings) -> None:

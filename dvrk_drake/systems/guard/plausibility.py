@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 #: Time between two evaluations of the mass matrix [s]. One evaluation takes as long as one step of the guard.
 _MASS_MATRIX_PERIOD = 0.05
 
-#: Time after the motors are switched on in which the effort may change without a motion [s]. This happens if the arm
-#: lies on an object.
+#: Time after the first measurement in which the effort may change without a motion [s]. The effort changes when the
+#: motors are switched on. There is no motion if the arm lies on an object.
 _POWER_ON = 0.25
 
 #: Number of encoder counts that are added to each position tolerance.
@@ -62,7 +62,9 @@ class Sample:
 
 
 class Check(Protocol):
-    """Protocol of one plausibility check. The caller stores the state, because Drake copies the guard at every update.
+    """Protocol of a plausibility check. The caller stores the state of the check.
+
+    The state is separate from the check, because Drake copies the guard at every update.
 
     Attributes:
         text: Description of the error that this check detects.
@@ -89,7 +91,7 @@ class PositionJump:
         self._tolerance, self._fastest, self._jitter = tolerance, 1.5 * speed_limit, settings.jitter
 
     def begin(self, sample: Sample) -> None:
-        """Returns None, because this check has no state."""
+        """Returns None as the initial state, because this check has no state."""
 
     def check(self, sample: Sample, state: None) -> tuple[None, Mask]:
         """See `Check.check`."""

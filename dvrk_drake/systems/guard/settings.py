@@ -15,8 +15,8 @@ class PlausibilitySettings:
 
     Attributes:
         position_tolerance: Tolerance of position steps, and of the difference between the position and the integrated
-            velocity [rad]. For a prismatic joint, the tolerance in m is a tenth of the number. Three encoder counts are
-            added to the tolerance.
+            velocity [rad]. For a prismatic joint, the tolerance is 0.1 m per rad of this value. Three encoder counts
+            are added to the tolerance.
         jitter: Largest error of the time between two measurements [s].
         velocity_delay: Largest delay of the velocity estimate [s].
         velocity_counts: Allowed error of the velocity, in encoder counts per second [1/s]. This error occurs if the
@@ -25,7 +25,8 @@ class PlausibilitySettings:
         velocity_memory: Time constant of the comparison of positions and velocities [s].
         frozen_effort: Change of effort that must cause a change of position, as a fraction of the effort limit.
         frozen_time: Longest time for which a position may stay constant after such a change of effort [s].
-        frozen_speed: Lowest expected speed of a joint during a motion by one encoder count [rad/s, m/s].
+        frozen_speed: Lowest expected speed of a moving joint [rad/s, m/s]. It gives the time of a motion by one encoder
+            count.
         response: Allowed unexplained effort as a fraction of the effort limit, in addition to `hand_effort`. See
             `plausibility.Response`.
         hand_effort: Allowed effort of the operator's hand or of a model error on a joint [N m]. For a prismatic joint,
@@ -34,10 +35,11 @@ class PlausibilitySettings:
         response_memory: Time constant with which the slowly varying part of the unexplained effort is attributed to
             model errors [s].
         start_gravity: Allowed difference between the measured effort and the gravity effort when effort commands start,
-            as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added.
+            as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added to the allowed
+            difference.
         silent_effort: Lowest commanded effort that the measured effort must follow, as a fraction of the effort limit.
         silent_time: Time within which the measured effort must follow the commanded effort [s].
-        detection_time: Minimum age of the last valid pose at the detection of a fault [s].
+        detection_time: Positions of this time before the detection of a fault are not used as the last valid pose [s].
         bad_samples: Largest number of consecutive measurements that may be late or not finite while the arm holds.
     """
 
@@ -64,8 +66,8 @@ class PlausibilitySettings:
 class GuardSettings:
     """Settings of a command guard.
 
-    The accepted range of each setting is given next to its default value. Values outside this range would disable the
-    protection, or all commands would be refused.
+    The accepted range of each setting is given next to its default value. With a value outside this range, the guard
+    would not protect the arm or would refuse all commands.
 
     Attributes:
         expiry: Age at which a command expires [s]. The age of a command is the age of the measurement from which it was
@@ -78,9 +80,9 @@ class GuardSettings:
             1 kHz.
         start_effort: Allowed difference between the first commanded efforts and the measured efforts, as a fraction of
             the effort limit.
-        margin: Minimum width of the soft wall before each position limit [rad, m]. The margin is also the allowed
-            difference between the first commanded positions and the measured pose. While efforts act, a pose that
-            exceeds a limit by more than half of the margin is a fault.
+        margin: Minimum width of the soft wall before each position limit [rad, m]; see `GuardLimits`. The margin is
+            also the allowed difference between the first commanded positions and the measured pose. While efforts act,
+            a pose that exceeds a limit by more than half of the margin is a fault.
         margin_fraction: Largest margin as a fraction of the range of the joint. It determines the margin of prismatic
             joints and of joints with a small range.
         effort_fraction: Fraction of each effort limit that effort commands may use. The soft wall and the braking at

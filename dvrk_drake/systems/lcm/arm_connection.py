@@ -64,8 +64,8 @@ def connect_arm(
 
     Args:
         builder: Builder of the Diagram.
-        arm: Arm that is connected. Statuses that do not continue the first received session are ignored; see
-            `StatusFilter`.
+        arm: Arm that is connected. Only statuses of the first received session are used, in the order of their
+            sequence; see `StatusFilter`.
         driver: Configuration of the driver. Its key verifies statuses and signs commands.
         lcm: LCM interface whose `HandleSubscriptions` the caller calls. If it is None, a new interface at
             `driver.lcm_url` is added, and the Simulator handles its messages.

@@ -112,7 +112,7 @@ class DvrkCommandReceiver(LeafSystem):
     """Receives commands for one arm, checks them with a guard, and outputs the resulting efforts and targets.
 
     Until a command acts, the arm holds the measured pose, as with Drake's command receivers. The arm also holds a pose
-    after a watchdog hold or a fault.
+    during a watchdog hold and after a fault.
 
     .. pydrake_system::
 
@@ -132,8 +132,8 @@ class DvrkCommandReceiver(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `lcmt_dvrk_command`: command, e.g. from an LcmSubscriberSystem. A repeated message is processed only once. Drake
-      keeps only the newest message of a channel, without the encoded bytes that are needed to verify the signature. A
-      process that moves an arm must therefore pass every message to `Receive` instead.
+      keeps only the newest message of a channel, without the encoded bytes that are needed to verify the authentication
+      code. A process that moves an arm must therefore pass every message to `Receive` instead.
     - `state_estimated` (2n): measured q, then v. `effort_measured` (n): applied motor efforts.
     - `position_control_effort` (n): present effort of the position controller in the arm's driver.
     - `gravity_effort` (n): gravity compensation of the arm's driver. If connected, it is added to commanded efforts and
@@ -142,8 +142,8 @@ class DvrkCommandReceiver(LeafSystem):
     - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose with zero
       velocity.
     - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
-      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If this is not
-      finite, the gravity effort of the model is used instead.
+      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If
+      `position_control_effort` is not finite, the gravity effort of the model is used instead.
     - `guard`: the CommandGuard, read-only.
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
@@ -167,7 +167,7 @@ class DvrkCommandReceiver(LeafSystem):
             arm: Arm that defines the number of joints and their effort limits.
             guard: Guard in its initial state. Each context has its own copy of the guard.
             clock: Clock of the arm, with the period of the guard. None: `ArmClock()` is used.
-            key: Key that must have signed the messages for `Receive`. None: signatures are not verified.
+            key: Key that must have signed the messages for `Receive`. None: authentication codes are not verified.
         """
         super().__init__()
         n = arm.num_joints

@@ -29,8 +29,9 @@ class DvrkDriver:
         lcm_url: URL of the LCM network. If it is empty, the environment variable LCM_DEFAULT_URL or LCM's default is
             used.
         status_period: Period in which the arm sends statuses and a controller sends commands [s].
-        control_modes: Modes that the arm accepts in addition to hold: position, effort, "off" (in quotes, because YAML
-            reads off as false). "off" is not accepted by default, because an arm falls when its motors are off.
+        control_modes: Modes that the arm accepts in addition to hold: position, effort and "off". Write "off" in
+            quotes, because YAML reads off as false. "off" is not accepted by default, because an arm falls when its
+            motors are off.
         key_file: File with the key that signs commands and statuses, created by `dvrk-drake key`. The path is relative
             to the driver's YAML file. If it is empty, messages are not authenticated, and any process on the network
             can command the arm.

@@ -60,7 +60,7 @@ class SimDvrkDriver(Diagram):
             start_utime: Time of the arm's clock at time zero of the context [us].
             wall_clock: Function that returns the wall-clock time [us] for the guard. None: commands expire only by the
                 time of the context.
-            key: Key that must have signed the messages for `Receive`. None: signatures are not verified.
+            key: Key that must have signed the messages for `Receive`. None: authentication codes are not verified.
 
         Raises:
             ModelError: The driver's model cannot be read, or is not valid for this arm.
@@ -139,7 +139,7 @@ def apply_driver_config(
         driver: Configuration of the driver. `driver.lcm_url` is not used. The driver's key verifies commands and signs
             statuses.
         station: Station in `builder` with an unconnected effort input.
-        lcm: LCM interface whose `HandleSubscriptions` the caller calls, e.g. an LcmInterfaceSystem or a loop.
+        lcm: LCM interface whose `HandleSubscriptions` the caller calls, e.g. in a loop or by an LcmInterfaceSystem.
         builder: Builder of the Diagram.
         model: See SimDvrkDriver.
         start_utime: Time of the arm's clock at time zero of the context [us].
