@@ -133,7 +133,7 @@ class GroundTruth:
     Attributes:
         arm: Arm to simulate, with an SDF in the output folder and the `effects` of the real arm.
         model: Exact model of the gravity, cable and spring torques, used only for evaluation.
-        is_paper_arm: Whether the arm is identified from the paper's recording.
+        is_paper_arm: Whether the parameters of the arm were identified from the paper's recording.
         origin: Origin of the arm, one sentence.
     """
 

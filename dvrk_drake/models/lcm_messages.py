@@ -181,8 +181,8 @@ class StatusFilter:
     A session is one run of the arm's process. The filter accepts only the first session that it receives. It ignores a
     status, and counts the reason in `ignored`, if the status is not authentic, belongs to another session, or was not
     sent after the last accepted status. It also ignores a status whose sequence number or time is too far ahead: the
-    sequence number may increase by 2000 per second plus 100, and the time by 1 ms for each of these statuses. Without
-    this limit, one spoofed status with a large sequence number would make all authentic statuses appear old.
+    sequence number may increase by at most 2000 per second plus 100, and the time by at most 1 ms times this number.
+    Without this limit, one spoofed status with a large sequence number would make all authentic statuses appear old.
 
     Attributes:
         last: Last accepted status, or None if no status has been accepted.

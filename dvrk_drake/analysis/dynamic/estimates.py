@@ -158,7 +158,7 @@ def error_covariance(
     """Returns the autocovariance (r,) of an actuator's error, for lags of 0 to r - 1 rows.
 
     Up to a lag of `CORRELATION_TIME`, the result is the sample autocovariance of the error, multiplied by a Parzen
-    window. For lags near whole periods, the result is the sample autocovariance for lags near one period. This part is
+    window. For lags near a multiple of the period, the values for lags near one period are used again. This part is
     due to errors that repeat in every period.
 
     Args:

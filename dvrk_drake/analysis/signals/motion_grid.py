@@ -117,7 +117,7 @@ class MotionGrid:
 
     @property
     def inner(self) -> slice:
-        """Slice of the rows without `ENDS` at both ends."""
+        """Slice of the rows without the first and the last `ENDS` seconds."""
         ends = round(ENDS * self.rate)
         return slice(ends, len(self.row_times) - ends)
 

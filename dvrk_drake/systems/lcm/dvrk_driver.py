@@ -61,7 +61,9 @@ class DvrkDriver:
         """
         self.guard.check()
         if any(mode not in _MODES for mode in self.control_modes):
-            raise StationError(f"control_modes must be a list of {', '.join(_MODES)}; got {list(self.control_modes)}")
+            raise StationError(
+                f"control_modes contains an unknown mode: {list(self.control_modes)}; allowed: {', '.join(_MODES)}"
+            )
         if fault := number_fault(self):
             raise StationError(fault)
 

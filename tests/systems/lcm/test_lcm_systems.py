@@ -276,7 +276,7 @@ def test_driver_is_loaded_from_yaml_and_checked():
         schema=DvrkDriver, data="{status_period: 0.002, guard: {expiry: 0.02}}", defaults=DvrkDriver()
     )
     assert (driver.status_period, driver.guard.expiry, driver.guard.start_time) == (0.002, 0.02, 0.25)
-    with pytest.raises(StationError, match="control_modes must be a list of position, effort, off; got \\['speed'\\]"):
+    with pytest.raises(StationError, match="unknown mode: \\['speed'\\]; allowed: position, effort, off"):
         DvrkDriver(control_modes=["speed"])
     with pytest.raises(StationError, match="status_period"):
         DvrkDriver(status_period=0.0)
