@@ -154,7 +154,7 @@ class CollectionFile:
             if not which.any():
                 raise CollectionError(
                     f"{self._path}, line {line}: the requested pose of this row is not in the pose file. Choose "
-                    "another output file, or the pose file that this output was measured with. New poses can be added "
+                    "another output file, or the pose file from which this output was created. New poses can be added "
                     "to that pose file."
                 )
             done |= which
