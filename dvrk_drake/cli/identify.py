@@ -133,12 +133,13 @@ def validate(
     with Steps(*_STEPS, "validating") as steps:
         loaded, read = _model_and_recording(model, recording, coordinates, topic, steps)
         folder = plots_folder(plots, overwrite=overwrite)
+        if (save or require) and read.sha256 and read.sha256 == loaded.provenance.sha256:
+            option = "--save" if save else "--require"
+            raise ModelError(
+                f"{read.source}: the model was identified from this recording; {option} requires another recording"
+            )
         if save:
             check_output(model, recording, overwrite=True)
-            if read.sha256 and read.sha256 == loaded.provenance.sha256:
-                raise ModelError(
-                    f"{read.source}: the model was identified from this recording; --save requires another recording"
-                )
             if loaded.validation is not None and not overwrite:
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")

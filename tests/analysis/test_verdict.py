@@ -197,7 +197,7 @@ def test_closed_pipe_fails_and_keeps_the_verdicts(files):
     assert IdentifiedModel.load(model).validation.verdicts["shoulder_pitch"] == "do not use"
 
 
-def test_identification_recording_gives_no_saved_verdicts(files, tmp_path, capsys):
+def test_identification_recording_gives_no_verdict_to_rely_on(files, tmp_path, capsys):
     model, good, _ = files
     loaded = IdentifiedModel.load(model)
     provenance = dataclasses.replace(loaded.provenance, sha256=read_recording(good).sha256)
@@ -205,8 +205,10 @@ def test_identification_recording_gives_no_saved_verdicts(files, tmp_path, capsy
     before = (tmp_path / "model.yaml").read_bytes()
     assert main(["validate", good, "--model", model]) == 0
     assert "the model was identified from this recording" in capsys.readouterr().err
-    assert main(["validate", good, "--model", model, "--save"]) == 2
-    assert "the model was identified from this recording; --save requires another recording" in capsys.readouterr().err
+    for option in (["--save"], ["--require", "usable"]):
+        assert main(["validate", good, "--model", model, *option]) == 2
+        text = f"the model was identified from this recording; {option[0]} requires another recording"
+        assert text in capsys.readouterr().err
     assert (tmp_path / "model.yaml").read_bytes() == before
 
 
