@@ -101,7 +101,9 @@ def print_validation(
         next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     elif validation.verdict == "do not use":
         next_command = f"dvrk-drake check {source} --arm {model.arm.source}"
-        if isinstance(validation, DynamicValidation):
+        # Errors above 100 % are due to wrong signs, units or coordinates, which a refit of friction does not correct.
+        plausible = all(error is None or error <= 1 for error in validation.relative_errors.values())
+        if isinstance(validation, DynamicValidation) and plausible:
             next_command = f"dvrk-drake recalibrate {source} --model {model_path} --output NEW.yaml"
     elif not saved:
         next_command = f"dvrk-drake validate {source} --model {model_path} --save"
