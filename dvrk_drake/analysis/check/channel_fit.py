@@ -299,7 +299,7 @@ class _DriveEffects(NamedTuple):
 
 
 def _drive_effects(arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], moves: bool) -> _DriveEffects:
-    """Returns the effects of the arm file, including springs and cables without a coefficient, and additional friction.
+    """Returns additional friction and the effects of the arm file. Their coefficients are unknowns of the fit.
 
     The additional friction is viscous and Coulomb friction of each actuator. Friction is omitted if the arm is at rest.
     """
