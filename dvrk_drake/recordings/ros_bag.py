@@ -345,9 +345,11 @@ def _with_jaw(path: Path, arm: _Topic, jaw: _Topic, joint: str) -> tuple[_Topic,
 def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> list[int]:
     """Returns the column of each joint of the arm. Joints that are not in the arm are ignored."""
     if missing := [joint for joint in arm.joint_names if joint not in names]:
+        advice = "Check --arm and --topic."
+        if missing == [arm.joint_names[-1]] == ["jaw"]:
+            advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well."
         raise RecordingError(
-            f"{path}: {topic} has the joints {', '.join(names)}; {arm.name} also needs {', '.join(missing)}. "
-            "Check --arm and --topic."
+            f"{path}: {topic} has the joints {', '.join(names)}; {arm.name} also needs {', '.join(missing)}. {advice}"
         )
     return [names.index(joint) for joint in arm.joint_names]
 

@@ -83,6 +83,13 @@ def test_joins_the_jaw_of_a_psm_by_time(psm, tmp_path):
     assert any("no message of the jaw" in note for note in states.notes)
 
 
+def test_names_the_missing_topic_of_the_jaw(psm, tmp_path):
+    q, qd, tau = blocks(5, 6)
+    path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": joint_states(stamps(5), psm.joint_names[:6], q, qd, tau)})
+    with pytest.raises(RecordingError, match="also needs jaw. Record /PSM1/jaw/measured_js as well"):
+        read_joint_states(path, psm)
+
+
 def test_reads_the_named_arm_of_several(psm, tmp_path):
     first, second = blocks(5, 7, seed=1), blocks(5, 7, seed=2)
     topics = {
