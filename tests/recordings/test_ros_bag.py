@@ -86,7 +86,7 @@ def test_joins_the_jaw_of_a_psm_by_time(psm, tmp_path):
 def test_names_the_missing_topic_of_the_jaw(psm, tmp_path):
     q, qd, tau = blocks(5, 6)
     path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": joint_states(stamps(5), psm.joint_names[:6], q, qd, tau)})
-    with pytest.raises(RecordingError, match="also needs jaw. Record /PSM1/jaw/measured_js as well"):
+    with pytest.raises(RecordingError, match=r"also needs jaw\. Record /PSM1/jaw/measured_js as well"):
         read_joint_states(path, psm)
 
 
