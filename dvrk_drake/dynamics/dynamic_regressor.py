@@ -247,9 +247,9 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
 def _link_frames(
     model: DynamicRegressor, plant: MultibodyPlant, bodies: dict[str, tuple[RigidBody, RigidTransform]]
 ) -> list[tuple[str, RigidTransform]]:
-    """Returns the label and the pose X_LF of frame F for each link of the model.
+    """Returns the label of each link L of the model, and the pose X_LF of its frame F = dh_<label>.
 
-    The label of a link without a dh frame is its name in the SDF without the suffix "_link".
+    For a link without such a frame, F is its SDF frame. The label is then its name without the suffix "_link".
     """
     named = {body.name(): (label, X_LF) for label, (body, X_LF) in bodies.items()}
     return [named.get(link.link, (link.link.removesuffix("_link"), RigidTransform())) for link in model.links]
