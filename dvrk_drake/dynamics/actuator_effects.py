@@ -106,7 +106,7 @@ def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple
         # Additional friction in the direction +x.
         return z, max(math.tanh(v / scale), 0.0)
     if code == 4:
-        # Additional friction at low speed, which becomes small above five widths of the smoothed sign.
+        # Additional friction at low speed. It becomes small at speeds above 5 * scale.
         return z, math.tanh(v / scale) * math.exp(-((v / (5.0 * scale)) ** 2))
     if code == 5:
         # Elasto-plastic (Prandtl) element: a spring that slides at a deflection of `scale`. Several parallel elements

@@ -47,7 +47,7 @@ class StandardParameter:
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Base parameters beta = combination phi of standard parameters phi (p,).
+    """Base parameters beta = combination @ phi, where phi (p,) contains the standard parameters.
 
     The regressor for beta consists of the columns `columns` of the regressor for phi.
 

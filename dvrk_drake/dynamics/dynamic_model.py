@@ -54,7 +54,7 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: Gravity effort above which an actuator compensates gravity [N m, N]. Smaller efforts are rounding errors.
+#: Gravity effort above which an actuator is considered loaded by gravity [N m, N]. Smaller efforts are rounding errors.
 MIN_WEIGHT = 1e-9
 #: Number of random poses at which the gravity efforts are compared with `MIN_WEIGHT`.
 WEIGHING_POSES = 20
@@ -99,9 +99,9 @@ class DynamicModel:
     def holding_effects(self) -> tuple[int, ...]:
         """Indices of the effects that have the same torque at rest and in motion.
 
-        These are the position-dependent effects, except the offset of an actuator that compensates gravity. Such an
+        These are the position-dependent effects, except the offset of an actuator that is loaded by gravity. Such an
         offset can be caused by an error of the gravity model or by direction-dependent friction, so the offset may be
-        wrong at rest. If the coordinate also has a cable cosine, the offset is part of the cable torque and is
+        wrong at rest. If the actuator also has the effect "cable cosine", the offset is part of the cable torque and is
         included.
         """
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)

@@ -184,7 +184,7 @@ _AXES = tuple(parameter_axis(name) for name in PARAMETER_NAMES)
 
 @dataclass(frozen=True, eq=False)
 class DynamicBaseParameters:
-    """Base parameters beta = base.combination phi_F, with tau = Y_base beta = Y phi for every motion.
+    """Base parameters beta = base.combination @ phi_F, with tau = Y_base beta = Y phi for every motion.
 
     phi_F (p,) contains the ten parameters of each link in its frame dh_<label>, then the parameters of the rotors. For
     a link without such a frame, the SDF frame is used. `base.names` refers to phi_F. phi (p,) contains the parameters
@@ -193,7 +193,7 @@ class DynamicBaseParameters:
     Attributes:
         standard_parameters: Standard parameters phi_F (p,).
         base: Base parameters as combinations of phi_F.
-        to_links: Matrix (p, p) with phi = to_links phi_F.
+        to_links: Matrix (p, p) with phi = to_links @ phi_F.
     """
 
     standard_parameters: tuple[StandardParameter, ...]
@@ -202,7 +202,7 @@ class DynamicBaseParameters:
 
     @cached_property
     def combination(self) -> NDArray[np.float64]:
-        """Matrix (b, p) with beta = combination phi."""
+        """Matrix (b, p) with beta = combination @ phi."""
         return np.asarray(np.linalg.solve(self.to_links.T, self.base.combination.T).T, dtype=np.float64)
 
 
@@ -247,9 +247,9 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
 def _link_frames(
     model: DynamicRegressor, plant: MultibodyPlant, bodies: dict[str, tuple[RigidBody, RigidTransform]]
 ) -> list[tuple[str, RigidTransform]]:
-    """Returns the label and the pose X_LF of frame F for each link of the model.
+    """Returns the label of each link L of the model, and the pose X_LF of its frame F = dh_<label>.
 
-    The label of a link without a dh frame is its name in the SDF without the suffix "_link".
+    For a link without such a frame, F is its SDF frame. The label is then its name without the suffix "_link".
     """
     named = {body.name(): (label, X_LF) for label, (body, X_LF) in bodies.items()}
     return [named.get(link.link, (link.link.removesuffix("_link"), RigidTransform())) for link in model.links]

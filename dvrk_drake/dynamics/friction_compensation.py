@@ -18,7 +18,7 @@ from dvrk_drake.models.arm import Arm
 
 #: Largest travel before sliding [rad, m] of the presliding effects that are assumed to hold the arm at rest.
 HOLDING_TRAVEL = 0.015
-#: Largest width of the smoothed sign [rad/s, m/s] of the Coulomb effects that are assumed to hold the arm at rest.
+#: Largest `ActuatorEffect.scale` [rad/s, m/s] of the Coulomb effects that are assumed to hold the arm at rest.
 HOLDING_SPEED = 0.25
 #: Largest share of the friction that may be compensated. On another day, an arm may have a third less friction than
 #: identified (docs/dynamics.md). The compensation must never exceed the actual friction.
@@ -135,7 +135,7 @@ def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
 def safe_ratios(
     friction: Friction, ratio: float, holding_error: ArrayLike, hysteresis_ratio: float = 0.0
 ) -> NDArray[np.float64]:
-    """Returns the largest compensation ratio of each effect for which the remaining friction holds the arm.
+    """Returns the largest compensation ratios of the effects with which the remaining friction holds the arm.
 
     The remaining friction must hold the arm at rest for every torque error e with |e_i| <= holding_error_i. This means
     that there are forces f_k along the coordinates with sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k.
@@ -147,11 +147,11 @@ def safe_ratios(
         friction: Friction of the arm.
         ratio: Requested ratio, 0 to `MAX_RATIO`.
         holding_error: Largest error (n,) of the gravity compensation [N m, N].
-        hysteresis_ratio: Requested ratio of effects with `Friction.springs_back`, 0 to `MAX_HYSTERESIS_RATIO`. If it is
-            at most `ratio`, it has no effect. These effects do not hold a released arm at its pose, so compensating
-            them does not reduce the holding friction. The total compensation along a coordinate is at most `MAX_RATIO`
-            times the friction along this coordinate, excluding viscous friction. Hysteresis is compensated before other
-            friction.
+        hysteresis_ratio: Requested ratio of effects with `Friction.springs_back`, 0 to `MAX_HYSTERESIS_RATIO`. A value
+            of at most `ratio` is ignored. Effects with `springs_back` do not hold a released arm at its pose, so
+            compensating them does not reduce the holding friction. The total compensation along a coordinate is at most
+            `MAX_RATIO` times the friction along this coordinate, excluding viscous friction. Hysteresis is compensated
+            before other friction.
 
     Returns:
         Ratios (k,) of the effects.
@@ -192,7 +192,7 @@ def safe_ratios(
 def _largest_ratios(
     rows: NDArray[np.float64], holding: NDArray[np.float64], error: NDArray[np.float64], most: float
 ) -> NDArray[np.float64]:
-    """Returns the largest ratios (c,) of the coordinates for which the remaining friction balances all errors.
+    """Returns the largest ratios (c,) of the coordinates with which the remaining friction balances all errors.
 
     Args:
         rows: Matrix (c, j) that maps joint velocities to the velocities of the coordinates.

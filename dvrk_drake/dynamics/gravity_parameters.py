@@ -31,7 +31,7 @@ class GravityParameters:
             `link_inertias`, to the standard parameters. A rotor without a frame dh_<name> is balanced about its axis.
             Such a rotor is treated as a part of the link that carries the motor.
         lengths: Name -> distance between link frames [m]. The names of the base parameters contain these names.
-        base: Base parameters beta = base.combination standard_values, in the units base.units.
+        base: Base parameters beta = base.combination @ standard_values, in the units `base.units`.
     """
 
     arm: Arm

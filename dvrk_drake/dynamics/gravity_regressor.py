@@ -26,7 +26,7 @@ class SymbolicGravity(GravityParameters):
     Attributes:
         q: Joint positions as symbols q1, ..., qn [rad, m].
         regressor: Y (n, b) as a function of q and `GRAVITY`.
-        potential: Row (1, b). The product potential beta is the part of the potential energy that depends on q [J].
+        potential: Row (1, b). `potential @ beta` is the part of the potential energy that depends on q [J].
     """
 
     q: tuple[sympy.Symbol, ...]

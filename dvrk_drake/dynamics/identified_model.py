@@ -123,7 +123,7 @@ class Provenance:
     version: str = ""
 
 
-#: Verdicts on a joint of a model, from most to least favourable. For `off`, the model commands no torque.
+#: Verdicts on a joint of a model, from most to least favourable. For `off`, the feedforward scale is 0.
 Verdict = Literal["off", "good", "usable", "not judged", "do not use"]
 
 

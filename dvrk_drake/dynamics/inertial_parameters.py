@@ -124,8 +124,8 @@ class RotorInertia:
 
     Attributes:
         actuators: Names of the actuators of the row and the column of D. An actuator has the name of the joint in the
-            same row of the transmission. Elements of D with two different names are artefacts of the SDF format, see
-            `rotor_inertias`.
+            same row of the transmission. Elements of D for two different actuators are artefacts of the SDF format,
+            see `rotor_inertias`.
         value: Value according to the SDF [kg m^2; kg for a prismatic actuator].
     """
 

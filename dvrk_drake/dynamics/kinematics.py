@@ -88,12 +88,12 @@ class PsmInverseKinematics:
     The solution is unique, except for full revolutions of the roll, if two conditions hold. The wrist centre is beyond
     the remote centre of motion (RCM), and |wrist_pitch| < 90 degrees.
 
-    The wrist centre is the intersection of the shaft and the wrist pitch axis. The tip is here the origin of the wrist
+    The wrist centre is the intersection of the shaft and the wrist pitch axis. Here, the tip is the origin of the wrist
     yaw link, which lies on the wrist yaw axis. The wrist link connects these two points and has the length L. It lies
     in a plane with the shaft and is perpendicular to the yaw axis. Therefore its direction d is the direction of the
-    tip position without the component along the yaw axis. The wrist centre p_tip - L d lies on the shaft, which passes
-    through the RCM. The position of the wrist centre determines yaw, pitch and insertion. The remaining rotation
-    consists of roll, wrist pitch and wrist yaw about z, x and y.
+    tip position p_tip, relative to the RCM, without the component along the yaw axis. The wrist centre p_tip - L d lies
+    on the shaft, which passes through the RCM. The position of the wrist centre determines yaw, pitch and insertion.
+    The remaining rotation consists of the roll about z, the wrist pitch about x and the wrist yaw about y.
 
     Lengths and the pose of the frame on its link are read from the arm's SDF.
     """

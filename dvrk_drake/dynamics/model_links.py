@@ -30,10 +30,10 @@ _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
 
 
 def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
-    """Returns the physically consistent links with gravity torque Y(q) beta that are nearest to the SDF.
+    """Returns the physically consistent links that have the given base parameters and are nearest to the SDF.
 
     Z = L^-1 J L^-T is the pseudo-inertia J of a link relative to the pseudo-inertia J0 = L L' in the SDF. Z is the
-    identity matrix for an unchanged link of any size. The distance to the SDF is the sum of |Z - 1|^2 (Frobenius norm)
+    identity matrix for a link with J = J0. The distance to the SDF is the sum of |Z - 1|^2 (Frobenius norm)
     over the links. This distance is minimized subject to the linear equations of the gravity torque. All eigenvalues of
     Z must be at least MIN_EIGENVALUE_RATIO. The distance and the constraints do not depend on frames or units. The
     distance is a second-order approximation at J0 of the distance defined by Lee, Wensing and Park, "Geometric robot
@@ -257,8 +257,8 @@ def _unit_rotor_inertia(axis: NDArray[np.float64]) -> NDArray[np.float64]:
 def _rotation_rates(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Returns link -> (rate, axis) for links with a revolute joint.
 
-    rate (n,) is the angular velocity about the joint axis per joint velocity. The rate includes the rotation of parents
-    with parallel joint axes. axis (3,) is the joint axis in the link's frame.
+    rate (n,) is the angular velocity about the joint axis per unit velocity of each independent joint. It includes the
+    rotation of parents with parallel joint axes. axis (3,) is the joint axis in the link's frame.
     """
     context = plant.CreateDefaultContext()
     rotations: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}

@@ -283,8 +283,8 @@ def total_mass_reached(total: float, nominal: float) -> bool:
 
 def _add_prior(program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia) -> None:
     floor = least_eigenvalue_bound(link) * np.eye(4)
-    # With S0 = L L', Z = L^-1 S L^-T is the identity matrix for an unchanged link of any size. log det Z differs from
-    # log det S only by a constant.
+    # With S0 = L L', Z = L^-1 S L^-T is the identity matrix for S = S0. log det Z differs from log det S only by a
+    # constant.
     L_inverse = np.linalg.inv(np.linalg.cholesky(link.pseudo_inertia() - floor))
     units = np.array([L_inverse @ pseudo_inertia(unit) @ L_inverse.T for unit in _UNITS])
     Z = program.NewSymmetricContinuousVariables(4, "Z")

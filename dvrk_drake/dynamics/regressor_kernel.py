@@ -171,8 +171,10 @@ def _move_link(X, H, joint, P, C):  # pragma: no cover - compiled
 def _torques(X, H, factor, J_P, C, J_C, torques):  # pragma: no cover - compiled
     """Fills J_C and `torques`. The ten rows of `torques` are J_C' f per unit of each parameter of link C.
 
-    J_C' f is the joint torque. J_C is J_P, transformed to C, plus factor * H. The wrench f has the force
-    m a + [dw] h + [w]^2 h and the moment h x a + I dw + w x I w.
+    J_C' f is the joint torque. J_C is J_P, transformed to C, plus factor * H. `factor` is the element of G for the link
+    and the joint. The wrench f has the force m a + [dw] h + [w]^2 h and the moment h x a + I dw + w x I w. Here, m, h
+    and I are the mass, first moment and inertia of the link, w and dw are its angular velocity and acceleration, and a
+    is the acceleration of its origin minus gravity.
     """
     h0, h1, h2, h3, h4, h5 = H[0] * factor, H[1] * factor, H[2] * factor, H[3] * factor, H[4] * factor, H[5] * factor
     for s in range(BLOCK):

@@ -119,9 +119,8 @@ def export_model(
         friction_ratio: Share of the friction to compensate on each joint (7,), 0 to 1, for "dvrk-gc". None uses
             typical values.
         dead_band: Speeds (7,) [rad/s] below which no friction is compensated, for "dvrk-gc". None uses typical values.
-        saturation: Speeds (7,) [rad/s] above which the full share `friction_ratio` of the friction is
-            compensated, for "dvrk-gc". None uses
-            typical values.
+        saturation: Speeds (7,) [rad/s] above which the full share `friction_ratio` of the friction is compensated, for
+            "dvrk-gc". None uses typical values.
         overwrite: Whether to replace existing files.
 
     Returns:

@@ -174,7 +174,7 @@ def print_comparison(
     print_answer(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). At {wrong:.0f} % of "
-        "the poses, the torque of a joint is at a limit, far outside the range of the model, or opposite to the model.",
+        "the poses, the file's torque on a joint is at a limit, far outside the model's range, or opposite in sign.",
         _next_step(comparison.model, model_name),
         "yellow" if wrong else "green",
     )

@@ -91,7 +91,7 @@ def print_validation(
         console: Console to print to.
         validation: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
-        saved: Whether the verdicts are stored in the model file, where the command run expects them.
+        saved: Whether the verdicts are stored in the model file, from which the command `run` reads them.
         verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
     """
     verdicts, model = validation.verdicts, validation.model
@@ -284,7 +284,7 @@ def _print_correlations(console: Console, pairs: Sequence[CorrelatedEstimates]) 
         what = "difference" if pair.correlation > 0 else "sum"
         console.print(
             f"not identifiable separately: {pair.first} and {pair.second} (correlation {pair.correlation:+.3f}). Only "
-            f"their scaled {what} is identifiable.",
+            f"a scaled {what} is identifiable.",
             style="yellow",
             markup=False,
         )

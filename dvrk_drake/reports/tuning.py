@@ -116,7 +116,7 @@ def _print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
         console,
         "inertia: smallest (all other joints free) and largest (all other joints locked) over the joint range [kg m^2; "
         "kg]. frequency: natural frequency of the closed loop. phase [deg] and gain: stability margins. limited by "
-        "other joints: slower than the design of the single joint, so that all joints are stable together.",
+        "other joints: the joint is slower than in its single-joint design, so that all joints are stable together.",
     )
     _print_gains(console, f"{arm.name}, gains of the model-based design", arm, design.joints)
 
