@@ -80,7 +80,7 @@ def test_convert_writes_the_csv_of_a_bag(tmp_path):
     assert main(["convert", bag, "--arm", "mtmr", "--output", str(out)]) == 0
     first, second = read_recording(csv, arm), read_recording(out, arm)
     for name in ("t", "q", "qd", "tau"):
-        np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

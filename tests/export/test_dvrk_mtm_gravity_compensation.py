@@ -238,7 +238,7 @@ def test_tilted_base_is_rejected_or_approximated(tmp_path, capsys):
     model.save(given)
     assert main(["export", "--model", str(given), "--dvrk-gc", str(out)]) == 2
     error = refusal(capsys.readouterr().err)
-    assert "tilted by 2.3 deg" in error and not out.exists()
+    assert "a base tilt of 0 instead of 2.3 deg" in error and not out.exists()
     # With the option in the message, the error of the file is the error in the message.
     tolerance = error.split("--gc-tolerance ")[1]
     assert main(["export", "--model", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0
