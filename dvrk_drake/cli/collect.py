@@ -78,7 +78,7 @@ def collect(
     Args:
         poses: Pose file. With --output, the arm moves to the poses in this file. --teach and --random add poses to it.
         output: Move the arm to each pose of the pose file, and append one row per pose to this CSV file.
-        teach: Compensate gravity while you move the arm by hand. Press Enter to add the current pose to the pose file.
+        teach: Compensate gravity so that you can move the arm by hand. The Enter key adds the current pose to the file.
         random: Add N random poses to the pose file.
         at_rest: With --teach: also add each pose at which the arm is at rest for one second.
         both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.

@@ -58,10 +58,10 @@ def export(
         diff: Print the differences between the SDF of the arm and the exported SDF.
         gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: 1e-6.
         friction: Also compensate the dry friction of the model. The model must be identified from a motion.
-        coulomb: Also compensate Coulomb friction with these values, one per joint [N m]. Excludes --friction.
+        coulomb: Also compensate Coulomb friction with these values, one per joint [N m]. Not allowed with --friction.
         friction_ratio: Share of the friction of each joint to compensate, 0 to 1. Default: 0.8 0.8 0.8 0.4 0.6 0.6 0.
         dead_band: Speed below which no friction is compensated [rad/s]. Default: 0.02 0.02 0.02 0.01 0.008 0.008 0.01.
-        saturation: Speed above which --friction-ratio is fully reached [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
+        saturation: Speed above which the full --friction-ratio applies [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export

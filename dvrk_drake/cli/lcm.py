@@ -120,7 +120,7 @@ def run(
 
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
-        gains: Gains file from the command tune, for the modes damped and hold. Default: the gains of the arm file.
+        gains: Gains file written by dvrk-drake tune, for the modes damped and hold. Default: the gains of the arm file.
         friction_ratio: Share of friction to compensate in mode gravity, 0 to 0.6. It is reduced if the arm could creep.
         hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
         friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.

@@ -26,7 +26,7 @@ from dvrk_drake.cli.app import app
 from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
-# The matrices are small. Several BLAS threads would mostly wait for each other, on a busy computer for minutes.
+# The matrices are small. Several BLAS threads would mostly wait for each other: minutes on a busy computer.
 # The variable must be set before numpy is imported, which happens in the commands.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -90,7 +90,7 @@ def convert(
         variable: Variable of a team-mat file that contains the recording. Required if several variables are possible.
         rate: Sampling rate [Hz] of rows without time stamps. Default: 200 for wpi-csv, no time stamps for csv.
         arm: csv, wpi-csv: convert to joint coordinates of this arm. ros-bag, lcm-log: read messages of this arm.
-        skip_invalid: Skip rows with an empty cell, NaN or an infinite value, and print their number.
+        skip_invalid: Skip rows with an empty cell, NaN or an infinite value, and print the number of skipped rows.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording
 

@@ -93,7 +93,7 @@ def study(
     ] = None,
     scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_EXECUTOR)] = None,
     plots: Plots = None,
-    overwrite: Annotated[Overwrite, Parameter(help="Write into a folder of --plots that is not empty.")] = False,
+    overwrite: Annotated[Overwrite, Parameter(help="Write into the --plots folder even if it is not empty.")] = False,
     verbose: Verbose = False,
 ) -> None:
     """Simulate a scenario with many poses, seeds and variations.
@@ -142,8 +142,8 @@ def tune(
     method: Annotated[
         Literal["paper", "model", "both"],
         Parameter(
-            help="paper: raise Kp until the joint oscillates, then set Kv and Ki. model: design gains from inertia, "
-            "friction and delay."
+            help="paper: raise Kp until the joint oscillates, then set Kv (kd) and Ki. model: design gains from "
+            "inertia, friction and delay."
         ),
     ] = "both",
     output: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,

@@ -62,7 +62,7 @@ class Arm:
         sdf: Package URLs or paths of the SDF files: first the arm, then its instrument if there is one.
         mirrored_links: Mapping from a URL in `sdf` to the links of that file that are mirrored for this arm.
         position_lower, position_upper: Position limits (n,) of this arm.
-        effort_limits: Limits (n,) of the joint torques, from the SDF.
+        effort_limits: Limits (n,) of the joint efforts, from the SDF.
         prismatic: Array (n,), True for prismatic joints [m, N], False for revolute joints [rad, N m].
         coupled_limits: Limits on weighted sums of joint positions.
         linkage: Map q_tree = G q + c from the independent joint positions q to the positions of `tree_joint_names`. It
@@ -72,9 +72,10 @@ class Arm:
         gravity: Gravity vector (3,) in the base frame [m/s^2].
         gains: Default gains of the controller.
         friction_coordinates: Additional coordinates along which friction acts, besides joints and actuators: mapping
-            from the name of a coordinate to a vector (n,), whose product with q is the coordinate.
+            from the name of a coordinate to a vector (n,), whose dot product with q is the coordinate.
         identification: Settings for recordings of the arm, and bounds of the mass distribution of the links.
-        effects: Friction, cable and sensor effects of the real arm. A simulation includes them only on request.
+        effects: Friction, cable and sensor effects of the real arm. A simulation includes only those that are named in
+            `simulated_effects`.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -227,7 +228,7 @@ class Arm:
         Args:
             count: Number of poses.
             generator: Random number generator.
-            margin: Fraction (0 to 0.5) of each position range that is excluded at both ends of the range.
+            margin: Fraction (0 to 0.5) of each position range that is excluded at each end of the range.
 
         Raises:
             ArmError: Almost no pose within the joint limits meets the coupled limits.
@@ -276,7 +277,7 @@ def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], join
 
 
 def known_arms() -> list[str]:
-    """Returns the names that `load_arm` accepts."""
+    """Returns the names of the arms of this package, which `load_arm` accepts."""
     return sorted(path.stem for path in _ARMS.glob("*.yaml"))
 
 

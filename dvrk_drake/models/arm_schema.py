@@ -53,7 +53,7 @@ class LoopClosure:
 
 @dataclass
 class Gains:
-    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)], with N and m for a prismatic joint.
+    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N/m, N s/m, N/(m s) if prismatic.
 
     The ranges in this class apply to all arms. `Arm.gains_fault` checks the narrower ranges of one arm.
     """
@@ -130,7 +130,7 @@ class Mechanism:
     `transmission` maps an actuator to the coefficients of its position: actuator position = sum of coefficient * joint
     position. An actuator without an entry has the position of its joint. `effort_cut_off` is the cut-off
     frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects` are the friction, cable and
-    sensor effects of the real arm. A simulation includes them only on request.
+    sensor effects of the real arm. A simulation includes only those that are named in `simulated_effects`.
     """
 
     sdf: str = ""

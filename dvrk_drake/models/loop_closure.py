@@ -25,8 +25,8 @@ def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClos
     The pin joins the origins of frame_a and frame_b. The link of frame_a is a bar. The distance constraint keeps the
     distance between the parent joint of this bar and frame_b equal to the length of the bar.
 
-    Drake's solver SAP assigns each constraint the compliance 5e-10 s^2 / m at a time step of 1 ms, where m is the
-    effective mass of the unconstrained tree at the pin. The three equations of the pin share one effective mass. A
+    Drake's solver SAP gives each constraint the compliance (5e-10 s^2) / M at a time step of 1 ms, where M [kg] is
+    the effective mass of the unconstrained tree at the pin. The three equations of the pin share one effective mass. A
     light bar that rotates freely makes the pin compliant in all directions, including the direction of the bar, in
     which the linkage is loaded. The distance constraint has the effective mass of the linkage and is stiff. With this
     constraint, the weight of the PSM moves its remote centre by 1e-8 m instead of 2e-6 m.

@@ -35,9 +35,9 @@ def add_arm(
 ) -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world, and sets gravity and limits.
 
-    The loop closures require Drake's SAP solver, which the contact approximations sap, similar and lagged use. The
-    approximation tamsi of a discrete plant is changed to sap. A continuous plant can be simulated only with the
-    integrator CENIC. For a continuous plant, the closure "ball" requires drake 1.56 or newer.
+    The loop closures require Drake's SAP solver. The contact approximations `sap`, `similar` and `lagged` use this
+    solver. If a discrete plant uses `tamsi`, the function selects `sap`. A continuous plant can be simulated only with
+    the integrator CENIC. For a continuous plant, the closure "ball" requires drake 1.56 or newer.
 
     Args:
         plant: Plant, with or without a scene graph.
@@ -81,8 +81,8 @@ def check_plant(arm: Arm) -> None:
     """Checks that a plant of the arm can be created with each method of loop closure.
 
     Raises:
-        ArmError: Drake cannot load the SDF, or a link has no joint. A frame of a loop closure, or one of the frames
-            dh_0, dh_1, ..., is missing.
+        ArmError: Drake cannot load the SDF, a link is not connected to the base by joints, a frame of a loop closure is
+            missing, or the numbers of the frames dh_0, dh_1, ... have a gap.
     """
     for closure in get_args(Closure):
         try:
@@ -125,9 +125,9 @@ def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> No
 
 
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
-    """Returns the indices of the joints `arm.tree_joint_names` in the positions of the plant.
+    """Returns the indices of the joints `arm.tree_joint_names` in the position vector of the plant.
 
-    The indices are also valid for the velocities, because all joints have one degree of freedom.
+    The indices are also valid for the velocity vector, because all joints have one degree of freedom.
     """
     joints = [plant.GetJointByName(name, instance) for name in arm.tree_joint_names]
     return np.array([joint.position_start() for joint in joints])

@@ -24,7 +24,7 @@ _MANY = {bool: "true or false", int: "integers", float: "numbers", str: "strings
 RANGE = "range"
 #: Metadata key of a field: its name in files of earlier versions.
 FORMERLY = "formerly"
-#: Mapping from a unit to another unit that is often used by mistake, and the value of the other unit in the first unit.
+#: Mapping from a unit to another unit that is often used by mistake, and the factor that converts the other unit to it.
 _MISTAKEN = {
     "rad": ("degrees", math.pi / 180),
     "rad/s": ("degrees/s", math.pi / 180),

@@ -114,9 +114,9 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     """Reads the moving joints from a composed model.
 
     Raises:
-        ArmError: The link base_link is missing, another link has no mass, or two joints have the same name. A joint has
-            an unsupported type, has `<friction>`, which Drake ignores silently, or follows another joint with a
-            multiplier of 0.
+        ArmError: The link base_link is missing, another link has no mass, two joints have the same name, or the
+            model has an unsupported joint. Unsupported are joint types other than revolute, prismatic and fixed;
+            `<friction>`, which Drake ignores silently; and `drake:mimic` of a fixed joint or with a multiplier of 0.
     """
     if root.find("model/link[@name='base_link']") is None:
         raise ArmError("the SDF has no link base_link")

@@ -79,7 +79,7 @@ def check_poses(poses: NDArray[np.float64], arm: Arm, source: str) -> None:
             raise CollectionError(f"{source}, pose {k + 1}: {'; '.join(violations)} [rad, m] of {arm.name}")
         if (same := same_pose(poses[:k], pose, arm)) is not None:
             raise CollectionError(
-                f"{source}, pose {k + 1}: equal to pose {same + 1}; all joints differ by less than "
+                f"{source}, pose {k + 1}: equal to pose {same + 1}; the difference of each joint is less than "
                 f"{SAME_POSE[0]:g} rad or {SAME_POSE[1]:g} m"
             )
 

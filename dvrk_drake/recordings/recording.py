@@ -37,7 +37,7 @@ LIMIT_TOLERANCE = 0.2, 0.02
 MAX_COUNT = 900_000
 #: Minimum number of rows of a motion, and maximum median sampling interval of a motion [s].
 MIN_ROWS, MAX_PERIOD = 100, 0.05
-#: RMS joint velocity above which a recording is a motion [rad/s], [m/s].
+#: RMS joint velocity above which a joint is not at rest [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
 #: Maximum difference of each joint position between samples of the same pose [rad], [m].
 SAME_POSE = 0.01, 0.001
@@ -56,8 +56,8 @@ class Recording:
         t: Times (m,) [s], or None for static poses.
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
-        lines: Line number (m,) of each row in the source, or None. For an LCM log, `lines` contains event numbers; for
-            a MATLAB array, it contains pose numbers.
+        lines: Line number (m,) of each row in the source, or None. They are event numbers for an LCM log, message
+            numbers for a ROS bag, and pose numbers for a MATLAB array.
         sha256: SHA-256 of the source, or "".
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
         line_label: Name of the numbers in `lines`, for messages: "line", "event", "message" or "pose".

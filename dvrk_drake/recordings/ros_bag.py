@@ -89,12 +89,14 @@ def read_joint_states(
         path: Path of a `.bag`, `.db3` or `.mcap` file, or of the folder of a ROS 2 bag.
         arm: Arm whose joints are read.
         topic: JointState topic, e.g. "/PSM1/measured_js", or its namespace, "/PSM1". Default: the only topic
-            `/<ARM>/measured_js`, in any namespace, where ARM is the name of the arm, with or without a number.
+            `/<ARM>/measured_js`, in any namespace, where ARM is the name of the arm, optionally followed by
+            a number.
         skip_invalid: Whether to omit and note messages with a NaN or an infinity, instead of refusing the bag.
         progress: Callback that receives the completed share 0..1.
 
     Raises:
-        RecordingError: The bag is damaged or empty, has no such topic or several, or its messages do not fit the arm.
+        RecordingError: The bag is damaged or empty, no topic or several topics match, or the messages do not fit
+            the arm.
     """
     path = Path(path)
     reader = _Bag(path)
@@ -125,7 +127,7 @@ def read_joint_states(
 
 
 class _Topic(NamedTuple):
-    """Content of one topic: joint names, header stamps [ns], blocks (m, k) and the numbers of the messages."""
+    """Content of one topic: joint names, header stamps [ns], joint states (m, k), and numbers of the messages."""
 
     names: tuple[str, ...]
     stamps: NDArray[np.int64]
