@@ -319,7 +319,7 @@ def require_usable(
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     """Checks a recording with `check_recording`, then its channels with `check_channels`.
 
-    The channels are not checked if `check_recording` reports a refusal for another reason than efforts with a wrong
+    The channels are not checked if `check_recording` reports a refusal, unless all refusals are efforts with a wrong
     sign. Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels
     therefore replaces the refusals for wrong signs.
     """
