@@ -35,7 +35,8 @@ def validate(
             finished share of the step (0 to 1).
 
     Returns:
-        Result with `verdict`, `verdicts` and `relative_errors` of the joints, `warnings`, and detailed errors.
+        Result with the `verdicts` and `relative_errors` of the joints, the least favourable `verdict`, `warnings`, and
+        detailed errors.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute

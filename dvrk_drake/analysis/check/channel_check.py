@@ -23,8 +23,8 @@ from dvrk_drake.recordings.recording import Recording
 #: motions, no exchange of channels has a positive gain. On public motions with one added error, the correct hypothesis
 #: has a gain of at least 25, and in most cases of more than 100.
 MIN_GAIN = 20.0
-#: Smallest gain at which inverted channels are accepted. An arm is almost symmetric under reflection. Inverted channels
-#: therefore have gains of up to 46 on the unmodified public motions.
+#: Smallest gain at which the hypothesis of an inverted channel is accepted. An arm is almost symmetric under
+#: reflection. This hypothesis therefore has gains of up to 46 on the unmodified public motions.
 MIN_MIRROR_GAIN = 100.0
 #: Smallest gains for poses at rest. The first number is for exchanged channels, the second number is for inverted or
 #: scaled efforts. Friction disturbs the efforts at rest. On the unmodified public poses, the largest gains are 10 for
@@ -57,7 +57,7 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     - The efforts of two channels are exchanged.
     - All signals of two channels are exchanged.
     - The effort of a channel is inverted, or all signals of a channel are inverted.
-    - The effort of an actuator is a multiple of the true effort.
+    - The effort of an actuator has a wrong scale.
     - The position of a channel has an offset.
 
     Each hypothesis is tested by a maximum-a-posteriori fit (`ChannelFit`), and the fits are compared by their
@@ -70,8 +70,9 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         arm: Arm that was recorded.
 
     Returns:
-        One refusal for exchanged or inverted channels. Otherwise, warnings for wrong effort scales and for position
-        offsets, and notes with the joints whose effort scale or position offset is not identifiable from the recording.
+        One refusal for exchanged or inverted channels (for an inverted effort in poses at rest, a warning). Otherwise,
+        warnings for wrong effort scales and for position offsets, and notes with the joints whose effort scale or
+        position offset is not identifiable from the recording.
 
     Raises:
         RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too coarsely.
@@ -258,7 +259,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
     """Yields warnings for actuators whose effort has a wrong scale.
 
     The scale is estimated from the dissipated friction power, or from a fit if the arm file states no friction. A note
-    lists the actuators whose friction power is also consistent with a scale of 0.5 or 2.
+    lists the other actuators for which a scale of 0.5 or 2 cannot be excluded.
     """
     power, allowed, uncertain = fit.dissipation(), _friction_factors(fit), []
     for i in map(int, fit.used):
@@ -318,9 +319,9 @@ def _uncertain_scale(arm: Arm, joints: list[int]) -> Iterator[Finding]:
 def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
     """Returns the largest accepted ratio (n,) of dissipated to expected friction power for each actuator.
 
-    In joint coordinates, the result includes the gear ratio of an actuator that moves only one joint. Reason: the
-    friction in the PSM's arm file was identified from a recording whose roll position may be that of the instrument
-    disc or that of the joint.
+    The ratio is `FRICTION_FACTOR`. For a recording in joint coordinates, it is multiplied by the gear ratio of an
+    actuator that moves only one joint. Reason: the friction in the PSM's arm file was identified from a recording whose
+    roll position may be that of the instrument disc or that of the joint.
     """
     if fit.recording.coordinates == "actuator":
         return np.full(fit.arm.num_joints, FRICTION_FACTOR)

@@ -198,7 +198,7 @@ class ChannelFit:
     def _fit(
         self, tau: NDArray[np.float64], column: NDArray[np.float64] | None = None
     ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """Fits the model to efforts tau (r, n). An additional `column` (r, n) has a coefficient with prior deviation 1.
+        """Fits the model to efforts tau (r, n). An additional `column` (r, n) has prior standard deviation 1.
 
         Returns:
             Log-likelihood, coefficients x (k,) and their precision (k, k).

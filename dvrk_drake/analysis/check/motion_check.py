@@ -26,7 +26,8 @@ from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
 
 #: Smallest reported share of repeated rows. Smaller shares can occur by chance.
 MIN_REPEATED = 0.005
-#: Smallest additional share of repeated rows of q, qd or tau for a warning that this signal comes from a slower topic.
+#: Smallest difference of two shares of rows for a warning that a signal (q, qd or tau) comes from a slower topic: the
+#: share of rows that repeat this signal, and the share of rows that repeat all signals.
 MIN_EXTRA = 0.05
 #: An interval between two rows is a gap if it exceeds both values: the first in median intervals, the second in s.
 GAP, MIN_GAP = 5.0, MAX_PERIOD

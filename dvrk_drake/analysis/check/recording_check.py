@@ -319,9 +319,9 @@ def require_usable(
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     """Checks a recording with `check_recording`, then its channels with `check_channels`.
 
-    The channels are not checked if `check_recording` reports a refusal, except for efforts with a wrong sign. Exchanged
-    channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels therefore replaces the
-    refusals for wrong signs.
+    The channels are not checked if `check_recording` reports a refusal, unless all refusals are efforts with a wrong
+    sign. Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels
+    therefore replaces the refusals for wrong signs.
     """
     report = check_recording(recording, arm)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]

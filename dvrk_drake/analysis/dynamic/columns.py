@@ -98,7 +98,7 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
     """Returns the spring and cable effects that the arm file lists in `motion.known_effects`.
 
-    The linear range of a spring exceeds the positions of its coordinate at the joint positions q (m, n) [rad, m].
+    The linear range of a spring contains all positions of its coordinate at the joint positions q (m, n) [rad, m].
     """
     effects = []
     for name, kinds in arm.identification.known_effects.items():

@@ -243,7 +243,8 @@ class ConsistentFit:
         lower: Lower bounds (p + e,) of x, -inf if there is none.
         errors: Sums of squared residuals (n,) of the actuators.
         information: Weighted sum (p + e, p + e) of X' X over the actuators.
-        prior_precision: Hessian (p + e, p + e) of the Gaussian prior plus the log-det prior at x.
+        prior_precision: Hessian (p + e, p + e) of the Gaussian prior plus the log-det prior at x, see
+            `consistent_parameters`.
     """
 
     def __init__(self, problem: DynamicProblem, effects: NDArray[np.int_], weights: NDArray[np.float64]) -> None:

@@ -95,7 +95,7 @@ class MotionDifference:
 
     Attributes:
         grid: Resampled motion of the second recording.
-        rows: Mask (r,) of the inner rows of `grid` that the reference also contains. It selects k rows.
+        rows: Mask (r,) of the inner rows of `grid` at times that the reference also covers. It selects k rows.
         period: Period of the motion [s], or None if the motion does not repeat.
         shift: Time shift [s]. Time t of the second recording corresponds to time t + shift of the reference.
         tau: Low-pass filtered difference (k, n) of the actuator efforts [N m, N]. The effect of small differences
@@ -187,7 +187,10 @@ def _interpolate(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[
 
 
 def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recording: Recording) -> float:
-    """Returns the time shift [s] that minimises the differences of the positions, divided by standard deviations."""
+    """Returns the time shift [s] that minimises the mean squared difference of the positions.
+
+    The positions of each joint are divided by their standard deviation.
+    """
     deviation = np.std(other.q, axis=0)
     moving = deviation > 1e-3
     x, y = (grid.q[:, moving] / deviation[moving] for grid in (reference, other))

@@ -272,12 +272,12 @@ def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
 
 
 def equally_good_links(estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the payloads on links that explain the change about as well as the best link."""
+    """Returns the payloads whose error is at most `SAME_ERROR` times the error of the payload on the best link."""
     return [payload for payload in estimates if payload.relative_error <= SAME_ERROR * estimates[0].relative_error]
 
 
 def better_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the payloads on other links that explain the change clearly better, best first."""
+    """Returns the payloads on other links that explain the change clearly better (`SAME_ERROR`), best first."""
     return [other for other in estimates if SAME_ERROR * other.relative_error < payload.relative_error]
 
 
@@ -399,7 +399,7 @@ def _problem(
     columns = ((np.arange(size), whitening(x, i)) for i, x in enumerate(actuator_columns))
     equations = NormalEquations.of(columns, size, tau, fold[rows], edge[rows])
     # A low-pass filtered effort has two independent values per period of the cut-off frequency. Errors that repeat with
-    # the motion have fewer independent values, so the standard errors are computed by a jackknife over the phases.
+    # the motion have fewer independent values, so the standard errors are computed by a jackknife over the folds.
     independent = 2 * grid.settings.effort_cut_off / grid.rate
     com = link.parameters[1:4] / link.parameters[0]
     precision = np.mean(difference.changes**2, axis=0) / difference.deviation**2

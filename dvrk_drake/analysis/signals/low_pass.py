@@ -18,7 +18,7 @@ ORDER = 6
 
 
 def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int = ORDER) -> NDArray[np.float64]:
-    """Applies a zero-phase Butterworth low-pass filter along axis 0, forwards and backwards as scipy's `sosfiltfilt`.
+    """Applies a zero-phase Butterworth low-pass filter along axis 0, forwards and backwards like scipy's `sosfiltfilt`.
 
     Args:
         x: Samples (m,) or (m, n) at a constant rate.

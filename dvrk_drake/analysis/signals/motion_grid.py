@@ -129,7 +129,7 @@ class MotionGrid:
         return (1 - share) * x[before] + share * x[before + 1]
 
     def filter_efforts(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Applies the low-pass filter of the efforts to x (r, ...) and removes `ENDS` at both ends."""
+        """Applies the low-pass filter of the efforts to x (r, ...) and removes `ENDS` seconds at both ends."""
         flat = low_pass(x.reshape(len(x), -1), self.rate, self.settings.effort_cut_off)
         return flat.reshape(x.shape)[self.inner]
 

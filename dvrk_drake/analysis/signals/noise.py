@@ -52,7 +52,7 @@ class Band(NamedTuple):
 def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectra:
     """Computes the spectra of signal and noise.
 
-    For a period T, the noise is (x(t) - x(t + T)) / sqrt(2). Without a period, white noise is assumed. Its density is
+    With a period T, the noise is (x(t) - x(t + T)) / sqrt(2). Without a period, white noise is assumed. Its density is
     then the median density of x above a quarter of the sampling rate. The spectrum of the signal is the spectrum of x
     minus the spectrum of the noise.
 

@@ -65,7 +65,7 @@ def repeatability_floor(
         floor_j = rms(tau_j(t) - tau_j(t + T)) / sqrt(2) / rms(tau_j)
 
     This value approximates the smallest possible relative error of a model that is a function of q, v and vd. The
-    efforts are filtered with a zero-phase low-pass filter, and `ENDS` is omitted at both ends.
+    efforts are filtered with a zero-phase low-pass filter, and `ENDS` seconds are omitted at both ends.
 
     Args:
         tau: Efforts (m, n) of the actuators at a constant rate [N m, N].
@@ -112,8 +112,8 @@ def phase_folds(
 
     Returns:
         fold: Index (r,) of the fold of each row, 0 to folds - 1.
-        edge: Mask (r, 2) of the rows within `GAP` of the preceding fold (column 0) and of the following fold (column
-            1).
+        edge: Mask (r, 2) of the rows within `GAP` seconds of the preceding fold (column 0) and of the following fold
+            (column 1).
     """
     t = grid.row_times[grid.inner]
     length = period if period is not None else float(t[-1] - t[0]) * (1 + 1e-9)

@@ -23,7 +23,7 @@ MAX_REST_SPEED, MIN_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
 
 
 def static_poses(recording: Recording, arm: Arm) -> Recording | None:
-    """Extracts the static poses of a motion, at which the arm is at rest for at least `MIN_REST`.
+    """Extracts the static poses of a motion, at which the arm is at rest for at least `MIN_REST` seconds.
 
     Each static segment is averaged over its second half. Segments at the same pose are averaged. A gap in the times
     ends a segment, because the motion in the gap is unknown.
@@ -97,7 +97,7 @@ def stationary_runs(
 #: Largest speed and acceleration in a low-speed segment, as shares of the joint's 99 % quantiles of speed and
 #: acceleration.
 SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2
-#: Largest interval between averaged rows [s]. Rows are averaged in blocks if at least two rows fit into this interval.
+#: Largest duration of a block of averaged rows [s]. Rows are averaged only if a block contains at least two rows.
 MIN_PERIOD = 0.005
 #: Smallest number of rows of a low-speed segment.
 MIN_SAMPLES = 3
@@ -165,7 +165,7 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
 
 
 def _downsampled(recording: Recording) -> Recording:
-    """Averages blocks of rows to reduce their number. The low-pass filter removes faster changes anyway."""
+    """Averages blocks of rows to reduce their number. A block is much shorter than 1 / `CUT_OFF`."""
     t, qd, tau = recording.t, recording.qd, recording.measured_effort()
     if t is None or qd is None:
         return recording

@@ -1,6 +1,6 @@
 """Estimates the true times of the rows of a motion from positions and velocities.
 
-Recorded velocities are used only if their gain and lag agree with the derivatives of the recorded positions.
+Recorded velocities are used only if they agree in gain and lag with the derivatives of the recorded positions.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def _without_drift(
 
 
 def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
-    """Returns a mask (m,) of the rows in motion that repeat q, qd and tau of the previous row."""
+    """Returns a mask (m,) of the rows that repeat q, qd and tau of the previous row, without rows at zero velocity."""
     blocks = [block for block in (recording.q, recording.qd, recording.tau) if block is not None]
     repeats = np.all([repeated_block(block) for block in blocks], axis=0)
     moves = np.any(np.abs(recording.qd) > 0, axis=1) if recording.qd is not None else np.ones(len(recording), bool)

@@ -157,7 +157,7 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
 
 
 def _is_redundant(effect: ActuatorEffect, selected: Sequence[ActuatorEffect]) -> bool:
-    """Returns whether the joint already has a selected cable (for a spring) or a selected spring (for a cable)."""
+    """Returns whether the effect is a spring at a joint with a selected cable, or a cable at one with a spring."""
     joint = effect.coordinate.partition(".")[2]
     kinds = {e.kind.partition(" ")[0] for e in selected if e.coordinate.partition(".")[2] == joint}
     return (effect.kind == "spring" and "cable" in kinds) or (effect.kind.startswith("cable") and "spring" in kinds)

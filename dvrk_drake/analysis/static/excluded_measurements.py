@@ -17,7 +17,7 @@ STOP_MARGIN = 0.01, 0.002
 
 @dataclass(frozen=True)
 class ExcludedMeasurement:
-    """Efforts of one pose that are excluded.
+    """Excluded efforts of one pose.
 
     Attributes:
         row: Index of the row in the recording, starting at 0.

@@ -36,7 +36,7 @@ class RobustFit:
     Attributes:
         fit: Last weighted fit.
         sigma: Standard deviations (n,) of the residuals of each joint.
-        outliers: Mask (m, n) of the rejected measurements.
+        outliers: Mask (m, n) of the outliers, which have zero weight.
     """
 
     fit: LinearFit
@@ -52,8 +52,8 @@ def weighted_fit(
 ) -> LinearFit:
     """Minimizes sum(weights (tau - X theta)^2) + sum(prior_precision theta^2).
 
-    The leave-one-out residuals of pose i are exactly (I - H_i)^-1 e_i. Here e_i are the residuals of pose i, A^-1 is
-    the covariance of theta, and H_i = X_i A^-1 X_i' W_i is a block of the hat matrix.
+    The leave-one-out residuals of pose i are exactly (I - H_i)^-1 e_i. Here e_i are the residuals and W_i the weights
+    of pose i, A^-1 is the covariance of theta, and H_i = X_i A^-1 X_i' W_i is a block of the hat matrix.
 
     Args:
         X: Regressor (m, n, p).

@@ -234,7 +234,8 @@ def _feedforward_scales(
 ) -> NDArray[np.float64]:
     """Returns the feedforward scale (n,) of each joint.
 
-    The scale is below 1 if the model is not better than zero torque, or if the joint hardly moves.
+    The scale is below 1 if the model is not better than zero torque. It is 0 if the joint hardly moves, or if its
+    torque is small and the leave-one-out error is large (`MAX_SMALL_TORQUE_RATIO`).
 
     Args:
         problem: Problem with the poses and torques.
