@@ -153,7 +153,7 @@ def _move_anchors(state, places, laws, time_step, anchors):
         if fall_speed > 0.0:
             slip_travel *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
         deflection = side * (position - anchors[actuator])
-        # From state 0, a travel by the deflection gives the limited deflection, divided by `slip_travel`.
+        # z is the deflection after limiting, divided by `slip_travel`.
         z, _ = effect_step(code, 0.0, deflection, 0.0, slip_travel)
         if abs(deflection - z * slip_travel) < 1e-12 * travel:
             continue
