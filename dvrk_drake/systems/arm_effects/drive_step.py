@@ -47,8 +47,9 @@ class DriveStep(LeafSystem):
     filter with cut-off frequency f: y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h with a = exp(-2 pi f h). Without an
     encoder, position and velocity are exact.
 
-    **Start.** Before the start, the arm is assumed to be at rest at the pose that it has at initialization. With a
-    delay, the output during initialization uses the pose of `SetAtRest` instead.
+    **Start.** Initialization sets the measurements to those of an arm that has been at rest at its present pose. With a
+    delay, systems that read `state_estimated` during initialization still get the measurements at the pose of the last
+    call of `SetAtRest`, or of `q_default`.
     """
 
     def __init__(self, arm: Arm, parts: PlantEffects, effects: ArmEffects, q_default: NDArray[np.float64]) -> None:
