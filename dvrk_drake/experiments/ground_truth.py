@@ -134,7 +134,7 @@ class GroundTruth:
         arm: Arm to simulate, with an SDF in the output folder and the `effects` of the real arm.
         model: Exact model of the gravity, cable and spring torques, used only for evaluation.
         is_paper_arm: Whether the parameters of the arm were identified from the paper's recording.
-        origin: Origin of the arm, one sentence.
+        origin: Text that states the source of the arm's links and effects.
     """
 
     arm: Arm

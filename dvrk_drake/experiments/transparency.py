@@ -30,7 +30,7 @@ from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 SAMPLE_PERIOD = 5e-3
 #: Duration of the initial transient of the grasp, which is excluded from the evaluation [s].
 GRASP_TIME = 1.0
-#: Maximum excess over the joint limits [rad, m]. A recording with a larger excess is not of this arm.
+#: Maximum excess over the joint limits [rad, m]. A recording with a larger excess is rejected.
 MAX_LIMIT_EXCESS = 0.1
 
 

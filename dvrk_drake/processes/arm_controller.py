@@ -44,7 +44,7 @@ class ArmController:
 
         Args:
             arm: Arm to control.
-            model: Model of the arm in its actual mounting.
+            model: Model of the arm with its actual base orientation.
             mode: Mode of the controller.
             period: Period of the status messages [s].
             friction: Friction compensator for mode "gravity". It is added to the Diagram. None: friction is not

@@ -137,7 +137,7 @@ class Teacher:
         self._writing: Future[None] | None = None
 
     def update(self, status: lcmt_dvrk_status, time: float) -> None:
-        """Processes a status that arrived at `time` [s]. There is no desired state, because the operator moves the arm.
+        """Processes a status that arrived at `time` [s]. Returns no desired state: the operator moves the arm.
 
         Raises:
             DvrkDrakeError: The file cannot be written.

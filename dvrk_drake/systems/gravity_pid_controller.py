@@ -64,10 +64,10 @@ class GravityPidController(LeafSystem):
     exceeds the limit. The integral is stored as an effort, so a change of Ki causes no step of the effort. Ki = 0
     resets the integral.
 
-    **Fault.** An invalid input does not raise an exception, so the Diagram continues to run. While an input is not
-    finite, the command is the gravity effort of the last finite pose, without PID. The arm then neither falls nor moves
-    to another pose. Before the first finite pose, the command is zero. Regulation resumes automatically, with the
-    integrator at zero, when the inputs are finite again.
+    **Fault.** An invalid input sets `fault` and does not raise an exception, so the Diagram continues to run. While an
+    input is invalid, the command is the gravity effort of the last valid pose, without PID. The arm then neither falls
+    nor moves to another pose. Before the first valid pose, the command is zero. Regulation resumes automatically, with
+    the integrator at zero, when the inputs are valid again.
 
     To compensate gravity without an identified model, use the model of the arm's SDF, as in the example.
 

@@ -28,7 +28,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
     - `theta`: parameters of the model
     - `effort`, `gravity`, `fault` (1), `integral`: results, which the function writes into these arrays
     - `latched_q`: array with the pose that is regulated if `has_desired` is false; NaN before the first pose
-    - `last_q`: array with the last finite pose; NaN before the first pose
+    - `last_q`: array with the last valid pose; NaN before the first pose
     """
 
     def step(

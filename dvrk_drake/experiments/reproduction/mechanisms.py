@@ -25,8 +25,8 @@ def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
 
     Returns:
         - Table (n, 5) with the columns sign, offset [rad], d [m], alpha [rad] and a [m].
-        - Error: largest difference between an entry of the DH matrices and of the plant's transforms (translations in
-          m).
+        - Error: largest difference between corresponding entries of the DH matrices and the plant's transforms
+          (translations in m).
     """
     plant = make_arm_plant(arm)
     poses = np.vstack([np.zeros(arm.num_joints), arm.sample_poses(POSES, np.random.default_rng(0))])

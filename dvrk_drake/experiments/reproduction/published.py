@@ -78,8 +78,8 @@ IDENTIFICATION_GRAVITY, CONTROL_GRAVITY = 9.9, 9.81
 #: Mean squared errors of Fig. 4 over the 72 poses [(N m)^2], J2..J7.
 FIGURE_4_MEANS = (8.14e-3, 7.96e-3, 1.97e-3, 4.62e-4, 3.98e-5, 1.92e-5)
 
-#: Final drift [rad], J2..J7: the trials shown in Fig. 5 and Fig. 6; for each figure, mean absolute drift over the
-#: team's five trials.
+#: Final drifts [rad] of J2..J7 in the trial that each figure shows (`FIGURE_5`, `FIGURE_6`), and means of the absolute
+#: final drifts over the team's five trials for each figure (`FIGURE_5_MEANS`, `FIGURE_6_MEANS`).
 FIGURE_5 = (0.0102, 0.0051, -0.0138, -0.174, -0.021, 0.0)
 FIGURE_6 = (0.0101, -0.0099, 0.0050, -0.003, -0.316, -0.071)
 FIGURE_5_MEANS = (0.070, 0.020, 0.0085, 1.29, 0.315, 0.730)

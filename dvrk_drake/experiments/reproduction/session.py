@@ -37,8 +37,9 @@ class SampleSizes:
     Attributes:
         collected: Number of poses for the identification of an arm.
         releases: Number of random release poses for our model.
-        paper_releases: Number of the first release poses that are also used for the paper's parameters.
-        hand_guided_releases: Number of the first release poses that are also used for our model with an approach.
+        paper_releases: Number of release poses, counted from the first, that are also used for the paper's parameters.
+        hand_guided_releases: Number of release poses, counted from the first, that are also used for our model with an
+            approach.
         psm_releases: Number of random release poses of the PSM.
         path_poses: Number of poses on the path of an operator.
         duration: Duration of a release [s].

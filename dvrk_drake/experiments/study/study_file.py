@@ -76,7 +76,7 @@ class Study:
     """Schema of a study file: runs of a scenario for all combinations of poses, seeds and variations.
 
     Attributes:
-        scenario: Name of an arm, or path of a scenario's YAML file, relative to the current working folder.
+        scenario: Name of an arm, or path of a scenario's YAML file, relative to the working directory.
         set: Settings "key=value" of the scenario, as for `dvrk-drake simulate --set`.
         poses: Start poses, one list of n numbers [rad, m] each. Default: the start of the scenario.
         random_poses: Random start poses, instead of `poses`.
@@ -137,7 +137,7 @@ class Study:
         """Returns the scenario of a case. `dvrk-drake simulate` can repeat the case with this scenario."""
         scenario = self.scenarios[case.variation]
         controller = scenario.controller
-        if controller.model:  # workers may use another working folder
+        if controller.model:  # workers may use another working directory
             controller = dataclasses.replace(controller, model=os.path.realpath(controller.model))
         arm = scenario.mounted_arm.source
         return dataclasses.replace(scenario, arm=arm, controller=controller, start=list(case.start), seed=case.seed)

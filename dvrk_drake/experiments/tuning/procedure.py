@@ -23,7 +23,8 @@ class Oscillation:
     """Oscillation of a joint. A swing is the motion from one turning point to the next.
 
     Attributes:
-        swings: Number of swings. The first swing is not evaluated, since friction is zero at its start.
+        swings: Number of swings. The first swing is not evaluated, since the presliding springs carry no
+            force at its start.
         growth: Mean ratio of the amplitudes of consecutive swings; 0 for too few swings.
         period: Period of the oscillation, i.e. duration of two swings [s]; infinite for too few swings.
     """

@@ -60,7 +60,7 @@ class SampledLoop:
     """Linear closed loop of n joints with mass matrix M, viscous friction b and a PID controller.
 
     Between two samples M vd = u - b v. The effort is u = -Kp q - Kd v_e - Ki h sum(q) with the velocity estimate
-    v_e and the sample period h, as in GravityPidController for the desired position 0. It is computed from the
+    v_e and the sample period h, as in GravityPidController for the desired position 0. u is computed from the
     measurement `ticks` periods earlier, and is constant for one period. Gravity is compensated exactly. v_e is computed
     as in `systems.arm_effects.drive_step.DriveStep`.
     """

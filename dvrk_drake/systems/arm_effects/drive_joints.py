@@ -36,10 +36,11 @@ STIFF = Cable(stiffness=float("inf"))
 
 
 class DriveJoints:
-    """Finds or creates the joint for a coordinate x = row q of the joint positions q (n,), in a plant before Finalize.
+    """Finds or creates the joint for a coordinate of the drive, in a plant before Finalize.
 
-    If x is proportional to the position of one joint, that joint is used. If x depends on several joints, a body with
-    its own joint is added. The position of this joint is x. The body is coupled in one of two ways:
+    The coordinate is x = row @ q with a constant `row` (n,) and the joint positions q (n,). If x is proportional to the
+    position of one joint, that joint is used. If x depends on several joints, a body with its own joint is added. The
+    position of this joint is x. The body is coupled in one of two ways:
 
     - to a link that rotates by x about the same axis, e.g. the crank of the parallelogram relative to the yaw link,
     - otherwise to the last body of a chain that begins at the world. Each body of the chain rotates relative to the
@@ -86,7 +87,7 @@ class DriveJoints:
         return self.joint(joint_row(self._arm, coordinate))
 
     def joint(self, row: NDArray[np.float64]) -> tuple[Joint, float]:
-        """Returns the joint of x = row q with row (n,), and the factor that converts the position of the joint to x."""
+        """Returns the joint of x = row @ q, and the factor that converts the position of the joint to x."""
         terms = np.flatnonzero(np.abs(row) > 1e-12)
         if len(terms) == 1:
             (i,) = terms
@@ -112,7 +113,7 @@ class DriveJoints:
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
     def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
-        """Returns a new joint whose angle row q is the sum of the angles of coaxial joints; None if there are none."""
+        """Returns a new joint for x = row @ q if x is the sum of the angles of coaxial joints, otherwise None."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
         for name in names:

@@ -47,8 +47,9 @@ class DriveStep(LeafSystem):
     filter with cut-off frequency f: y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h with a = exp(-2 pi f h). Without an
     encoder, position and velocity are exact.
 
-    **Start.** Before the start, the arm is assumed to be at rest at the pose that it has at initialization. With a
-    delay, the output during initialization uses the pose of `SetAtRest` instead.
+    **Start.** Initialization sets the measurements to those of an arm that has been at rest at its present pose. With a
+    delay, systems that read `state_estimated` during initialization still get the measurements at the pose of the last
+    call of `SetAtRest`, or of `q_default`.
     """
 
     def __init__(self, arm: Arm, parts: PlantEffects, effects: ArmEffects, q_default: NDArray[np.float64]) -> None:
@@ -153,7 +154,7 @@ def _move_anchors(state, places, laws, time_step, anchors):
         if fall_speed > 0.0:
             slip_travel *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
         deflection = side * (position - anchors[actuator])
-        # From state 0, a travel by the deflection gives the limited deflection, divided by `slip_travel`.
+        # z is the deflection after limiting, divided by `slip_travel`.
         z, _ = effect_step(code, 0.0, deflection, 0.0, slip_travel)
         if abs(deflection - z * slip_travel) < 1e-12 * travel:
             continue

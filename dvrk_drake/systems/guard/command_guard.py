@@ -122,7 +122,7 @@ class CommandGuard:
       measured effort must be near the gravity effort of the model, and may exceed the limit of commanded efforts by at
       most the setting `start_effort`.
 
-    A controller that was restarted, or whose state does not match the arm's state, therefore does not move the arm.
+    A controller whose state does not match the arm's state, e.g. after a restart, therefore does not move the arm.
 
     **Faults**: A fault is latched. The causes of a fault are:
 

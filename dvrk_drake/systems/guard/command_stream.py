@@ -10,7 +10,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.limits import Vector
 
-#: Reasons of refusals of messages that do not belong to the session or to the sender in control. The guard counts these
+#: Refusal reasons for messages that do not belong to the session or to the sender in control. The guard counts these
 #: messages as ignored, not as refused.
 FOREIGN = frozenset(
     {
@@ -25,7 +25,7 @@ FOREIGN = frozenset(
     }
 )
 
-#: Reasons of refusals of commands that do not continue the sender's stream, such as copies and replays. Such commands
+#: Refusal reasons for commands that do not continue the sender's stream, such as copies and replays. Such commands
 #: do not end the state STARTING.
 OUT_OF_STREAM = frozenset(
     {

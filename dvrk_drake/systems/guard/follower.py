@@ -74,8 +74,8 @@ class Follower:
             q: Measured positions (n,) [rad, m].
             v: Measured velocities (n,) [rad/s, m/s].
             valid: Mask (n,) of joints with a valid position.
-            gravity: Gravity effort (n,) [N m, N] of the model at q, with the last valid position for each invalid
-                position.
+            gravity: Gravity effort (n,) [N m, N] of the model at q, in which the last valid position replaces each
+                invalid position.
         """
         limits = self._limits
         largest, least = limits.fault_effort, limits.fault_effort / 3

@@ -238,7 +238,7 @@ class GuardLimits:
         return inside, flags | limited
 
     def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
-        """Returns the limited feedforward velocity (n,) at `target` (n,), which is zero for joints with `flags`."""
+        """Returns the limited feedforward velocity (n,) at `target` (n,). It is zero for joints with `flags`."""
         velocity = np.where(flags == 0, clip(command, -self.speed, self.speed), 0.0)
         lead = self._look_ahead * velocity
         ahead, _ = self._inside(target + lead, target)

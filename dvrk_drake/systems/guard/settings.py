@@ -15,8 +15,8 @@ class PlausibilitySettings:
 
     Attributes:
         position_tolerance: Tolerance of position steps, and of the difference between the position and the integrated
-            velocity [rad]. For a prismatic joint, the tolerance is 0.1 m per rad of this value. Three encoder counts
-            are added to the tolerance.
+            velocity [rad]. For a prismatic joint, the tolerance in m is 0.1 times this value. Three encoder counts are
+            added to the tolerance.
         jitter: Largest error of the time between two measurements [s].
         velocity_delay: Largest delay of the velocity estimate [s].
         velocity_counts: Allowed error of the velocity, in encoder counts per second [1/s]. This error occurs if the
@@ -25,12 +25,12 @@ class PlausibilitySettings:
         velocity_memory: Time constant of the comparison of positions and velocities [s].
         frozen_effort: Change of effort that must cause a change of position, as a fraction of the effort limit.
         frozen_time: Longest time for which a position may stay constant after such a change of effort [s].
-        frozen_speed: Lowest expected speed of a moving joint [rad/s, m/s]. It gives the time of a motion by one encoder
-            count.
+        frozen_speed: Lowest expected speed of a moving joint [rad/s, m/s]. The time in which a joint moves by one
+            encoder count at this speed is added to `frozen_time`.
         response: Allowed unexplained effort as a fraction of the effort limit, in addition to `hand_effort`. See
             `plausibility.Response`.
         hand_effort: Allowed effort of the operator's hand or of a model error on a joint [N m]. For a prismatic joint,
-            the effort in N is ten times the number.
+            the allowed effort in N is ten times this value.
         response_time: Time constant of the filters of effort and acceleration [s].
         response_memory: Time constant with which the slowly varying part of the unexplained effort is attributed to
             model errors [s].
@@ -39,7 +39,8 @@ class PlausibilitySettings:
             difference.
         silent_effort: Lowest commanded effort that the measured effort must follow, as a fraction of the effort limit.
         silent_time: Time within which the measured effort must follow the commanded effort [s].
-        detection_time: Positions of this time before the detection of a fault are not used as the last valid pose [s].
+        detection_time: Longest expected time from an error to its detection [s]. Positions that were measured during
+            this time before the detection are not used as last valid positions.
         bad_samples: Largest number of consecutive measurements that may be late or not finite while the arm holds.
     """
 
