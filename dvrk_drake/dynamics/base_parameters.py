@@ -101,8 +101,8 @@ def reduce_to_base(
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
         parameters: Standard parameters (p,).
         preference: Permutation of the column indices 0 to p - 1, most preferred column first.
-        lengths: Name -> coefficient, such as a length [m] or a product of lengths. In the names of base parameters, the
-            name replaces the value of the coefficient.
+        lengths: Name -> coefficient, such as a length [m] or a product of lengths. In the symbolic names of the
+            base parameters, each coefficient is written as its key instead of its value.
         tolerance: Relative tolerance. A column is dependent if the norm of its component that is orthogonal to the
             chosen columns is at most `tolerance` times the largest column norm.
     """

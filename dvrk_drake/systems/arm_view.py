@@ -110,7 +110,7 @@ def start_meshcat(
         meshcat = Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
     except RuntimeError as error:
         raise DvrkDrakeError(
-            f"port {port or ''} cannot be opened. If another program uses it, choose another port"
+            "no free port can be opened" if port is None else f"port {port} cannot be opened. Choose another port"
         ) from error
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
