@@ -304,10 +304,10 @@ class IdentifiedModel(_Identified):
                 raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
         if self.dynamics is not None:
             DynamicModel(self.arm, self.dynamics)
-            if self.effects or not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
-                raise ModelError(
-                    "a model with dynamics needs all effects in dynamics and gravity equal to dynamics.gravity"
-                )
+            if self.effects:
+                raise ModelError("effects must be empty in a model with dynamics; use dynamics.effects")
+            if not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
+                raise ModelError("gravity must equal dynamics.gravity in a model with dynamics")
 
     @property
     def holding_effects(self) -> list[DriveEffect]:

@@ -196,7 +196,11 @@ class NonNegativeFit:
         self._positive = self._minimum(self._schur, self._constrained) > 0
 
     def solve(self, added: int | None = None) -> NDArray[np.float64]:
-        """Returns x (k,). If `added` is not None, the fit includes this candidate."""
+        """Returns the solution x (k,).
+
+        Args:
+            added: Index of one of the `candidates` that the fit also includes, or None.
+        """
         S, constrained = self._schur, self._constrained
         y = np.zeros(len(self._remaining))
         if added is not None:
