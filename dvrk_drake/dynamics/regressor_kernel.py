@@ -2,7 +2,7 @@
 
 The recursion processes blocks of `BLOCK` samples. Each quantity of the recursion is a row of `BLOCK` samples, so that
 the compiler can vectorise the loops over a block. The compiler vectorises a loop only if it can prove that rows do not
-overlap and indices are not negative. Therefore each loop writes rows of one array. Sample s of row k is at index
+overlap and indices are not negative. Therefore each loop writes to only one array. Sample s of row k is at index
 k * BLOCK + s.
 """
 

@@ -1,4 +1,4 @@
-"""Simulation and recording of a controlled arm, and functions that sample simulations."""
+"""Simulation and recording of a controlled arm, and functions that advance a simulation and read its logged samples."""
 
 from __future__ import annotations
 

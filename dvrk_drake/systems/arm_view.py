@@ -45,7 +45,9 @@ def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def geometry_corners(arm: Arm) -> NDArray[np.float64]:
-    """Returns the corners (k, 3) [m] of boxes around the visual geometry, in the base frame, for all poses of the view.
+    """Returns the corners (k, 3) of boxes around the visual geometry in the base frame [m].
+
+    The corners are those at all poses that the view must show.
 
     Raises:
         ArmError: The arm has no visual geometry.

@@ -184,7 +184,10 @@ def _effort_exchanges(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields the exchanges of all signals of two channels. The gain is -inf for positions beyond the joint limits."""
+    """Yields the exchanges of all signals of two channels.
+
+    The gain in log-likelihood is -inf if exchanged positions are beyond the joint limits.
+    """
     recording, arm = fit.recording, fit.arm
     allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i, j in combinations(map(int, fit.used), 2):
@@ -226,7 +229,10 @@ def _inversions(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields the inversions of all signals of a channel. The gain is -inf for positions beyond the joint limits."""
+    """Yields the inversions of all signals of a channel.
+
+    The gain in log-likelihood is -inf if inverted positions are beyond the joint limits.
+    """
     recording, arm = fit.recording, fit.arm
     allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i in map(int, fit.used):
