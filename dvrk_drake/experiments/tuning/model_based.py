@@ -152,7 +152,8 @@ def design_joint(joint: JointProperties, sampling: Sampling, frequency_scale: fl
         low, high = (SampledLoop(M, sampling, joint.viscous).margins(Gains([kp], [kd], [ki])) for M in joint.inertia)
         return JointDesign(kp, kd, ki, float(frequency_scale * w), (low, high), limited_by)
     raise ControllerError(
-        f"no gains satisfy the requirements at {FREQUENCIES[-1]:g} rad/s or more (limited by {limited_by})"
+        f"no gains with a natural frequency of {FREQUENCIES[-1]:g} rad/s or more satisfy the requirements "
+        f"(limited by {limited_by})"
     )
 
 

@@ -109,7 +109,7 @@ class DriveStep(LeafSystem):
         return update
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        """Computes the output without delay, which equals the result of the next update."""
+        """Computes the output of an arm without measurement delay. It equals the result of the next update."""
         memory = context.get_discrete_state(_MEMORY).get_value().copy()
         state = self.EvalVectorInput(context, 0).get_value()
         self._measure_into(state, *self._maps, self._constants, memory, output.get_mutable_value())
