@@ -117,7 +117,7 @@ def plot_measured_against_predicted(
     measured_joints: NDArray[np.bool_],
     excluded: list[ExcludedMeasurement],
 ) -> None:
-    """Plots the predicted torque over the measured torque of each pose, with one panel per joint.
+    """Plots predicted against measured torque, with one point per pose and one panel per joint.
 
     Args:
         path: PNG file to write.
