@@ -22,7 +22,7 @@ _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_FastLoader):
-    """YAML loader that refuses duplicate keys in a mapping. By default, the last of these keys is used."""
+    """YAML loader that refuses duplicate keys in a mapping. PyYAML's own loaders use the last of these keys."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys: set[str] = set()

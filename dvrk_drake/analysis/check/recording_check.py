@@ -300,7 +300,8 @@ def require_usable(
         Report without refusals.
 
     Raises:
-        RecordingError: The recording has a refusal. The message is the first refusal. The attribute `findings` of the error contains all refusals and warnings.
+        RecordingError: The recording has a refusal. The message is the first refusal. The attribute `findings`
+            of the error contains all refusals and warnings.
     """
     report_share = step_progress(progress, "checking the recording")
     report_share(0.0)

@@ -45,8 +45,10 @@ class VelocityAgreement(NamedTuple):
 def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: float) -> VelocityAgreement:
     """Compares qd with the time derivative of q.
 
+    The function low-pass filters both velocities, which removes most of the effect of timing jitter.
+
     Args:
-        q: Positions (m, n) at a constant rate. The low-pass filter removes most of the effect of timing jitter.
+        q: Positions (m, n) at a constant rate.
         qd: Velocities (m, n) at the same rate.
         rate: Sampling rate [Hz].
     """
