@@ -94,8 +94,9 @@ class PointMassProblem:
     def fit(self, start: PointMass | None = None) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
         """Fits the point mass.
 
-        Each actuator is weighted by the reciprocal of its residual variance. Position coordinates that are not
-        identifiable are set to those of the link's centre of mass, one after another.
+        Each actuator is weighted by the reciprocal of its residual variance. If position coordinates are not
+        identifiable, the one with the largest standard error is set to that of the link's centre of mass, and the fit
+        is repeated.
 
         Args:
             start: Initial value. None: several initial values are used, because the cost has several local minima.

@@ -91,7 +91,7 @@ class EffortSensor(LeafSystem):
             arm: Arm with n joints.
             motors: Motors of the arm.
             effort: Noise and resolution. None: the measurement is exact.
-            time_step: Period in which the noise changes [s].
+            time_step: Sampling period of the noise [s].
             seed: Seed of the noise, at least 0.
         """
         super().__init__()
