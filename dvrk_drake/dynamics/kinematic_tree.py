@@ -128,7 +128,7 @@ def _pose_in_parent(plant: MultibodyPlant, joint: Joint) -> RigidTransform:
 
 
 def _hinge(joint: Joint) -> NDArray[np.float64]:
-    """Returns H (6,), the velocity V_PC_C of the point Co per unit of dx/dt."""
+    """Returns H (6,), the spatial velocity V_PC_C of frame C per unit of dx/dt."""
     X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     axis_C = X_CM.rotation() @ _axis(joint)
     if joint.type_name() == "prismatic":

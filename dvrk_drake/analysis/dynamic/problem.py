@@ -280,7 +280,7 @@ class ConsistentProgram:
         self._mean = np.concatenate([problem.prior, np.zeros(len(effects))])
 
     def solve(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns x (p + e,) for weighted sums of products (p + e + 1, p + e + 1), whose last column is the effort.
+        """Returns x (p + e,) for weighted sums (p + e + 1, p + e + 1) of products of the columns [X tau].
 
         The sums are scaled to units of the prior standard deviations. A Cholesky decomposition then reduces them to a
         triangular matrix. In these units, the normal matrix has no eigenvalue below 1. Therefore, the result is as
