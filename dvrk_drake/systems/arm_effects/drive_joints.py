@@ -1,4 +1,7 @@
-"""Joints of a plant for the coordinates of the drive. At these joints, Drake's solver computes the torques of friction and stops."""
+"""Joints of a plant for the coordinates of the drive.
+
+At these joints, Drake's solver computes the torques of friction and stops.
+"""
 
 from __future__ import annotations
 
