@@ -40,7 +40,8 @@ from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.recordings.recording import Recording, read_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording
 
 DEFAULT = ("mtm_one", "psm_one")
 PSM_MOTIONS = ("psm_one", "psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion")

@@ -39,7 +39,8 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.recordings.recording import Recording, read_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Published errors [%] per joint: on the motion of the fit, and on another motion.
 PUBLISHED = {

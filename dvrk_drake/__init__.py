@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from dvrk_drake.experiments.simulation import simulate
     from dvrk_drake.export.model_export import export_model
     from dvrk_drake.models.arm import Arm, load_arm
-    from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+    from dvrk_drake.recordings.reading import read_recording
+    from dvrk_drake.recordings.recording import Recording, write_recording
     from dvrk_drake.systems.arm_station import ArmStation
     from dvrk_drake.systems.arm_view import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
@@ -46,7 +47,7 @@ _MODULES = {
     "load_scenario": "experiments.scenario",
     "payload": "analysis.payload.payload",
     "predict": "analysis.validation",
-    "read_recording": "recordings.recording",
+    "read_recording": "recordings.reading",
     "recalibrate": "analysis.recalibration",
     "simulate": "experiments.simulation",
     "start_meshcat": "systems.arm_view",

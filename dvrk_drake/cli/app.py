@@ -8,12 +8,19 @@ All other arguments are options, e.g. --arm, --model, --output (a file), --folde
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, ArgumentCollection, Group, Parameter, Token
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm as LoadedArm
+    from dvrk_drake.progress import Progress
+    from dvrk_drake.recordings.recording import Recording as ReadRecording
 
 app = App(
     name="dvrk-drake",
@@ -71,13 +78,6 @@ Arm = Annotated[
     str, Parameter(metavar="ARM", completer=_complete_arm, help="mtml, mtmr, psm, or the path of an arm file (YAML).")
 ]
 Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written by identify.")]
-Coordinates = Annotated[
-    Literal["joint", "actuator"], Parameter(help="Coordinates of q, qd and tau in a CSV recording.")
-]
-Topic = Annotated[
-    str | None,
-    Parameter(metavar="TOPIC", help="ROS bag: JointState topic or its namespace. Default: measured_js of the arm."),
-]
 Gravity = Annotated[
     tuple[float, float, float] | None,
     Parameter(
@@ -124,3 +124,67 @@ Set = Annotated[
     list[str] | None,
     Parameter(metavar="KEY=VALUE", help="Change a value of the scenario. Repeat the option to change several values."),
 ]
+
+
+Recording = Annotated[
+    str, Parameter(help="CSV, ROS bag (.bag, sqlite3, MCAP), MATLAB file, NumPy archive, cisst collector or LCM log.")
+]
+_FILE = Group("Options for the file (docs/recordings.md)", sort_key=2)
+
+
+@Parameter(name="*", group=_FILE)
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """Options for facts that a recording does not state, shared by the commands that read recordings."""
+
+    coordinates: Annotated[
+        Literal["joint", "actuator", "wpi"] | None,
+        Parameter(help="Coordinates of q, qd and tau. Default: those that the file states, or else joint."),
+    ] = None
+    topic: Annotated[
+        str | None,
+        Parameter(metavar="TOPIC", help="ROS bag: JointState topic or its namespace. Default: measured_js of the arm."),
+    ] = None
+    arrays: Annotated[
+        list[str] | None,
+        Parameter(
+            metavar="NAME=ARRAY ..",
+            consume_multiple=True,
+            help="MATLAB file: names of the arrays, e.g. q=log.position tau=log.effort. Default: recognised names.",
+        ),
+    ] = None
+    rate: Annotated[
+        float | None,
+        Parameter(metavar="HZ", help="Sampling rate of a motion without times. Default: static poses."),
+    ] = None
+    skip_invalid: Annotated[
+        bool, Parameter(show_default=False, help="Omit rows with an empty cell, NaN or an infinite value.")
+    ] = False
+
+    def read(self, path: str, arm: LoadedArm | None, progress: Progress) -> ReadRecording:
+        """Reads a recording with these options. Raises RecordingError as `read_recording`."""
+        from dvrk_drake.recordings.reading import read_recording
+
+        return read_recording(path, arm, progress=progress, **self.as_arguments())
+
+    def as_arguments(self) -> dict[str, Any]:
+        """Returns the keyword arguments of `read_recording`."""
+        return vars(self) | {"arrays": None if self.arrays is None else _named_arrays(self.arrays)}
+
+    def as_text(self) -> str:
+        """Returns the options for a command line, beginning with a space, or ""."""
+        words = []
+        for name, value in vars(self).items():
+            if value not in (None, False):
+                values = value if isinstance(value, list) else [] if value is True else [f"{value}"]
+                words += [f"--{name.replace('_', '-')}", *map(shlex.quote, values)]
+        return "".join(f" {word}" for word in words)
+
+
+def _named_arrays(texts: Sequence[str]) -> dict[str, str]:
+    from dvrk_drake.errors import RecordingError
+
+    pairs = [text.partition("=") for text in texts]
+    if wrong := [text for text, (name, sign, array) in zip(texts, pairs, strict=True) if not (name and sign and array)]:
+        raise RecordingError(f"--arrays {wrong[0]}: allowed: NAME=ARRAY, e.g. q=position; names: q, qd, tau, t, poses")
+    return {name: array for name, _, array in pairs}

@@ -10,13 +10,13 @@ import dvrk_drake as dvrk
 from dvrk_drake.cli.app import (
     IDENTIFY,
     Arm,
-    Coordinates,
+    FileOptions,
     Gravity,
     Json,
     Model,
     Overwrite,
     Plots,
-    Topic,
+    Recording,
     Verbose,
     app,
     one_of,
@@ -33,13 +33,11 @@ from dvrk_drake.cli.support import (
 )
 from dvrk_drake.errors import ModelError
 
-Recording = Annotated[
-    str, Parameter(help="CSV with columns q1..qn, tau1..taun (optionally t, qd1..qdn), ROS bag, or LCM log.")
-]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 LowSpeedSegments = Annotated[
     bool, Parameter(show_default=False, help="Treat low-speed segments of a motion as static poses.")
 ]
+_FILE = FileOptions()
 _STEPS = "reading", "checking the recording"
 _SOURCE = one_of("Source of the model (one is required)")
 
@@ -51,8 +49,7 @@ def identify(
     *,
     arm: Arm,
     output: NewModel,
-    coordinates: Coordinates = "joint",
-    topic: Topic = None,
+    file: FileOptions = _FILE,
     method: Literal["robust", "paper"] = "robust",
     low_speed_segments: LowSpeedSegments = False,
     gravity: Gravity = None,
@@ -74,7 +71,7 @@ def identify(
     recorded_arm = mounted(dvrk.load_arm(arm), gravity)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
-        read = dvrk.read_recording(recording, recorded_arm, coordinates, topic=topic, progress=steps)
+        read = file.read(recording, recorded_arm, steps)
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
@@ -94,11 +91,11 @@ def identify(
 
 
 def _model_and_recording(
-    model: str, recording: str, coordinates: Literal["joint", "actuator"], topic: str | None, steps: Steps
+    model: str, recording: str, file: FileOptions, steps: Steps
 ) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
     """Loads a model and a recording of its arm, and prints the notes on the recording."""
     loaded = dvrk.IdentifiedModel.load(model)
-    read = dvrk.read_recording(recording, loaded.arm, coordinates, topic=topic, progress=steps)
+    read = file.read(recording, loaded.arm, steps)
     print_notes(recording, read.notes)
     return loaded, read
 
@@ -109,8 +106,7 @@ def validate(
     /,
     *,
     model: Model,
-    coordinates: Coordinates = "joint",
-    topic: Topic = None,
+    file: FileOptions = _FILE,
     require: Literal["good", "usable"] | None = None,
     save: Annotated[bool, Parameter(show_default=False)] = False,
     low_speed_segments: LowSpeedSegments = False,
@@ -131,7 +127,7 @@ def validate(
     if json is not None:
         check_output(json, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "validating") as steps:
-        loaded, read = _model_and_recording(model, recording, coordinates, topic, steps)
+        loaded, read = _model_and_recording(model, recording, file, steps)
         folder = plots_folder(plots, overwrite=overwrite)
         if (save or require) and read.sha256 and read.sha256 == loaded.provenance.sha256:
             option = "--save" if save else "--require"
@@ -178,8 +174,7 @@ def predict(
     *,
     model: Model,
     output: Annotated[str, Parameter(metavar="FILE.csv")],
-    coordinates: Coordinates = "joint",
-    topic: Topic = None,
+    file: FileOptions = _FILE,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict the efforts of a recording with a model.
@@ -195,7 +190,7 @@ def predict(
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "predicting") as steps:
-        prediction = dvrk.predict(*_model_and_recording(model, recording, coordinates, topic, steps), progress=steps)
+        prediction = dvrk.predict(*_model_and_recording(model, recording, file, steps), progress=steps)
     tau = prediction.tau
     write_csv(output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
     print_warnings(make_console(), prediction.warnings)
@@ -209,8 +204,7 @@ def recalibrate(
     *,
     model: Model,
     output: NewModel,
-    coordinates: Coordinates = "joint",
-    topic: Topic = None,
+    file: FileOptions = _FILE,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
@@ -223,7 +217,7 @@ def recalibrate(
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "refitting friction") as steps:
-        result = dvrk.recalibrate(*_model_and_recording(model, recording, coordinates, topic, steps), progress=steps)
+        result = dvrk.recalibrate(*_model_and_recording(model, recording, file, steps), progress=steps)
     result.save(output, overwrite=True)
     print_recalibration(make_console(), result, model_path=output, verbose=verbose)
     print_written(output)
@@ -238,8 +232,7 @@ def payload(
     arm: Annotated[Arm | None, Parameter(group=_SOURCE, help="Identify the model of this arm from REFERENCE.")] = None,
     model: Annotated[Model | None, Parameter(group=_SOURCE, help="Model identified from a motion.")] = None,
     link: Annotated[str | None, Parameter(metavar="NAME")] = None,
-    coordinates: Coordinates = "joint",
-    topic: Topic = None,
+    file: FileOptions = _FILE,
     gravity: Gravity = None,
     json: Json = None,
     overwrite: Overwrite = False,
@@ -264,10 +257,7 @@ def payload(
     identified = None if model is None else dvrk.IdentifiedModel.load(model)
     recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
-        without_payload, with_payload = (
-            dvrk.read_recording(path, recorded_arm, coordinates, topic=topic, progress=steps)
-            for path in (reference, loaded)
-        )
+        without_payload, with_payload = (file.read(path, recorded_arm, steps) for path in (reference, loaded))
         for recording in (without_payload, with_payload):
             print_notes(recording.source, recording.notes)
         result = dvrk.payload(without_payload, with_payload, identified or recorded_arm, link, progress=steps)

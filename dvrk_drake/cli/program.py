@@ -41,7 +41,11 @@ RENAMED = {
     "validate": {"": "--model", "--slow-parts": "--low-speed-segments"},
     "predict": {"": "--model"},
     "recalibrate": {"": "--model"},
-    "convert": {"": "--output", "--format": "--input-format"},
+    "convert": {
+        "": "--output",
+        "--variable": "--arrays poses=NAME",
+        "--input-format": "--coordinates wpi for wpi-csv files, and not needed for other formats",
+    },
     "record": {"": "--output"},
     "key": {"": "--output"},
     "identify": {"--tables": "--verbose", "--slow-parts": "--low-speed-segments"},

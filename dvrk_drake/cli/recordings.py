@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import IDENTIFY, Arm, Coordinates, Json, Overwrite, Plots, Topic, Verbose, app
+from dvrk_drake.cli.app import IDENTIFY, Arm, FileOptions, Json, Overwrite, Plots, Recording, Verbose, app
 from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_notes, print_written, write_json
 from dvrk_drake.errors import RecordingError
+
+_FILE = FileOptions()
 
 
 @app.command(group=IDENTIFY)
 def check(
-    recording: str,
+    recording: Recording,
     /,
     *,
     arm: Arm,
-    coordinates: Coordinates = "joint",
-    topic: Topic = None,
+    file: FileOptions = _FILE,
     json: Json = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
@@ -29,9 +30,6 @@ def check(
     """Check a recording and report its problems.
 
     The exit code is 2 if the recording is not suitable for identification.
-
-    Args:
-        recording: CSV with columns q1..qn, tau1..taun (optionally t, qd1..qdn), ROS bag, or LCM log.
     """
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
@@ -41,13 +39,12 @@ def check(
         check_output(json, recording, overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps("reading", "checking the recording") as steps:
-        checked = dvrk.read_recording(recording, recorded_arm, coordinates, topic=topic, progress=steps)
+        checked = file.read(recording, recorded_arm, steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if json is not None:
         write_json(json, report.as_dict())
-    options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"
-    print_report(make_console(), report, arm=options, verbose=verbose)
+    print_report(make_console(), report, arm=arm + file.as_text(), verbose=verbose)
     if json is not None:
         print_written(json)
     if folder is not None:
@@ -65,47 +62,26 @@ def check(
 
 @app.command(group=IDENTIFY)
 def convert(
-    recording: str,
+    recording: Recording,
     /,
     *,
     output: Annotated[str, Parameter(metavar="FILE.csv")],
-    input_format: Literal["csv", "team-mat", "wpi-csv", "lcm-log", "ros-bag"] | None = None,
-    coordinates: Literal["joint", "actuator"] | None = None,
-    variable: Annotated[str | None, Parameter(metavar="NAME")] = None,
-    topic: Topic = None,
-    rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
+    file: FileOptions = _FILE,
     arm: Annotated[str | None, Parameter(metavar="ARM")] = None,
-    skip_invalid: Annotated[bool, Parameter(show_default=False)] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Convert a recording to the CSV format of this project.
-
-    The formats are csv, ros-bag, lcm-log, team-mat (MATLAB files of JHU and WPI) and wpi-csv (CSV files of WPI).
+    """Convert a recording to a CSV with a header.
 
     Args:
-        recording: File to convert.
         output: CSV file to write.
-        input_format: Format of the recording. Default: detected from the content.
-        coordinates: Coordinates of q and tau. Required for csv. All other formats define the coordinates.
-        variable: Variable of a team-mat file that contains the recording. Required if several variables are possible.
-        rate: Sampling rate [Hz] of rows without time stamps. Default: 200 for wpi-csv, no time stamps for csv.
-        arm: csv, wpi-csv: convert to joint coordinates of this arm. ros-bag, lcm-log: read messages of this arm.
-        skip_invalid: Skip rows with an empty cell, NaN or an infinite value, and print the number of skipped rows.
+        arm: Convert to joint coordinates of this arm. Required for a ROS bag, where it selects the topic.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording
 
     check_output(output, recording, overwrite=overwrite)
-    converted = convert_recording(
-        recording,
-        output,
-        format=input_format,
-        coordinates=coordinates,
-        variable=variable,
-        topic=topic,
-        rate=rate,
-        arm=None if arm is None else dvrk.load_arm(arm),
-        skip_invalid=skip_invalid,
-    )
+    loaded = None if arm is None else dvrk.load_arm(arm)
+    with Steps("reading") as steps:
+        converted = convert_recording(recording, output, arm=loaded, progress=steps, **file.as_arguments())
     print_written(output, f"{len(converted)} rows, {converted.coordinates} coordinates")
     for note in converted.notes:
         print(note)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import SIMULATE, Arm, Coordinates, Overwrite, Plots, Set, Verbose, app, one_of, whole_number
+from dvrk_drake.cli.app import SIMULATE, Arm, FileOptions, Overwrite, Plots, Set, Verbose, app, one_of, whole_number
 from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_written, quiet_drake, until_stopped
 from dvrk_drake.errors import ModelError, ScenarioError, StudyError
 from dvrk_drake.progress import step_progress
@@ -16,6 +16,7 @@ from dvrk_drake.progress import step_progress
 if TYPE_CHECKING:
     from dvrk_drake.experiments.transparency import Compensation
 
+_FILE = FileOptions()
 _SCENARIO = one_of("Source (one is required)")
 _EXECUTOR = one_of("Computers (at most one option)", least=0)
 
@@ -191,7 +192,7 @@ def transparency(
     *,
     arm: Arm,
     path: Annotated[str | None, Parameter(metavar="RECORDING")] = None,
-    coordinates: Coordinates = "joint",
+    file: FileOptions = _FILE,
     speed: Annotated[float | None, Parameter(metavar="S")] = None,
     model: Annotated[list[str] | None, Parameter(metavar="MODEL.yaml")] = None,
     friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.5,
@@ -215,7 +216,6 @@ def transparency(
     """
     from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.recordings.recording import read_recording
     from dvrk_drake.reports.terminal_tables import make_console
     from dvrk_drake.reports.transparency import print_transparency, write_transparency
 
@@ -224,7 +224,7 @@ def transparency(
     effects = moved_arm.effects.only(simulated_effects or ["all"])
     followed = random_path(moved_arm)
     if path is not None:
-        motion = read_recording(path, moved_arm, coordinates)
+        motion = file.read(path, moved_arm, lambda step, share: None)
         followed = recorded_path(moved_arm, motion, 1.0 if speed is None else speed)
     elif speed is not None:
         raise ScenarioError("--speed requires --path with a recorded motion")

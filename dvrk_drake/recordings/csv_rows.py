@@ -6,10 +6,14 @@ import codecs
 import csv
 import hashlib
 import io
+import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +25,8 @@ from dvrk_drake.models.files import open_input, read_input
 _BLOCK, _MAX_LINE = 1 << 20, 1 << 20
 #: Maximum size of a file whose rows are kept as text [bytes].
 _MAX_ROWS = 64_000_000
+#: Maximum number of rows of numbers, i.e. 15 min at 1 kHz. For so many rows, `check` needs 1.5 GB of memory.
+MAX_COUNT = 900_000
 
 
 def read_bytes(path: Path) -> bytes:
@@ -39,6 +45,7 @@ class CsvReader:
     unmodified cells) of the rows that are not blank. A new iteration continues after the last row that was read.
 
     Attributes:
+        path: Path of the file.
         has_underscore: Whether the text read so far contains an underscore. Python accepts underscores in numbers, but
             `is_number` does not.
     """
@@ -49,7 +56,7 @@ class CsvReader:
         Raises:
             RecordingError: The file cannot be read.
         """
-        self._path, self._progress = path, progress
+        self.path, self._progress = path, progress
         self._file = open_input(path, RecordingError)
         self._digest = hashlib.sha256()
         self._reader = csv.reader(self._lines(), strict=True)
@@ -73,7 +80,7 @@ class CsvReader:
                     self._check_commas(cells)
                 yield reader.line_num, cells
         except csv.Error as error:
-            raise RecordingError(f"{self._path}, line {reader.line_num}: invalid CSV: {error}") from error
+            raise RecordingError(f"{self.path}, line {reader.line_num}: invalid CSV: {error}") from error
 
     def sha256(self) -> str:
         """Returns the SHA-256 of the file; valid after all rows have been read."""
@@ -83,7 +90,7 @@ class CsvReader:
         self._is_first = False
         if len(cells) == 1 and re.search(r"[;\s]", cells[0].strip()):
             raise RecordingError(
-                f"{self._path}, line {self._reader.line_num}: the first row has no comma. Separate cells by commas "
+                f"{self.path}, line {self._reader.line_num}: the first row has no comma. Separate cells by commas "
                 "and use a point as the decimal separator."
             )
 
@@ -95,17 +102,14 @@ class CsvReader:
             try:
                 block = self._file.read(_BLOCK)
             except OSError as error:
-                raise RecordingError(f"{self._path} cannot be read: {error.strerror}") from error
+                raise RecordingError(f"{self.path} cannot be read: {error.strerror}") from error
             self._digest.update(block)
             undecoded = len(decoder.getstate()[0])
             try:
                 text = decoder.decode(block, final=not block)
             except UnicodeDecodeError as error:
                 at = num_read - undecoded + error.start
-                raise RecordingError(
-                    f"{self._path} is not a UTF-8 text file: {error.reason} at byte {at}. Allowed: CSV file, "
-                    "ROS bag or LCM log. dvrk-drake convert reads MATLAB files."
-                ) from error
+                raise RecordingError(f"{self.path} is not a UTF-8 text file: {error.reason} at byte {at}") from error
             if is_start and text:
                 text, is_start = text.removeprefix("\ufeff"), False
             text = rest + text
@@ -114,7 +118,7 @@ class CsvReader:
             end = max(text.rfind("\n"), text.rfind("\r", 0, -1)) + 1 if block else len(text)
             whole, rest = text[:end], text[end:]
             if len(rest) > _MAX_LINE:
-                raise RecordingError(f"{self._path}: invalid CSV: a line has more than {_MAX_LINE} characters")
+                raise RecordingError(f"{self.path}: invalid CSV: a line has more than {_MAX_LINE} characters")
             self.has_underscore = self.has_underscore or "_" in whole
             yield from io.StringIO(whole, newline="")
             self._progress(min(1.0, num_read / size))
@@ -134,6 +138,84 @@ def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     with CsvReader(path) as reader:
         rows = [(line, [cell.strip() for cell in cells]) for line, cells in reader]
         return rows, reader.sha256()
+
+
+class NumberRows(NamedTuple):
+    """Numbers of selected columns.
+
+    Attributes:
+        blocks: Mapping from the name of a block to its numbers (m, k).
+        lines: Line number (m,) of each row.
+        rows: Index (m,) of each row among all rows, including the skipped rows.
+        notes: Note on skipped rows, or ().
+    """
+
+    blocks: dict[str, NDArray[np.float64]]
+    lines: NDArray[np.int_]
+    rows: NDArray[np.int_]
+    notes: tuple[str, ...]
+
+
+def read_numbers(
+    reader: CsvReader,
+    header: Sequence[str],
+    blocks: Mapping[str, Sequence[int]],
+    *,
+    skip_invalid: bool = False,
+    first: Iterable[tuple[int, list[str]]] = (),
+    header_name: str = "the header",
+) -> NumberRows:
+    """Reads the numbers of selected columns in all remaining rows.
+
+    Args:
+        reader: Open file, after its header.
+        header: Name of each column.
+        blocks: Mapping from the name of a block to the indices of its columns.
+        skip_invalid: Whether to skip and note rows with an empty cell, a NaN or an infinity.
+        first: Rows (line number, cells) that were already read.
+        header_name: Source of `header`, for messages.
+
+    Raises:
+        RecordingError: A row has another number of cells than the header, a cell is not a finite number, there is no
+            row, or there are too many rows.
+    """
+    path = reader.path
+    skipped, values, lines = array("q"), {name: array("d") for name in blocks}, array("q")
+    parts = [(values[name], columns) for name, columns in blocks.items()]
+    width = len(header)
+    for line, cells in chain(first, reader):
+        if len(cells) != width:
+            raise RecordingError(f"{path}, line {line}: the row has {len(cells)} cells, {header_name} has {width}")
+        if len(lines) == MAX_COUNT:
+            raise RecordingError(f"{path}, line {line}: the file has more than {MAX_COUNT} rows. Split the recording.")
+        if skip_invalid and not all(
+            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}, line {line}: {header[column]}"))
+            for _, columns in parts
+            for column in columns
+        ):
+            skipped.append(line)
+            continue
+        lines.append(line)
+        for part, columns in parts:
+            try:
+                numbers = [float(cells[column]) for column in columns]
+                valid = math.isfinite(sum(numbers)) and not reader.has_underscore
+            except ValueError:
+                valid = False
+            if not valid:
+                numbers = [
+                    parse_finite(cells[column].strip(), f"{path}, line {line}: {header[column]}") for column in columns
+                ]
+            part.extend(numbers)
+    if not lines:
+        raise RecordingError(f"{path} has " + ("no row of finite numbers" if skipped else "a header but no rows"))
+    kept, left_out = np.frombuffer(lines, np.int64), np.frombuffer(skipped, np.int64)
+    return NumberRows(
+        {name: np.frombuffer(part).reshape(len(lines), -1) for name, part in values.items()},
+        kept,
+        np.searchsorted(np.union1d(kept, left_out), kept),
+        (skipped_note(left_out, len(lines) + len(skipped)),) if skipped else (),
+    )
 
 
 def listed(numbers: Iterable[int]) -> str:

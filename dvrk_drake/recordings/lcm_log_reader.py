@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, decode, status_channel
+from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.recording import Recording
 
 _MAGIC = bytes.fromhex("EDA1DA01")
 _HEADER = struct.Struct(">4sqqII")
@@ -49,7 +50,7 @@ class LcmLogReader:
         notes: Descriptions of damage, complete after the iteration.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: Path) -> None:
         """Opens the log at `path`, which must begin with an event.
 
         Raises:
@@ -91,13 +92,12 @@ class LcmLogReader:
         return len(content)
 
 
-def is_lcm_log(path: str | Path) -> bool:
-    """Returns whether the file begins like an LCM log; False if it cannot be read."""
-    try:
-        with open_input(path, RecordingError) as file:
-            return file.read(len(_MAGIC)) == _MAGIC
-    except (RecordingError, OSError):
+def is_lcm_log(path: Path) -> bool:
+    """Returns whether the file begins like an LCM log; False for a folder."""
+    if path.is_dir():
         return False
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
 
 
 def event_bytes(event: LcmEvent) -> bytes:
@@ -222,27 +222,7 @@ def measurements(status: lcmt_dvrk_status) -> tuple[float, ...]:
 _LISTED = 8
 
 
-class StatusLog(NamedTuple):
-    """Measurements of one arm, in joint coordinates and SI units.
-
-    Attributes:
-        t: Times (m,) since the first row, from the arm's clock [s].
-        q, qd, tau: Measured positions, velocities and efforts (m, n).
-        events: Event numbers (m,) of the rows in the log.
-        notes: Descriptions of damaged, missing and omitted parts, one per line.
-        sha256: SHA-256 of the log.
-    """
-
-    t: NDArray[np.float64]
-    q: NDArray[np.float64]
-    qd: NDArray[np.float64]
-    tau: NDArray[np.float64]
-    events: NDArray[np.int_]
-    notes: tuple[str, ...]
-    sha256: str
-
-
-def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
+def read_status_log(path: Path, options: FileOptions) -> Recording:
     """Reads an LCM log written by lcm-logger or `dvrk-drake record`. Messages of other channels are ignored.
 
     A message is omitted and counted in `notes` if it cannot be read, is of another arm, is not later than the previous
@@ -250,12 +230,13 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
 
     Args:
         path: Path of the log.
-        arm: Arm whose statuses are read; None if the log has statuses of only one arm.
+        options: Arm whose statuses are read; None if the log has statuses of only one arm.
 
     Raises:
-        RecordingError: The file is not an LCM log or has no usable status, or `arm` is None and the log has statuses of
-            several arms.
+        RecordingError: The file is not an LCM log or has no usable status, or the arm is None and the log has statuses
+            of several arms.
     """
+    arm = options.arm
     log = LcmLogReader(path)
     channel = status_channel(arm) if arm else _only_status_channel(log)
     stream = StatusStream(arm.name, arm.num_joints) if arm else None
@@ -279,7 +260,8 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
     if not events:
         raise RecordingError(f"{path}: {_no_usable_status(channel, arm, channels, notes)}")
     q, qd, tau = np.array(rows).reshape(len(events), 3, -1).transpose(1, 0, 2)
-    return StatusLog(np.array(times), q, qd, tau, np.array(events), tuple(notes), log.sha256())
+    numbers, sha256 = np.array(events), log.sha256()
+    return Recording(q, tau, qd, np.array(times), "joint", str(path), numbers, sha256, tuple(notes), "event")
 
 
 def _only_status_channel(log: LcmLogReader) -> str:

@@ -1,15 +1,11 @@
 """Defines `Recording`: positions and efforts of a motion or of static poses.
 
-A recording is read from a CSV, a ROS bag or an LCM log, and written to a CSV.
+`read_recording` in `reading.py` reads recordings of all formats.
 """
 
 from __future__ import annotations
 
 import csv
-import math
-from array import array
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -23,18 +19,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
-from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
-from dvrk_drake.recordings.ros_bag import is_ros_bag, read_joint_states
 
 Coordinates = Literal["joint", "actuator"]
 
 #: Tolerance of the position limits [rad], [m]. A pose that exceeds a limit by more is refused. Joint stops are
 #: compliant, so real poses may exceed the limits slightly.
 LIMIT_TOLERANCE = 0.2, 0.02
-#: Maximum number of rows of a CSV, i.e. 15 min at 1 kHz. For so many rows, `check` needs 1.5 GB of memory.
-MAX_COUNT = 900_000
 #: Minimum number of rows of a motion, and maximum median sampling interval of a motion [s].
 MIN_ROWS, MAX_PERIOD = 100, 0.05
 #: RMS joint velocity above which a joint is not at rest [rad/s], [m/s].
@@ -57,10 +47,10 @@ class Recording:
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
         lines: Line number (m,) of each row in the source, or None. They are event numbers for an LCM log, message
-            numbers for a ROS bag, and pose numbers for a MATLAB array.
+            numbers for a ROS bag, and row or pose numbers for arrays.
         sha256: SHA-256 of the source, or "".
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
-        line_label: Name of the numbers in `lines`, for messages: "line", "event", "message" or "pose".
+        line_label: Name of the numbers in `lines`, for messages: "line", "event", "message", "row" or "pose".
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -249,168 +239,6 @@ class Recording:
             )
 
 
-def read_recording(
-    path: str | Path,
-    arm: Arm | None = None,
-    coordinates: Coordinates = "joint",
-    *,
-    topic: str | None = None,
-    skip_invalid: bool = False,
-    progress: Progress | None = None,
-) -> Recording:
-    """Reads a CSV, a ROS bag, or an LCM log with the DVRK_STATUS messages of an arm; the content selects the format.
-
-    A CSV has a header with q1..qn and optionally t, qd1..qdn and tau1..taun, in any order. Other columns are ignored.
-    For the content of a log, see `read_status_log`.
-
-    Args:
-        path: Path of the CSV, log or bag.
-        arm: Arm that defines the number and the names of the joints. From a log or a bag, only the measurements of this
-            arm are read. If None, a CSV must have 7 joints, and a log must have statuses of only one arm.
-        coordinates: Coordinates of q, qd and tau in a CSV. Logs and bags contain joint coordinates.
-        topic: JointState topic of a bag, or its namespace; see `read_joint_states`.
-        skip_invalid: Whether to omit rows and messages that contain an empty cell, a NaN or an infinity, and to list
-            them in `notes`. If False, a file with such rows is refused.
-        progress: Callback that receives the name of the step ("reading") and the completed fraction (0 to 1).
-
-    Returns:
-        Recording with SHA-256 and line numbers. Its attribute `notes` lists the omitted rows of a CSV, or counts the
-        omitted messages of a log.
-
-    Raises:
-        RecordingError: The file cannot be read as a recording. The message names the file, line and column.
-
-    Example:
-        >>> import dvrk_drake as dvrk, numpy as np
-        >>> arm = dvrk.load_arm("mtmr")
-        >>> dvrk.write_recording(dvrk.Recording(q=np.zeros((8, 7)), tau=np.ones((8, 7))), "poses.csv")
-        >>> recording = dvrk.read_recording("poses.csv", arm)
-        >>> len(recording), recording.coordinates, recording.where(0)
-        (8, 'joint', 'poses.csv, line 2')
-    """
-    if coordinates not in get_args(Coordinates):
-        raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
-    path = Path(path)
-    if is_lcm_log(path):
-        if coordinates != "joint":
-            raise RecordingError(f"{path}: an LCM log is in joint coordinates, not in {coordinates} coordinates")
-        _refuse_topic(path, topic)
-        log = read_status_log(path, arm)
-        return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes, "event")
-    share = step_progress(progress, "reading")
-    if is_ros_bag(path):
-        if coordinates != "joint":
-            raise RecordingError(f"{path}: a ROS bag is in joint coordinates, not in {coordinates} coordinates")
-        if arm is None:
-            raise RecordingError(f"{path}: a ROS bag needs the arm whose joint states are read (arm= in Python)")
-        bag = read_joint_states(path, arm, topic, skip_invalid=skip_invalid, progress=share)
-        return Recording(
-            bag.q, bag.tau, bag.qd, bag.t, "joint", str(path), bag.messages, bag.sha256, bag.notes, "message"
-        )
-    _refuse_topic(path, topic)
-    return _read_csv(path, arm, coordinates, share, skip_invalid)
-
-
-def _refuse_topic(path: Path, topic: str | None) -> None:
-    if topic is not None:
-        raise RecordingError(f"{path}: --topic does not apply, because this file is not a ROS bag")
-
-
-def _read_csv(
-    path: Path,
-    arm: Arm | None,
-    coordinates: Coordinates,
-    progress: Callable[[float], object],
-    skip_invalid: bool,
-) -> Recording:
-    num_joints = arm.num_joints if arm else 7
-    with CsvReader(path, progress) as reader:
-        header_line, cells = next(iter(reader), (0, []))
-        if not cells:
-            raise RecordingError(f"{path} is empty; needs a header with {_expected_columns(num_joints)}")
-        header = [cell.strip() for cell in cells]
-        blocks = _columns_of_blocks(f"{path}, line {header_line}", header, arm, num_joints)
-        values, lines, skipped = _read_numbers(path, reader, header, blocks, skip_invalid)
-        sha256 = reader.sha256()
-    if not lines:
-        rows = "no row of finite numbers" if skipped else "a header but no rows"
-        raise RecordingError(f"{path} has {rows}")
-    q, qd, tau, t = (
-        np.frombuffer(values[prefix]).reshape(len(lines), -1) if prefix in values else None
-        for prefix in ("q", "qd", "tau", "t")
-    )
-    assert q is not None
-    times = None if t is None else t[:, 0]
-    notes = (skipped_note(np.array(skipped), len(lines) + len(skipped)),) if skipped else ()
-    return Recording(q, tau, qd, times, coordinates, str(path), np.frombuffer(lines, np.int64), sha256, notes)
-
-
-def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joints: int) -> dict[str, list[int]]:
-    """Returns a mapping from a prefix (q, qd, tau, t) to its columns in the header."""
-    if all(is_number(cell) for cell in header):
-        raise RecordingError(
-            f"{where}: the header is missing. The first line must contain the column names "
-            f"{_expected_columns(num_joints)}. dvrk-drake convert reads public recordings without a header."
-        )
-    if duplicate := next((name for name, count in Counter(header).items() if name and count > 1), ""):
-        raise RecordingError(f"{where}: column {duplicate[:30]} occurs twice")
-    blocks = {}
-    for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
-        names = column_names(prefix, num_joints)
-        missing = [name for name in names if name not in header]
-        if len(missing) == num_joints and not needed:
-            continue
-        if missing:
-            raise RecordingError(
-                f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
-                f"needs {_expected_columns(num_joints)}{_joint_list(arm)}"
-            )
-        if f"{prefix}{num_joints + 1}" in header:
-            raise RecordingError(
-                f"{where}: unexpected column {prefix}{num_joints + 1}; "
-                f"the arm has {num_joints} joints{_joint_list(arm)}"
-            )
-        blocks[prefix] = [header.index(name) for name in names]
-    if "t" in header:
-        blocks["t"] = [header.index("t")]
-    return blocks
-
-
-def _read_numbers(
-    path: Path, reader: CsvReader, header: list[str], blocks: dict[str, list[int]], skip_invalid: bool
-) -> tuple[dict[str, array], array, list[int]]:
-    """Returns the numbers of each prefix row by row, the line of each row, and the lines of skipped rows."""
-    skipped: list[int] = []
-    values, lines = {prefix: array("d") for prefix in blocks}, array("q")
-    parts = [(values[prefix], columns) for prefix, columns in blocks.items()]
-    width = len(header)
-    for line, cells in reader:
-        if len(cells) != width:
-            raise RecordingError(f"{path}, line {line}: the row has {len(cells)} cells, the header has {width}")
-        if len(lines) == MAX_COUNT:
-            raise RecordingError(f"{path}, line {line}: the file has more than {MAX_COUNT} rows. Split the recording.")
-        if skip_invalid and not all(
-            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}, line {line}: {header[column]}"))
-            for _, columns in parts
-            for column in columns
-        ):
-            skipped.append(line)
-            continue
-        lines.append(line)
-        for part, columns in parts:
-            try:
-                numbers = [float(cells[column]) for column in columns]
-                valid = math.isfinite(sum(numbers)) and not reader.has_underscore
-            except ValueError:
-                valid = False
-            if not valid:
-                numbers = [
-                    parse_finite(cells[column].strip(), f"{path}, line {line}: {header[column]}") for column in columns
-                ]
-            part.extend(numbers)
-    return values, lines, skipped
-
-
 def column_names(prefix: str, num_joints: int) -> list[str]:
     """Returns the column names of q, qd, tau, or t in a CSV."""
     return ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
@@ -455,11 +283,3 @@ def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) 
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(header)
         writer.writerows([repr(float(x)) for x in row] for row in values)
-
-
-def _joint_list(arm: Arm | None) -> str:
-    return f"; joints of {arm.name}: {', '.join(arm.joint_names)}" if arm else ""
-
-
-def _expected_columns(num_joints: int) -> str:
-    return f"q1..q{num_joints} and tau1..tau{num_joints} (t and qd1..qd{num_joints} optional)"

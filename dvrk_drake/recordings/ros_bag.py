@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import re
 from array import array
 from collections.abc import Callable, Iterator
@@ -23,6 +22,8 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
+from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.recording import Recording
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -37,49 +38,16 @@ MAX_JAW_GAP = 0.05
 _REPORT = 4096
 
 
-class JointStates(NamedTuple):
-    """Joint states of one arm, in joint coordinates and SI units.
-
-    Attributes:
-        t: Times (m,) since the first row [s], from the header stamps.
-        q: Positions (m, n).
-        qd: Velocities (m, n), or None if the messages have no velocities.
-        tau: Efforts (m, n), or None if the messages have no efforts.
-        messages: Number (m,) of the message of each row on its topic, from 1.
-        notes: Descriptions of omitted messages, one per line.
-        sha256: SHA-256 of the bag.
-    """
-
-    t: NDArray[np.float64]
-    q: NDArray[np.float64]
-    qd: NDArray[np.float64] | None
-    tau: NDArray[np.float64] | None
-    messages: NDArray[np.int_]
-    notes: tuple[str, ...]
-    sha256: str
-
-
-def is_ros_bag(path: str | Path) -> bool:
+def is_ros_bag(path: Path) -> bool:
     """Returns whether a path is a ROS bag: a file that begins like one, or a folder with `metadata.yaml`."""
-    # Unlike pathlib, os.path returns False for a path that is not valid.
-    if os.path.isdir(path):
-        return os.path.isfile(os.path.join(path, _METADATA))
-    try:
-        with open_input(path, RecordingError) as file:
-            return file.read(16).startswith(_MAGIC)
-    except (RecordingError, OSError):
-        return False
+    if path.is_dir():
+        return (path / _METADATA).is_file()
+    with path.open("rb") as file:
+        return file.read(16).startswith(_MAGIC)
 
 
-def read_joint_states(
-    path: str | Path,
-    arm: Arm,
-    topic: str | None = None,
-    *,
-    skip_invalid: bool = False,
-    progress: Callable[[float], object] = lambda share: None,
-) -> JointStates:
-    """Reads the measured joint states of an arm from a bag.
+def read_ros_bag(path: Path, options: FileOptions) -> Recording:
+    """Reads the measured joint states of an arm from a bag, in joint coordinates.
 
     Messages with a header stamp of 0, and messages that are not later than the previous one, are omitted and noted.
     The joints may be in any order. If the messages lack the last joint, the jaw, it is read from the topic of the jaw
@@ -87,22 +55,19 @@ def read_joint_states(
 
     Args:
         path: Path of a `.bag`, `.db3` or `.mcap` file, or of the folder of a ROS 2 bag.
-        arm: Arm whose joints are read.
-        topic: JointState topic, e.g. "/PSM1/measured_js", or its namespace, "/PSM1". Default: the only topic
-            `/<ARM>/measured_js`, in any namespace, where ARM is the name of the arm, optionally followed by
-            a number.
-        skip_invalid: Whether to omit and note messages with a NaN or an infinity, instead of refusing the bag.
-        progress: Callback that receives the completed share 0..1.
+        options: Arm (required), topic and `skip_invalid`. The topic is a JointState topic, e.g. "/PSM1/measured_js", or
+            its namespace, "/PSM1". Default: the only topic `/<ARM>/measured_js`, in any namespace, where ARM is the
+            name of the arm, optionally followed by a number.
 
     Raises:
         RecordingError: The bag is damaged or empty, no topic or several topics match, or the messages do not fit
             the arm.
     """
-    path = Path(path)
+    arm, skip_invalid, progress = options.required_arm(path), options.skip_invalid, options.progress
     reader = _Bag(path)
     with reader:
         connections = reader.joint_state_topics()
-        name = _choose_topic(path, arm, topic, connections)
+        name = _choose_topic(path, arm, options.topic, connections)
         jaw = name.rpartition("/")[0] + "/jaw/measured_js"
         has_jaw = jaw in connections
         share = connections[name].msgcount + (connections[jaw].msgcount if has_jaw else 0)
@@ -123,7 +88,7 @@ def read_joint_states(
     q, qd, tau = (None if part is None else part[:, order] for part in (first.q, first.qd, first.tau))
     assert q is not None
     t = 1e-9 * (first.stamps - first.stamps[0])
-    return JointStates(t, q, qd, tau, first.messages, tuple(notes), _sha256(path))
+    return Recording(q, tau, qd, t, "joint", str(path), first.messages, _sha256(path), tuple(notes), "message")
 
 
 class _Topic(NamedTuple):

@@ -16,7 +16,7 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 WITH_A_REAL_ARM = """
 With a real arm:
 1. Record at least 40 different static poses with dvrk-drake collect, or
-   convert a recording of another program (docs/public_recordings.md).
+   convert a recording of another program (docs/recordings.md).
 2. dvrk-drake identify POSES.csv --arm {arm} --output model.yaml
 3. On another day: dvrk-drake validate OTHER.csv --model model.yaml --save
 4. Disable the gravity compensation of the dVRK controller. Otherwise gravity is

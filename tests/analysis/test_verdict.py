@@ -32,7 +32,8 @@ from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSecti
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
-from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +237,7 @@ def test_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkeypa
     ("command", "written"),
     [
         ("check {0}/poses.csv --arm mtmr --json o.json", ["o.json"]),
-        ("convert {0}/poses.csv --coordinates joint --output o.csv", ["o.csv"]),
+        ("convert {0}/poses.csv --output o.csv", ["o.csv"]),
         ("predict {0}/poses.csv --model {0}/model.yaml --output o.csv", ["o.csv"]),
         ("validate {0}/other.csv --model {0}/model.yaml --json o.json --plots p", ["o.json", "p"]),
         ("export --model {0}/model.yaml --sdf o.sdf --urdf o.urdf", ["o.sdf", "o.urdf", "o_meshes"]),

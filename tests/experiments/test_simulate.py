@@ -13,7 +13,7 @@ from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 EXAMPLE = ROOT / "examples" / "psm_reach.yaml"
 PSM = load_arm("psm")

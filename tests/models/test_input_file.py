@@ -23,10 +23,11 @@ from dvrk_drake.models.files import MAX_TEXT
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
-from dvrk_drake.recordings import csv_rows, recording
+from dvrk_drake.recordings import csv_rows
 from dvrk_drake.recordings.conversion import convert
 from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
-from dvrk_drake.recordings.recording import read_recording, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import write_recording
 
 ARM = load_arm("mtml")
 #: Mapping from a file name to its reader.
@@ -42,8 +43,8 @@ READERS = {
     "recording.csv": lambda path: read_recording(path, ARM),
     "collection.csv": lambda path: CollectionFile(path, ARM, both_sides=True),
     "team.mat": lambda path: convert(path, f"{path}.out"),
-    "wpi.csv": lambda path: convert(path, f"{path}.out", format="wpi-csv"),
-    "status.log": lambda path: convert(path, f"{path}.out", format="lcm-log"),
+    "wpi.csv": lambda path: convert(path, f"{path}.out"),
+    "status.log": lambda path: convert(path, f"{path}.out"),
     "arm.sdf": lambda path: compose_sdf([path]),
 }
 #: Functions that create something other than a regular file at a path.
@@ -259,7 +260,7 @@ def test_block_size_does_not_change_the_rows(block, end, tmp_path, monkeypatch):
 def test_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
-    monkeypatch.setattr(recording, "MAX_COUNT", 3)
+    monkeypatch.setattr(csv_rows, "MAX_COUNT", 3)
     with pytest.raises(RecordingError, match=r", line 5: the file has more than 3 rows\. Split"):
         read_recording(path)
     path.write_text(f"{HEADER}\n" + "1" * 3_000_000)

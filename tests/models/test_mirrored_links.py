@@ -23,7 +23,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensa
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 #: Signs that mirror the joint angles and torques of an arm in the plane x = 0.
 MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])

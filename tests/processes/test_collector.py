@@ -11,7 +11,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 FRICTION = 0.08 * load_arm("mtml").effort_limits
 

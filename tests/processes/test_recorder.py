@@ -8,7 +8,7 @@ from status_logs import ARM, statuses
 from dvrk_drake.models.lcm_messages import MessageKey, status_channel
 from dvrk_drake.processes import recorder as module
 from dvrk_drake.processes.recorder import Recorder
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 KEY = MessageKey(bytes(range(32)))
 

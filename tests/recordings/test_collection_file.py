@@ -11,7 +11,7 @@ from sticky_arm import random_poses
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.pose_file import CollectionFile
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 ARMS = ("mtml", "psm")
 

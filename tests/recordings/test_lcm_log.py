@@ -13,9 +13,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.conversion import convert
 from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, StatusStream
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording_stream import check_stream_output, open_recording_file
 
 
@@ -242,13 +241,11 @@ def test_log_of_a_moving_arm_is_identified_by_static_segments(tmp_path, capsys):
     )
 
 
-def test_convert_refuses_options_of_other_formats(tmp_path):
+@pytest.mark.parametrize("options", [{"rate": 100.0}, {"topic": "/MTML"}, {"arrays": {"q": "q"}}])
+def test_options_of_other_formats_are_refused(tmp_path, options):
     path = write_log(tmp_path / "a.log", statuses())
-    with pytest.raises(RecordingError, match="do not apply to an LCM log"):
-        convert(path, tmp_path / "a.csv", rate=100.0)
-    (tmp_path / "b.csv").write_text("0,1\n")
-    with pytest.raises(RecordingError, match="is not an LCM log"):
-        convert(tmp_path / "b.csv", tmp_path / "a.csv", format="lcm-log")
+    with pytest.raises(RecordingError, match=f"--{next(iter(options))} does not apply to an LCM log"):
+        read_recording(path, **options)
 
 
 # Files that are written during a recording.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from repository import ROOT
 
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 DOCUMENT = ROOT / "docs" / "public_recordings.md"
 

@@ -13,7 +13,8 @@ from unprivileged import public_folder, run_unprivileged
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.recordings.recording import read_recording, write_csv, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import write_csv, write_recording
 
 
 @pytest.mark.parametrize("absent", [(), ("t",), ("qd",), ("tau",), ("t", "qd", "tau")])

@@ -8,7 +8,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.ros_bag import is_ros_bag, read_joint_states
+from dvrk_drake.recordings.reading import detect_format, read_recording
 
 START = 1_700_000_000_000_000_000
 
@@ -35,8 +35,8 @@ def stamps(rows, period=0.01):
 def test_reads_the_numbers_that_were_written(mtm, tmp_path, kind):
     q, qd, tau = blocks(20, 7)
     path = write_bag(tmp_path, kind, {"/MTML/measured_js": joint_states(stamps(20), mtm.joint_names, q, qd, tau)})
-    assert is_ros_bag(path)
-    states = read_joint_states(path, mtm)
+    assert detect_format(path).name == "a ROS bag"
+    states = read_recording(path, mtm)
     np.testing.assert_array_equal(states.q, q)
     np.testing.assert_array_equal(states.qd, qd)
     np.testing.assert_array_equal(states.tau, tau)
@@ -57,14 +57,14 @@ def test_reads_compressed_bags(mtm, tmp_path, kind, compression):
     q, qd, tau = blocks(20, 7)
     rows = joint_states(stamps(20), mtm.joint_names, q, qd, tau)
     path = write_bag(tmp_path, kind, {"/MTML/measured_js": rows}, compression=compression)
-    np.testing.assert_array_equal(read_joint_states(path, mtm).tau, tau)
+    np.testing.assert_array_equal(read_recording(path, mtm).tau, tau)
 
 
 def test_orders_joints_by_name_and_ignores_others(mtm, tmp_path):
     q, qd, tau = blocks(5, 8)
     names = ("gripper", *mtm.joint_names[::-1])
     path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(stamps(5), names, q, qd, tau)})
-    np.testing.assert_array_equal(read_joint_states(path, mtm).q, q[:, :0:-1])
+    np.testing.assert_array_equal(read_recording(path, mtm).q, q[:, :0:-1])
 
 
 def test_joins_the_jaw_of_a_psm_by_time(psm, tmp_path):
@@ -75,9 +75,9 @@ def test_joins_the_jaw_of_a_psm_by_time(psm, tmp_path):
     ramp = 1e-9 * (jaw_stamps - START)[:, None]
     jaw = joint_states(jaw_stamps, ["jaw"], ramp, ramp, ramp)
     path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": arm, "/PSM1/jaw/measured_js": jaw})
-    states = read_joint_states(path, psm)
+    states = read_recording(path, psm)
     inside = slice(1, 29)
-    row = np.searchsorted(states.messages, np.arange(40)[inside] + 1)
+    row = np.searchsorted(states.lines, np.arange(40)[inside] + 1)
     np.testing.assert_allclose(states.q[row, 6], 0.01 * np.arange(40)[inside], atol=1e-9)
     np.testing.assert_array_equal(states.q[row, :6], q[inside])
     assert any("no message of the jaw" in note for note in states.notes)
@@ -87,7 +87,7 @@ def test_names_the_missing_topic_of_the_jaw(psm, tmp_path):
     q, qd, tau = blocks(5, 6)
     path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": joint_states(stamps(5), psm.joint_names[:6], q, qd, tau)})
     with pytest.raises(RecordingError, match=r"also needs jaw\. Record /PSM1/jaw/measured_js as well"):
-        read_joint_states(path, psm)
+        read_recording(path, psm)
 
 
 def test_reads_the_named_arm_of_several(psm, tmp_path):
@@ -98,15 +98,15 @@ def test_reads_the_named_arm_of_several(psm, tmp_path):
     }
     path = write_bag(tmp_path, "mcap", topics)
     with pytest.raises(RecordingError, match=r"several topics fit PSM: /PSM1/measured_js, /PSM2/measured_js"):
-        read_joint_states(path, psm)
+        read_recording(path, psm)
     for topic in ("/PSM2", "/PSM2/measured_js"):
-        np.testing.assert_array_equal(read_joint_states(path, psm, topic).q, second[0])
+        np.testing.assert_array_equal(read_recording(path, psm, topic=topic).q, second[0])
 
 
 def test_finds_the_arm_in_a_namespace(mtm, tmp_path):
     q, qd, tau = blocks(5, 7)
     path = write_bag(tmp_path, "mcap", {"/left/MTML/measured_js": joint_states(stamps(5), mtm.joint_names, q, qd, tau)})
-    np.testing.assert_array_equal(read_joint_states(path, mtm).q, q)
+    np.testing.assert_array_equal(read_recording(path, mtm).q, q)
 
 
 def test_omits_invalid_and_repeated_stamps(mtm, tmp_path):
@@ -114,9 +114,9 @@ def test_omits_invalid_and_repeated_stamps(mtm, tmp_path):
     times = stamps(10)
     times[0], times[5] = 0, times[4]
     path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(times, mtm.joint_names, q, qd, tau)})
-    states = read_joint_states(path, mtm)
-    np.testing.assert_array_equal(states.messages, [2, 3, 4, 5, 7, 8, 9, 10])
-    np.testing.assert_array_equal(states.q, q[states.messages - 1])
+    states = read_recording(path, mtm)
+    np.testing.assert_array_equal(states.lines, [2, 3, 4, 5, 7, 8, 9, 10])
+    np.testing.assert_array_equal(states.q, q[states.lines - 1])
     assert [note.partition(" omitted")[0] for note in states.notes] == [
         "1 messages of /MTML/measured_js",
         "1 messages of /MTML/measured_js",
@@ -155,7 +155,7 @@ def test_refuses_unusable_bags_with_one_line(mtm, tmp_path, case):
     topics, text = list(damaged(mtm))[case]
     path = write_bag(tmp_path, "mcap", topics)
     with pytest.raises(RecordingError, match=text) as caught:
-        read_joint_states(path, mtm)
+        read_recording(path, mtm)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
@@ -163,8 +163,8 @@ def test_can_omit_numbers_that_are_not_finite(mtm, tmp_path):
     q, qd, tau = blocks(10, 7)
     tau[3, 6] = np.inf
     path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(stamps(10), mtm.joint_names, q, qd, tau)})
-    states = read_joint_states(path, mtm, skip_invalid=True)
-    assert 4 not in states.messages and len(states.t) == 9
+    states = read_recording(path, mtm, skip_invalid=True)
+    assert 4 not in states.lines and len(states.t) == 9
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -178,7 +178,7 @@ def test_refuses_truncated_and_damaged_bags_with_one_line(mtm, tmp_path, kind):
     for cut in (16, 20, len(content) // 3, len(content) // 2):
         file.write_bytes(content[:cut])
         with pytest.raises(RecordingError) as caught:
-            read_joint_states(path, mtm)
+            read_recording(path, mtm)
         assert "\n" not in str(caught.value)
     # A damaged byte may be a number that is still valid; anything else must be a refusal.
     for _ in range(40):
@@ -187,15 +187,8 @@ def test_refuses_truncated_and_damaged_bags_with_one_line(mtm, tmp_path, kind):
             flipped[place] ^= 1 << generator.integers(8)
         file.write_bytes(bytes(flipped))
         try:
-            states = read_joint_states(path, mtm)
+            states = read_recording(path, mtm)
         except RecordingError as error:
             assert "\n" not in str(error)
         else:
             assert states.q.shape[1] == 7
-
-
-def test_other_files_are_no_bags(tmp_path):
-    (tmp_path / "poses.csv").write_text("q1,q2\n")
-    assert not is_ros_bag(tmp_path / "poses.csv")
-    assert not is_ros_bag(tmp_path)
-    assert not is_ros_bag(tmp_path / "missing.mcap")

@@ -16,7 +16,7 @@ from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, measurements
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children
 COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(7)]

@@ -21,7 +21,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
-from dvrk_drake.recordings.recording import Recording, read_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Values of the length symbols in Table I for the real arm [m]. L1 does not affect any joint and is 0 in the SDF.
 LENGTHS = {"0": 0.0, "L1": 0.0, "L2": 0.2794, "L3": 0.3645, "L4": 0.1506}

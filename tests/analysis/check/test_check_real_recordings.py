@@ -6,7 +6,7 @@ from check_findings import changed
 
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.conversion import read_wpi_csv, wpi_in_joint_coordinates
+from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = pytest.mark.slow
 
@@ -17,7 +17,7 @@ def real_motion(shared_data):
         path = shared_data / "trajectories" / f"{name}.csv"
         if not path.is_file():
             pytest.skip(f"needs {path}")
-        return wpi_in_joint_coordinates(read_wpi_csv(path), arm_of(name))
+        return read_recording(path, arm_of(name), "wpi")
 
     return motion
 

@@ -16,8 +16,8 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.recordings.conversion import read_wpi_csv, wpi_in_joint_coordinates
-from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
 
 pytestmark = pytest.mark.slow
 
@@ -216,7 +216,7 @@ def test_real_motions_have_no_finding(shared_data, name, coordinates):
     arm = load_arm("mtmr" if name.startswith("mtm") else "psm")
     recording = read_recording(path, arm, "actuator")
     if coordinates == "joint":  # as in a file from `dvrk-drake convert`
-        recording = wpi_in_joint_coordinates(read_wpi_csv(path), arm)
+        recording = read_recording(path, arm, "wpi")
     assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
 
 

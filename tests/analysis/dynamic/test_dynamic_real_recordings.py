@@ -17,8 +17,8 @@ from dvrk_drake.analysis.recalibration import refit_friction
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.conversion import read_wpi_csv, wpi_in_joint_coordinates
-from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +40,7 @@ def case(request, shared_data, tmp_path_factory):
     if not path.is_file():
         pytest.skip(f"needs {path}")
     arm = load_arm(request.param)
-    recording = wpi_in_joint_coordinates(read_wpi_csv(path), arm)
+    recording = read_recording(path, arm, "wpi")
     folder = tmp_path_factory.mktemp(request.param)
     motion, model = folder / "motion.csv", folder / "model.yaml"
     write_recording(recording, motion)
@@ -123,8 +123,7 @@ def another_day(case, shared_data):
     name, arm, _, model, _ = case
     if name != "psm":
         pytest.skip("recorded on another day: only the PSM")
-    recording = read_wpi_csv(shared_data / "trajectories" / "psm_one_no_weight.csv")
-    return model, wpi_in_joint_coordinates(recording, arm)
+    return model, read_recording(shared_data / "trajectories" / "psm_one_no_weight.csv", arm, "wpi")
 
 
 def errors(model, recording):

@@ -14,7 +14,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.conversion import convert
-from dvrk_drake.recordings.recording import Recording, read_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording
 
 pytestmark = pytest.mark.slow
 
@@ -137,7 +138,7 @@ def real_parts(arm, shared_data, tmp_path_factory):
 
     def parts_of(name):
         path = tmp_path_factory.mktemp("converted") / f"{name}.csv"
-        convert(shared_data / f"trajectories/{name}.csv", path, format="wpi-csv", arm=arm)
+        convert(shared_data / f"trajectories/{name}.csv", path, arm=arm, coordinates="wpi")
         return path, low_speed_segments(read_recording(path, arm), arm)
 
     return {name: parts_of(name) for name in ("psm_one", "psm_one_205g_insertion")}

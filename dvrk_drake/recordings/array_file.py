@@ -1,0 +1,327 @@
+"""Reads recordings from arrays in MATLAB files (version 4 to 7.3) and NumPy archives (.npz).
+
+The arrays q, qd, tau and t are named by the user or recognised by their names. Two public layouts are recognised:
+
+- static poses of WPI (https://github.com/WPI-AIM/dvrk_gravity_comp): one array of 8 x 2 x N, i.e. joint (the eighth is
+  the gripper), quantity (position, effort) and pose;
+- the gravity collection of JHU and CUHK (https://github.com/jhu-dvrk/dvrk-gravity-compensation): a folder of files with
+  `current_position` and `desired_effort`, each joint x pose x sample.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import scipy.io
+from numpy.typing import NDArray
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.recordings.csv_rows import listed, read_bytes
+from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.recording import Recording
+
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_ZIP_MAGIC = b"PK\x03\x04"
+_SUFFIXES = (".mat", ".npz")
+#: Recognised names of arrays, in lower case. The first names of q and tau are those of the public gravity collection.
+_NAMES = {
+    "q": ("current_position", "q", "position", "positions", "measured_position", "joint_position", "joint_positions"),
+    "qd": ("qd", "dq", "v", "velocity", "velocities", "measured_velocity", "joint_velocity", "joint_velocities"),
+    "tau": (
+        *("desired_effort", "tau", "effort", "efforts", "torque", "torques", "measured_effort", "joint_effort"),
+        *("joint_efforts", "joint_torque", "joint_torques"),
+    ),
+    "t": ("t", "time", "times", "timestamp", "timestamps"),
+}
+#: Quantities that the user can name.
+QUANTITIES = tuple(_NAMES)
+#: Joints and gripper of an array of static poses.
+_POSE_ROWS, _POSE_JOINTS = 8, 7
+#: Maximum number of arrays listed in a message.
+_LISTED = 12
+
+
+def is_array_file(path: Path) -> bool:
+    """Returns whether a path is a MATLAB file, a NumPy archive, or a folder with such files."""
+    if path.is_dir():
+        return bool(_collection(path))
+    if path.suffix.lower() in _SUFFIXES:
+        return True
+    with path.open("rb") as file:
+        start = file.read(520)
+    return start[126:128] in (b"IM", b"MI") or _is_hdf5(start)
+
+
+def read_array_file(path: Path, options: FileOptions) -> Recording:
+    """Reads a recording from a MATLAB file, a NumPy archive, or all such files of a folder and its subfolders.
+
+    An array is m x n, n x m or n x poses x samples for an arm with n joints. Each sample is one row of the recording.
+    Arrays without times contain static poses, unless the options state a rate.
+
+    `options.arrays` maps "q", "qd", "tau" and "t" to the names of the arrays. A member of a structure is named with
+    dots: "log.q". {"poses": NAME} names an array of 8 x 2 x N. Default: arrays with a recognised name, or else the only
+    array of 8 x 2 x N.
+
+    Args:
+        path: Path of the file or of the folder.
+        options: Arm (default: 7 joints), coordinates (default: "joint"), arrays, rate and `skip_invalid`, which also
+            omits poses that contain only zeros.
+
+    Raises:
+        RecordingError: A file is damaged, an array is missing or has another shape, several arrays are candidates, a
+            row is invalid, or a rate is given for arrays with times.
+    """
+    files = _collection(path) if path.is_dir() else [path]
+    names = dict(options.arrays or {})
+    if unknown := set(names) - {*QUANTITIES, "poses"}:
+        raise RecordingError(f"unknown array {', '.join(sorted(unknown))}; allowed: {', '.join(QUANTITIES)}, poses")
+    digest, parts = hashlib.sha256(), []
+    for number, file in enumerate(files):
+        options.progress(number / len(files))
+        content = read_bytes(file)
+        digest.update(content)
+        parts.append(_rows(file, _read_arrays(file, content), options.num_joints, names))
+    blocks = {
+        quantity: np.concatenate([part.blocks[quantity] for part in parts])
+        for quantity in parts[0].blocks
+        if all(quantity in part.blocks for part in parts)
+    }
+    label, preallocated = parts[0].label, parts[0].preallocated
+    notes = [parts[0].note if len(files) == 1 else f"{len(files)} files; {parts[0].note} of each file"]
+    if "t" in blocks and len(files) > 1:
+        del blocks["t"]
+        notes.append("times are not used, because each file has its own")
+    valid = _valid_rows(path, blocks, label, preallocated, options.skip_invalid)
+    if not np.all(valid):
+        omitted, reason = np.flatnonzero(~valid) + 1, "NaN or infinite" + preallocated * ", or all zeros"
+        notes.append(f"{len(omitted)} of {len(valid)} {label}s skipped ({reason}): {listed(omitted)}")
+    rows = np.flatnonzero(valid)
+    t, time_notes = options.sampled_times(path, blocks["t"][rows] if "t" in blocks else None, rows)
+    recording = Recording(
+        blocks["q"][rows],
+        blocks["tau"][rows] if "tau" in blocks else None,
+        blocks["qd"][rows] if "qd" in blocks else None,
+        t,
+        source=str(path),
+        lines=rows + 1,
+        sha256=digest.hexdigest(),
+        notes=(*notes, *time_notes),
+        line_label=label,
+    )
+    return options.with_coordinates(recording)
+
+
+class _Rows(NamedTuple):
+    """Rows of the blocks q, qd, tau (m, n) and t (m,) of one file.
+
+    Attributes:
+        blocks: Mapping from a quantity to its rows.
+        note: Source of the blocks.
+        label: Name of a row, for messages.
+        preallocated: Whether a row of zeros was allocated, but not recorded.
+    """
+
+    blocks: dict[str, NDArray[np.float64]]
+    note: str
+    label: str = "row"
+    preallocated: bool = False
+
+
+def _collection(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*") if file.suffix.lower() in _SUFFIXES and file.is_file())
+
+
+def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str]) -> _Rows:
+    """Returns the rows of the named arrays, or of the recognised arrays if none is named."""
+    shapes = [f"{name} ({_shape(array)})" for name, array in arrays.items()]
+    found = ", ".join(shapes[:_LISTED]) + (", ..." if len(shapes) > _LISTED else "") or "none"
+    for quantity, name in names.items():
+        if name not in arrays:
+            raise RecordingError(f"{path}: has no array {name} for {quantity}. Its arrays of real numbers: {found}.")
+    chosen = dict(names) or _recognised(path, arrays, n, found)
+    if "poses" in chosen:
+        if len(chosen) > 1:
+            raise RecordingError(f"{path}: poses contains positions and efforts; do not name other arrays")
+        return _poses(path, chosen["poses"], arrays[chosen["poses"]], n)
+    if "q" not in chosen:
+        raise RecordingError(
+            f"{path}: no array for q. Name the arrays with --arrays q=NAME tau=NAME (arrays= in Python). "
+            f"Its arrays of real numbers: {found}."
+        )
+    blocks = {
+        quantity: _joint_rows(path, name, arrays[name], n) for quantity, name in chosen.items() if quantity != "t"
+    }
+    if "t" in chosen:
+        t = arrays[chosen["t"]]
+        if t.size != max(t.shape, default=0):
+            raise RecordingError(f"{path}: {chosen['t']} is {_shape(t)}; allowed for t: a vector")
+        blocks["t"] = np.asarray(t, float).reshape(-1)
+    for quantity, block in blocks.items():
+        if len(block) != len(blocks["q"]):
+            raise RecordingError(
+                f"{path}: {chosen[quantity]} has {len(block)} rows, but {chosen['q']} has {len(blocks['q'])}; all "
+                "arrays must have the same number of rows"
+            )
+    return _Rows(blocks, ", ".join(f"{quantity} from array {name}" for quantity, name in chosen.items()))
+
+
+def _recognised(path: Path, arrays: Mapping[str, NDArray], n: int, found: str) -> dict[str, str]:
+    """Returns a mapping from a quantity to the only array with a recognised name and a fitting shape."""
+    chosen = {}
+    for quantity, known in _NAMES.items():
+        fitting = [
+            name
+            for name, array in arrays.items()
+            if name.rpartition(".")[2].lower() in known
+            and (array.size == max(array.shape, default=0) if quantity == "t" else _is_joint_array(array, n))
+        ]
+        if len(fitting) > 1:
+            raise RecordingError(
+                f"{path}: several arrays may be {quantity}: {', '.join(fitting)}. Choose with --arrays q=NAME tau=NAME "
+                "(arrays= in Python)."
+            )
+        if fitting:
+            chosen[quantity] = fitting[0]
+    if "q" in chosen:
+        return chosen
+    poses = [name for name, array in arrays.items() if _is_pose_array(array)] if n == _POSE_JOINTS else []
+    if len(poses) > 1:
+        raise RecordingError(
+            f"{path}: several arrays have the shape 8 x 2 x N of static poses: {', '.join(poses)}. Choose one with "
+            "--arrays poses=NAME (arrays= in Python)."
+        )
+    if poses:
+        return {"poses": poses[0]}
+    raise RecordingError(
+        f"{path}: no array of {n} joints has a recognised name. Name the arrays with --arrays q=NAME tau=NAME (arrays= "
+        f"in Python). Its arrays of real numbers: {found}."
+    )
+
+
+def _shape(array: NDArray) -> str:
+    return " x ".join(map(str, array.shape)) or "one number"
+
+
+def _is_joint_array(array: NDArray, n: int) -> bool:
+    return (array.ndim == 2 and n in array.shape) or (array.ndim == 3 and array.shape[0] == n)
+
+
+def _is_pose_array(array: NDArray) -> bool:
+    # MATLAB drops trailing dimensions of 1, so one pose is 8 x 2.
+    return array.ndim in (2, 3) and array.shape[:2] == (_POSE_ROWS, 2)
+
+
+def _joint_rows(path: Path, name: str, array: NDArray, n: int) -> NDArray[np.float64]:
+    if not _is_joint_array(array, n):
+        raise RecordingError(
+            f"{path}: {name} is {_shape(array)}; allowed for {n} joints: m x {n}, {n} x m, or {n} x poses x samples"
+        )
+    values = np.asarray(array, float)
+    return values if values.ndim == 2 and values.shape[1] == n else values.reshape(n, -1).T.copy()
+
+
+def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
+    if n != _POSE_JOINTS or not _is_pose_array(array):
+        raise RecordingError(
+            f"{path}: {name} is {_shape(array)}; allowed for poses of 7 joints: 8 x 2 x N (joint; position, effort; "
+            f"pose), and the arm must have 7 joints, not {n}"
+        )
+    if array.size == 0:
+        raise RecordingError(f"{path}: array {name} has no poses")
+    joints = np.asarray(array, float).reshape(_POSE_ROWS, 2, -1)[:_POSE_JOINTS]
+    blocks = {"q": joints[:, 0].T.copy(), "tau": joints[:, 1].T.copy()}
+    return _Rows(blocks, f"static poses from array {name}; its eighth row (gripper) is ignored", "pose", True)
+
+
+def _valid_rows(
+    path: Path, blocks: Mapping[str, NDArray], label: str, preallocated: bool, skip_invalid: bool
+) -> NDArray[np.bool_]:
+    """Returns which rows (m,) contain only finite numbers, and not only zeros if the arrays were preallocated."""
+    if len(blocks["q"]) == 0:
+        raise RecordingError(f"{path}: the arrays have no rows")
+    table = np.column_stack([block.reshape(len(blocks["q"]), -1) for block in blocks.values()])
+    finite = np.all(np.isfinite(table), axis=1)
+    valid = finite & np.any(table, axis=1) if preallocated else finite
+    if not np.any(valid):
+        raise RecordingError(f"{path} has {len(valid)} {label}s, but none is valid")
+    if np.all(valid) or skip_invalid:
+        return valid
+    row = int(np.argmin(valid))
+    problem = "all numbers are zero, so the pose was not recorded"
+    for quantity, block in blocks.items():
+        if len(bad := np.flatnonzero(~np.isfinite(np.atleast_1d(block[row])))):
+            name = quantity if quantity == "t" else f"{quantity}{bad[0] + 1}"
+            problem = f"{name} is {np.atleast_1d(block[row])[bad[0]]}; only finite numbers are allowed"
+            break
+    raise RecordingError(
+        f"{path}, {label} {row + 1}: {problem}. Use --skip-invalid to omit invalid {label}s "
+        f"({np.sum(~valid)} of {len(valid)} {label}s)."
+    )
+
+
+def _is_hdf5(content: bytes) -> bool:
+    # MATLAB writes a header of 512 bytes before the HDF5 signature.
+    return any(content[start : start + 8] == _HDF5_MAGIC for start in (0, 512))
+
+
+def _read_arrays(path: Path, content: bytes) -> dict[str, NDArray]:
+    """Returns all arrays of real numbers in a file by name. Members of structures have names with dots: "log.q"."""
+    read = _read_hdf5 if _is_hdf5(content) else _read_npz if content[:4] == _ZIP_MAGIC else _read_mat
+    try:
+        with warnings.catch_warnings():
+            # Raises the warning "returned data may be corrupt" as an error.
+            warnings.simplefilter("error", UserWarning)
+            found = read(content)
+    except Exception as error:
+        # For a damaged file the libraries raise errors of many types: ValueError, OSError, zlib.error, KeyError, ...
+        text = " ".join(str(error).split())
+        raise RecordingError(f"{path}: the file is damaged, or not a MATLAB file or NumPy archive ({text})") from error
+    return {name: value for name, value in found.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"}
+
+
+def _read_mat(content: bytes) -> dict[str, object]:
+    loaded = scipy.io.loadmat(io.BytesIO(content), simplify_cells=False, squeeze_me=False, struct_as_record=True)
+    found: dict[str, object] = {}
+
+    def visit(name: str, value: object) -> None:
+        # A structure is an array (1, 1) of records.
+        if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
+            for member in value.dtype.names:
+                visit(f"{name}.{member}", value[member].item())
+        else:
+            found[name] = value
+
+    for name, value in loaded.items():
+        if not name.startswith("__"):
+            visit(name, value)
+    return found
+
+
+def _read_hdf5(content: bytes) -> dict[str, object]:
+    # The import takes 0.2 s, and most commands read no file of version 7.3.
+    import h5py
+
+    found: dict[str, object] = {}
+
+    def visit(name: str, item: object) -> None:
+        # Names that begin with # contain MATLAB's references.
+        if isinstance(item, h5py.Dataset) and not name.startswith("#") and "MATLAB_empty" not in item.attrs:
+            is_text = item.attrs.get("MATLAB_class", b"double") in (b"char", b"cell", b"logical")
+            if not is_text:
+                # MATLAB stores arrays by columns, HDF5 by rows.
+                found[name.replace("/", ".")] = np.asarray(item).T
+
+    with h5py.File(io.BytesIO(content), "r") as file:
+        file.visititems(visit)
+    return found
+
+
+def _read_npz(content: bytes) -> dict[str, object]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}

@@ -1,0 +1,179 @@
+"""Reads the joint states in a CSV of the cisst state collector, whose columns are listed in a `.desc` file.
+
+`mtsCollectorState` of cisstMultiTask (https://github.com/jhu-cisst/cisst) writes both files. The description contains
+the path of the CSV, the date, the format, the delimiter, three numbers of fields, and one line per column, e.g.
+"Data: measured_js.Position[0]:{d}". Each signal of type `prmStateJoint` has a time stamp [s], a flag that marks valid
+data, and the names, positions, velocities and efforts of its joints (rad, m, N m, N).
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import open_input, read_input
+from dvrk_drake.recordings.csv_rows import CsvReader, read_numbers
+from dvrk_drake.recordings.file_options import FileCoordinates, FileOptions
+from dvrk_drake.recordings.recording import Recording
+
+#: Lines of a description before the names of the columns.
+_HEAD = 7
+_FIELD = re.compile(r"(?:Data|Time): (.*)")
+_SIGNAL = re.compile(r"(?P<signal>.*measured_js)\.Position\[0\](:\{.*\})?")
+#: Members of prmStateJoint, and the corresponding blocks of a recording.
+_MEMBERS = {"q": "Position", "qd": "Velocity", "tau": "Effort"}
+#: Signals with the state of one additional joint.
+_JAW, _GRIPPER = "jaw/measured_js", "gripper/measured_js"
+_ORIGIN = re.compile(r"StateDataCollection-(?P<component>.+)-(?P<table>[^-]+)-\d{4}-")
+
+
+def is_collector_file(path: Path) -> bool:
+    """Returns whether a path is a description file of the collector, or a file with such a description."""
+    return path.suffix == ".desc" or (path.suffix == ".csv" and path.with_suffix(".desc").is_file())
+
+
+def read_collector(path: Path, options: FileOptions) -> Recording:
+    """Reads the measured joint states of an arm. Rows of invalid data and rows that repeat a time are omitted.
+
+    Joints are assigned by their names. Actuators, and joints without names, are assigned by their order. The jaw of a
+    PSM is read from the signal "jaw/measured_js".
+
+    Args:
+        path: Path of the CSV or of its description. Both must be in the same folder.
+        options: Arm (required), coordinates, topic and `skip_invalid`. Default coordinates are actuator coordinates for
+            the signal "measured_js" of an input/output table, whose name ends in "Read", and joint coordinates for all
+            others. The topic is the name of the signal, e.g. "kin/measured_js". Default: the only signal of the arm.
+
+    Raises:
+        RecordingError: A file is missing, the description is damaged, no signal or several signals fit, or the signal
+            has other joints.
+    """
+    arm = options.required_arm(path)
+    description, data = path.with_suffix(".desc"), path.with_suffix(".csv")
+    origin, fields = _read_description(description)
+    names = [re.sub(r":\{.*\}$", "", field) for field in fields]
+    signal = _choose_signal(description, fields, options.topic)
+    joints = _member_columns(names, signal, "Position")
+    labels = _joint_labels(data, _member_columns(names, signal, "Name"))
+    jaw = _JAW if signal != _JAW and len(joints) == arm.num_joints - 1 and f"{_JAW}.Position[0]" in names else ""
+    stated = _stated_coordinates(origin, signal)
+    order = _order(
+        *(description, signal, labels, len(joints), arm), has_jaw=bool(jaw), is_actuator=stated == "actuator"
+    )
+    blocks = {}
+    for block, member in _MEMBERS.items():
+        columns = _member_columns(names, signal, member)
+        extra = _member_columns(names, jaw, member) if jaw else []
+        if len(columns) == len(joints) and bool(extra) == bool(jaw):
+            blocks[block] = [[*columns, *extra][i] for i in order]
+    blocks |= {"t": [names.index(f"{signal}.Timestamp")], "valid": [names.index(f"{signal}.Valid")]}
+    with CsvReader(data, options.progress) as reader:
+        found = read_numbers(reader, names, blocks, skip_invalid=options.skip_invalid, header_name=description.name)
+        sha256 = reader.sha256()
+    t = found.blocks["t"][:, 0]
+    valid = found.blocks["valid"][:, 0] != 0
+    latest = np.maximum.accumulate(np.where(valid, t, -np.inf))
+    new = valid & (t > np.concatenate([[-np.inf], latest[:-1]]))
+    notes = list(found.notes)
+    for count, reason in (
+        (np.sum(~valid), "marked invalid"),
+        (np.sum(valid & ~new), "not later than the previous row"),
+    ):
+        if count:
+            notes.append(f"{count} rows of {signal} omitted: {reason}")
+    if not np.any(new) or np.sum(valid & ~new) > np.sum(new):
+        raise RecordingError(f"{data}: {signal} has {np.sum(new)} usable rows ({'; '.join(notes)})")
+    recording = Recording(
+        found.blocks["q"][new],
+        found.blocks["tau"][new] if "tau" in blocks else None,
+        found.blocks["qd"][new] if "qd" in blocks else None,
+        t[new] - t[new][0],
+        source=str(path),
+        lines=found.lines[new],
+        sha256=sha256,
+    )
+    notes.append(f"signal {signal} of {origin}, in {options.coordinates or stated} coordinates")
+    return dataclasses.replace(options.with_coordinates(recording, stated), notes=tuple(notes))
+
+
+def _read_description(path: Path) -> tuple[str, list[str]]:
+    """Returns the name of the CSV when it was written, and the names of its columns."""
+    try:
+        lines = read_input(path, RecordingError).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path} is not a text file: {error.reason}") from error
+    fields = [match[1] for line in lines[_HEAD:] if (match := _FIELD.fullmatch(line.strip()))]
+    if len(lines) < _HEAD or not lines[4].strip().isdigit() or int(lines[4]) != len(fields):
+        raise RecordingError(
+            f"{path}: not a complete description of the cisst collector; line 5 must be the number of the lines that "
+            f"begin with Data: or Time: ({len(fields)} found)"
+        )
+    if lines[2].strip() != "CSV" or lines[3].strip() != ",":
+        raise RecordingError(f"{path}: the format is {lines[2].strip()}; allowed: CSV with commas")
+    return Path(lines[0].strip()).name, fields
+
+
+def _choose_signal(path: Path, fields: list[str], topic: str | None) -> str:
+    signals = [match["signal"] for field in fields if (match := _SIGNAL.fullmatch(field))]
+    has = f"Signals with joint states: {', '.join(signals) or 'none'}."
+    if topic is not None:
+        if topic in signals:
+            return topic
+        raise RecordingError(f"{path}: has no signal {topic}. {has}")
+    fitting = [signal for signal in signals if not signal.endswith((_JAW, _GRIPPER))]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise RecordingError(f"{path}: several signals fit. {has} Choose one with --topic NAME (topic= in Python).")
+    raise RecordingError(f"{path}: has no joint states of an arm. {has} Collect measured_js of the arm.")
+
+
+def _member_columns(names: list[str], signal: str, member: str) -> list[int]:
+    """Returns the columns of a member, e.g. of "measured_js.Position[0]", "measured_js.Position[1]", ..."""
+    index = {name: column for column, name in enumerate(names)}
+    columns: list[int] = []
+    while (name := f"{signal}.{member}[{len(columns)}]") in index:
+        columns.append(index[name])
+    return columns
+
+
+def _joint_labels(path: Path, columns: list[int]) -> list[str]:
+    """Returns the names of the joints in the first row."""
+    with open_input(path, RecordingError) as file:
+        line = file.readline().decode(errors="replace")
+    cells = next(csv.reader([line]), [])
+    return [cells[column].strip() for column in columns if column < len(cells)]
+
+
+def _order(
+    path: Path, signal: str, labels: list[str], count: int, arm: Arm, *, has_jaw: bool, is_actuator: bool
+) -> list[int]:
+    """Returns the column of each joint of the arm among the `count` columns of the signal, followed by the jaw."""
+    if has_jaw:
+        labels, count = [*labels, arm.joint_names[-1]], count + 1
+    if set(arm.joint_names) <= set(labels):
+        return [labels.index(name) for name in arm.joint_names]
+    if labels and all(label.isidentifier() for label in labels) and not is_actuator:
+        raise RecordingError(
+            f"{path}: {signal} has the joints {', '.join(labels)}, but {arm.name} has {', '.join(arm.joint_names)}. "
+            "Check --arm and --topic."
+        )
+    if count != arm.num_joints:
+        jaw = f" Collect {_JAW} as well." if count == arm.num_joints - 1 else ""
+        raise RecordingError(
+            f"{path}: {signal} has {count} joints, but {arm.name} has {arm.num_joints}: "
+            f"{', '.join(arm.joint_names)}.{jaw}"
+        )
+    return list(range(count))
+
+
+def _stated_coordinates(origin: str, signal: str) -> FileCoordinates:
+    match = _ORIGIN.match(origin)
+    is_actuator = match is not None and match["table"].endswith("Read") and signal == "measured_js"
+    return "actuator" if is_actuator else "joint"

@@ -1,0 +1,153 @@
+"""Reads recordings of all supported formats. Each format has one reader; `FORMATS` lists them."""
+
+from __future__ import annotations
+
+import os
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import open_input
+from dvrk_drake.progress import Progress, step_progress
+from dvrk_drake.recordings.array_file import is_array_file, read_array_file
+from dvrk_drake.recordings.cisst_collector import is_collector_file, read_collector
+from dvrk_drake.recordings.csv_recording import read_csv
+from dvrk_drake.recordings.file_options import FileCoordinates, FileOptions
+from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.ros_bag import is_ros_bag, read_ros_bag
+
+#: Number of bytes at the beginning of a text file that must not contain a null byte.
+_HEAD = 4096
+
+
+@dataclass(frozen=True)
+class Format:
+    """Format of a recording.
+
+    Attributes:
+        name: Name of the format with its article.
+        matches: Function that returns whether an existing path has this format, according to its content and name.
+        read: Function that reads the file.
+        options: Names of the options that apply to this format, besides `arm`, `skip_invalid` and `progress`.
+    """
+
+    name: str
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, FileOptions], Recording]
+    options: frozenset[str]
+
+
+#: Formats in the order in which they are tried. A file with none of them is a CSV.
+FORMATS = (
+    Format("an LCM log", is_lcm_log, read_status_log, frozenset()),
+    Format("a ROS bag", is_ros_bag, read_ros_bag, frozenset({"topic"})),
+    Format("a file of the cisst collector", is_collector_file, read_collector, frozenset({"topic", "coordinates"})),
+    Format(
+        "a MATLAB file or NumPy archive",
+        is_array_file,
+        read_array_file,
+        frozenset({"arrays", "rate", "coordinates"}),
+    ),
+    Format("a CSV", lambda path: not path.is_dir(), read_csv, frozenset({"rate", "coordinates"})),
+)
+
+
+def read_recording(
+    path: str | Path,
+    arm: Arm | None = None,
+    coordinates: FileCoordinates | None = None,
+    *,
+    topic: str | None = None,
+    arrays: Mapping[str, str] | None = None,
+    rate: float | None = None,
+    skip_invalid: bool = False,
+    progress: Progress | None = None,
+) -> Recording:
+    """Reads a recording: CSV, ROS bag, MATLAB file, NumPy archive, cisst collector or LCM log.
+
+    The content of the file selects the format. docs/recordings.md describes the formats, and what each of them states
+    about units, coordinates and time.
+
+    Args:
+        path: Path of the file. A ROS 2 bag and a collection of MATLAB files may also be folders.
+        arm: Arm that defines the number and the names of the joints. From a bag or a log, only the measurements of this
+            arm are read. It is required for a bag and for the cisst collector. If None, other files must have 7 joints,
+            and a log must have statuses of only one arm.
+        coordinates: Coordinates of q, qd and tau in a file that does not state them: "joint", "actuator", or "wpi" for
+            the motions of WPI, which are in actuator coordinates except for the roll of a PSM. Default: the coordinates
+            that the file states, or else "joint".
+        topic: Topic of a bag, or its namespace, see `read_ros_bag`; signal of the cisst collector.
+        arrays: Mapping from "q", "qd", "tau" and "t" to the names of arrays, see `read_array_file`.
+        rate: Sampling rate [Hz] of a motion in a file without times.
+        skip_invalid: Whether to omit rows and messages that contain an empty cell, a NaN or an infinity, and to list
+            them in `notes`. If False, a file with such rows is refused.
+        progress: Callback that receives the name of the step ("reading") and the completed fraction (0 to 1).
+
+    Returns:
+        Recording with SHA-256 and line numbers. Its attribute `notes` describes assumptions and omitted rows.
+
+    Raises:
+        RecordingError: The file cannot be read as a recording, or an option does not apply to its format. The message
+            names the file and the line or message.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("mtmr")
+        >>> dvrk.write_recording(dvrk.Recording(q=np.zeros((8, 7)), tau=np.ones((8, 7))), "poses.csv")
+        >>> recording = dvrk.read_recording("poses.csv", arm)
+        >>> len(recording), recording.coordinates, recording.where(0)
+        (8, 'joint', 'poses.csv, line 2')
+    """
+    if coordinates is not None and coordinates not in get_args(FileCoordinates):
+        allowed = ", ".join(get_args(FileCoordinates))
+        raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {allowed}')
+    path = Path(path)
+    file_format = detect_format(path)
+    if coordinates not in (None, "joint") and "coordinates" not in file_format.options:
+        raise RecordingError(f"{path}: {file_format.name} is in joint coordinates, not in {coordinates} coordinates")
+    for option, value in (("topic", topic), ("arrays", arrays), ("rate", rate)):
+        if value is not None and option not in file_format.options:
+            raise RecordingError(f"{path}: --{option} does not apply to {file_format.name}")
+    return file_format.read(
+        path,
+        FileOptions(
+            arm=arm,
+            coordinates=coordinates,
+            topic=topic,
+            arrays=arrays,
+            rate=rate,
+            skip_invalid=skip_invalid,
+            progress=step_progress(progress, "reading"),
+        ),
+    )
+
+
+def detect_format(path: Path) -> Format:
+    """Returns the format of a file or folder. The reader of the format checks the content later.
+
+    Raises:
+        RecordingError: The path does not exist, cannot be read, or has none of the formats.
+    """
+    head = b""
+    # Unlike pathlib, os.path returns False for a path that is not valid.
+    if not os.path.isdir(path):
+        with open_input(path, RecordingError) as file:
+            try:
+                head = file.read(_HEAD)
+            except OSError as error:
+                raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    found = next((known for known in FORMATS if known.matches(path)), None)
+    if found is None:
+        raise RecordingError(
+            f"{path} is a folder without a recording; allowed: ROS 2 bag (with metadata.yaml), MATLAB files (.mat)"
+        )
+    if found is FORMATS[-1] and b"\0" in head:
+        raise RecordingError(
+            f"{path}: unknown format; allowed: CSV, ROS bag, MATLAB file, NumPy archive, cisst collector, LCM log"
+        )
+    return found

@@ -1,0 +1,123 @@
+"""CSV files without a header: layouts by their number of columns, times, and one line for each fault."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wpi
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.reading import read_recording
+
+
+def test_21_columns_are_motions_of_wpi_at_200_hz(tmp_path):
+    rows = wpi_rows()
+    path = write_wpi(tmp_path, rows)
+    recording = read_recording(path)
+    np.testing.assert_array_equal(recording.q, rows[:, :7])
+    np.testing.assert_array_equal(recording.qd, rows[:, 7:14])
+    np.testing.assert_array_equal(recording.tau, rows[:, 14:])
+    np.testing.assert_array_equal(recording.t, [0, 0.005, 0.010, 0.015])
+    assert recording.coordinates == "actuator"
+    assert recording.where(3) == f"{path}, line 4"
+    assert recording.notes == (
+        "no header: columns read as q1..q7, qd1..qd7, tau1..tau7",
+        "4 samples; the file has no times, so t = row / 200 Hz",
+    )
+    np.testing.assert_array_equal(read_recording(path, rate=10).t, [0, 0.1, 0.2, 0.3])
+
+
+def test_the_roll_of_a_psm_in_motions_of_wpi_is_that_of_the_joint(tmp_path):
+    psm = load_arm("psm")
+    rows = 1e-2 * wpi_rows()
+    recording = read_recording(write_wpi(tmp_path, rows), psm)
+    assert recording.coordinates == "joint"
+    np.testing.assert_array_equal(recording.q[:, :4], rows[:, :4])
+    np.testing.assert_array_equal(recording.tau[:, :4], rows[:, 14:18])
+    actuators = np.arange(7) != psm.joint_names.index("roll")
+    back = recording.in_actuator_coordinates(psm)
+    np.testing.assert_allclose(back.q[:, actuators], rows[:, :7][:, actuators], rtol=0, atol=1e-12)
+
+
+def test_14_columns_are_static_poses(tmp_path):
+    rows = wpi_rows()[:, :14]
+    recording = read_recording(write_wpi(tmp_path, rows), load_arm("mtml"))
+    np.testing.assert_array_equal(recording.q, rows[:, :7])
+    np.testing.assert_array_equal(recording.tau, rows[:, 7:])
+    assert (recording.qd, recording.t, recording.coordinates) == (None, None, "joint")
+
+
+def test_files_of_the_dvrk_collection_script_have_three_joints(tmp_path):
+    """The script dvrk_ecm_psm_gc_collect.py writes positions and efforts of yaw, pitch and insertion."""
+    path = write_wpi(tmp_path, wpi_rows()[:, :6])
+    assert_refused(
+        r", line 1: the first row has 6 cells and no header.*14 \(q, tau\)\. The file may have 3 joints: PSM has yaw",
+        read_recording,
+        path,
+        load_arm("psm"),
+    )
+
+
+def test_crlf_byte_order_mark_blank_lines_and_spaces(tmp_path):
+    line = ", ".join(str(i) for i in range(21))
+    recording = read_recording(write_text(tmp_path, f"\ufeff\r\n{line}\r\n\r\n{line}\r\n \r\n"))
+    np.testing.assert_array_equal(recording.lines, [2, 4])
+    np.testing.assert_array_equal(recording.t, [0, 0.005])
+
+
+FAULTS = {
+    "blank": ("\n \n,,\n", r"motion\.csv is empty"),
+    "title": ("my motion\n" + NUMBERS, r", line 1: the first row has no comma"),
+    "one number": (
+        "1\n2\n",
+        r", line 1: the first row has 1 cell and no header\. Allowed .* 21 columns \(q, qd, tau\)",
+    ),
+    "planned motion": ("1,2,3,4,5,6,7,500\n" * 3, r", line 1: the first row has 8 cells and no header"),
+    "ragged": (f"{NUMBERS}\n{NUMBERS}\n{NUMBERS},\n", r", line 3: the row has 22 cells, the first row has 21"),
+    "text": (f"{NUMBERS}\n{NUMBERS[:-1]}abc\n", r", line 2: tau7 \(column 21\) is not a number: 'abc'"),
+    "text first": ("x" + NUMBERS + "\n", r", line 1: q1 \(column 1\) is not a number: 'x1'"),
+    "empty cell": (f"{NUMBERS}\n{NUMBERS[:-1]}\n", r", line 2: tau7 \(column 21\) is empty"),
+    "underscore": (f"{NUMBERS}_0\n", r", line 1: tau7 \(column 21\) is not a number: '1_0'"),
+    "nan": (f"{NUMBERS}\n{NUMBERS}\nnan{NUMBERS[1:]}\n", r", line 3: q1 \(column 1\) is nan; only finite"),
+    "inf": (f"{NUMBERS[:-1]}-inf\n", r", line 1: tau7 \(column 21\) is -inf; only finite"),
+    "semicolons": (NUMBERS.replace(",", ";"), r", line 1: the first row has no comma\. Separate cells by commas"),
+    "open quote": (f'{NUMBERS}\n"{NUMBERS}\n{NUMBERS}\n', r", line 3: invalid CSV: unexpected end of data"),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_faults_name_file_line_and_column(tmp_path, case):
+    text, match = FAULTS[case]
+    assert_refused(match, read_recording, write_text(tmp_path, text))
+
+
+@pytest.mark.parametrize("rate", [0, -200, np.nan, np.inf])
+def test_other_rates_are_refused(tmp_path, rate):
+    path = write_wpi(tmp_path, wpi_rows())
+    assert_refused("rate is .* Hz; allowed: a positive number", read_recording, path, rate=rate)
+
+
+def test_skips_invalid_rows_and_keeps_times(tmp_path):
+    rows = wpi_rows(5)
+    rows[1, 3] = np.nan
+    rows[3, 20] = np.inf
+    path = write_wpi(tmp_path, rows)
+    path.write_text(path.read_text().replace("nan", ""))
+    recording = read_recording(path, skip_invalid=True)
+    np.testing.assert_array_equal(recording.t, [0, 0.01, 0.02])
+    np.testing.assert_array_equal(recording.lines, [1, 3, 5])
+    assert "2 of 5 rows skipped (empty, NaN or infinite): lines 2, 4" in recording.notes
+    path = write_wpi(tmp_path, np.full((3, 21), np.nan))
+    assert_refused("has no row of finite numbers", read_recording, path, skip_invalid=True)
+    bad = write_text(tmp_path, f"{NUMBERS}\n{NUMBERS[:-1]}abc\n")
+    assert_refused("tau7 .* is not a number", read_recording, bad, skip_invalid=True)
+
+
+def test_a_real_motion_without_header_and_time_is_restored(shared_data, tmp_path):
+    original = shared_data / "trajectories" / "mtm_one.csv"
+    lines = original.read_text().splitlines()[1:]
+    path = write_text(tmp_path, "\n".join(line.split(",", 1)[1] for line in lines))
+    restored, expected = read_recording(path), read_recording(original, coordinates="actuator")
+    for name in ("q", "qd", "tau"):
+        np.testing.assert_array_equal(getattr(restored, name), getattr(expected, name))
+    np.testing.assert_allclose(restored.t, expected.t, rtol=0, atol=1e-12)
