@@ -5,42 +5,13 @@ from __future__ import annotations
 import struct
 import warnings
 
-import h5py
 import numpy as np
 import pytest
 import scipy.io
+from array_files import KINDS, write_arrays
 from public_files import assert_refused, team_array, write_mat
 
 from dvrk_drake.recordings.reading import read_recording
-
-KINDS = ("v5", "v7.3", "npz")
-
-
-def write(folder, kind, arrays):
-    path = folder / ("arrays.npz" if kind == "npz" else "arrays.mat")
-    if kind == "npz":
-        np.savez(path, **{name: value for name, value in arrays.items() if not isinstance(value, dict)})
-    elif kind == "v5":
-        scipy.io.savemat(path, arrays)
-    else:
-        # MATLAB writes a header of 512 bytes before the HDF5 data.
-        with h5py.File(path, "w", userblock_size=512) as file:
-            store(file, arrays)
-        content = bytearray(path.read_bytes())
-        content[:128] = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
-        path.write_bytes(bytes(content))
-    return path
-
-
-def store(group, arrays):
-    for name, value in arrays.items():
-        if isinstance(value, dict):
-            store(group.create_group(name), value)
-        elif isinstance(value, str):
-            group[name] = np.frombuffer(value.encode("utf-16-le"), np.uint16)[:, None]
-            group[name].attrs["MATLAB_class"] = np.bytes_("char")
-        else:
-            group[name] = np.asarray(value).T
 
 
 def blocks(rows=20):
@@ -54,7 +25,7 @@ def test_recognised_names_in_both_orientations(tmp_path, kind, transposed):
     arrays = {"position": q, "velocity": qd, "effort": tau, "other": np.zeros((3, 3))}
     if transposed:
         arrays = {name: value.T for name, value in arrays.items()}
-    read = read_recording(write(tmp_path, kind, arrays | {"time": np.arange(20.0)[None]}))
+    read = read_recording(write_arrays(tmp_path, kind, arrays | {"time": np.arange(20.0)[None]}))
     np.testing.assert_array_equal(read.q, q)
     np.testing.assert_array_equal(read.qd, qd)
     np.testing.assert_array_equal(read.tau, tau)
@@ -67,7 +38,9 @@ def test_recognised_names_in_both_orientations(tmp_path, kind, transposed):
 def test_members_of_structures_have_names_with_dots(tmp_path, kind):
     q, _, tau = blocks()
     arrays = {"log": {"joints": {"q": q}, "motor": tau, "name": "7 joint"}, "title": "a title"}
-    read = read_recording(write(tmp_path, kind, arrays), arrays={"q": "log.joints.q", "tau": "log.motor"}, rate=100.0)
+    read = read_recording(
+        write_arrays(tmp_path, kind, arrays), arrays={"q": "log.joints.q", "tau": "log.motor"}, rate=100.0
+    )
     np.testing.assert_array_equal(read.q, q)
     np.testing.assert_array_equal(read.tau, tau)
     np.testing.assert_array_equal(read.t, np.arange(20) / 100)
@@ -87,7 +60,7 @@ def gravity_collection(seed, poses=5):
 @pytest.mark.parametrize("kind", KINDS)
 def test_gravity_collection_has_one_row_per_sample(tmp_path, kind):
     arrays = gravity_collection(1)
-    read = read_recording(write(tmp_path, kind, arrays))
+    read = read_recording(write_arrays(tmp_path, kind, arrays))
     assert read.q.shape == (15, 7)
     for pose in range(5):
         for sample in range(3):
@@ -99,7 +72,7 @@ def test_a_folder_of_the_gravity_collection_is_one_recording(tmp_path):
     for number in range(3):
         folder = tmp_path / f"Train_Joint{number}" / "data_pos"
         folder.mkdir(parents=True)
-        write(folder, "v5", gravity_collection(number))
+        write_arrays(folder, "v5", gravity_collection(number))
     read = read_recording(tmp_path)
     assert read.q.shape == (45, 7)
     np.testing.assert_array_equal(read.q[15], gravity_collection(1)["current_position"][:, 0, 0])
@@ -126,12 +99,12 @@ def test_a_folder_of_the_gravity_collection_is_one_recording(tmp_path):
     ],
 )
 def test_ambiguous_and_unsuitable_arrays_are_refused(tmp_path, arrays, names, text):
-    assert_refused(text, read_recording, write(tmp_path, "v5", arrays), arrays=names)
+    assert_refused(text, read_recording, write_arrays(tmp_path, "v5", arrays), arrays=names)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_files_are_refused(tmp_path, kind):
-    path = write(tmp_path, kind, {"q": blocks()[0], "tau": blocks()[2]})
+    path = write_arrays(tmp_path, kind, {"q": blocks()[0], "tau": blocks()[2]})
     content = path.read_bytes()
     for cut in (0, 200, len(content) // 2):
         path.write_bytes(content[:cut])
@@ -141,7 +114,7 @@ def test_damaged_files_are_refused(tmp_path, kind):
 def test_invalid_rows_are_refused_or_skipped(tmp_path):
     q, _, tau = blocks()
     tau[3, 6] = np.inf
-    path = write(tmp_path, "v5", {"q": q, "tau": tau, "t": np.arange(20.0)})
+    path = write_arrays(tmp_path, "v5", {"q": q, "tau": tau, "t": np.arange(20.0)})
     assert_refused(r"row 4: tau7 is inf; only finite .*--skip-invalid .*1 of 20 rows", read_recording, path)
     read = read_recording(path, skip_invalid=True)
     assert 4 not in read.lines and len(read) == 19 and 3.0 not in read.t

@@ -1,11 +1,15 @@
-"""Commands give the same numbers from a ROS bag as from the CSV of the same data."""
+"""Commands give the same numbers from each format as from the CSV of the same data."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from bags import KINDS, joint_states, write_bag
+from array_files import KINDS as ARRAY_KINDS
+from array_files import write_arrays
+from bags import KINDS as BAG_KINDS
+from bags import joint_states, write_bag
+from collector_files import joint_state, write_collection
 from synthetic_motion import clean_motion
 
 from dvrk_drake.analysis.validation import predict
@@ -18,15 +22,24 @@ from dvrk_drake.recordings.recording import Recording, write_recording
 START = 1_700_000_000_000_000_000
 
 
+KINDS = (*BAG_KINDS, *ARRAY_KINDS, "collector")
+
+
 def both(folder, name, arm, kind, recording, topic):
-    """Writes a recording as a CSV and as a bag. Time stamps are rounded to ns in both."""
+    """Writes a recording as a CSV and in another format. Time stamps are rounded to ns in both."""
     stamps = START + np.round(1e9 * (recording.t - recording.t[0])).astype(int)
-    csv = folder / f"{name}.csv"
-    write_recording(Recording(recording.q, recording.tau, recording.qd, 1e-9 * (stamps - stamps[0])), csv)
-    bag_folder = folder / name
-    bag_folder.mkdir()
-    rows = joint_states(stamps, arm.joint_names, recording.q, recording.qd, recording.tau)
-    return str(csv), str(write_bag(bag_folder, kind, {topic: rows}))
+    t, q, qd, tau = 1e-9 * (stamps - stamps[0]), recording.q, recording.qd, recording.tau
+    csv, other = folder / f"{name}.csv", folder / name
+    write_recording(Recording(q, tau, qd, t), csv)
+    other.mkdir()
+    if kind in BAG_KINDS:
+        path = write_bag(other, kind, {topic: joint_states(stamps, arm.joint_names, q, qd, tau)})
+    elif kind in ARRAY_KINDS:
+        path = write_arrays(other, kind, {"q": q, "qd": qd, "tau": tau, "t": t})
+    else:
+        signal = joint_state("kin/measured_js", arm.joint_names, t, q, qd, tau)
+        path = write_collection(other, f"StateDataCollection-{arm.name}-StateTable-2025-10-06", signal)
+    return str(csv), str(path)
 
 
 def poses(arm, seed):
@@ -48,6 +61,9 @@ def numbers(value):
 
 def same_numbers(first, second):
     first, second = (json.loads(path.read_text()) for path in (first, second))
+    for result in (first, second):
+        # The notes describe the file.
+        result["findings"] = [entry for entry in result.get("findings", []) if entry["severity"] != "note"]
     np.testing.assert_allclose(numbers(first), numbers(second), rtol=1e-6, atol=1e-9)
 
 
@@ -59,7 +75,7 @@ def same_models(first, second):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_static_poses_from_a_bag(tmp_path, kind, capsys):
+def test_static_poses(tmp_path, kind, capsys):
     arm = load_arm("mtmr")
     csv, bag = both(tmp_path, "poses", arm, kind, poses(arm, 0), "/MTMR/measured_js")
     other = both(tmp_path, "other", arm, kind, poses(arm, 1), "/lab/MTMR/measured_js")
@@ -100,22 +116,40 @@ def test_unsuitable_options_of_a_bag_give_one_line(tmp_path, options, text, caps
     assert "--topic does not apply" in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.fixture(scope="module")
+def motions():
+    """Returns two motions of a PSM, the second with other efforts."""
+    motion, generator = clean_motion(), np.random.default_rng(3)
+    noise = np.sin(motion.q) + generator.normal(size=motion.q.shape)
+    return motion, replace(motion, tau=motion.tau + 0.02 * np.std(motion.tau, axis=0) * noise)
+
+
+def results(folder, first, second, model):
+    """Runs identify, recalibrate and payload. Returns the identified model and the result of payload."""
+    folder.mkdir()
+    identified, again, payload = (str(folder / name) for name in ("model.yaml", "again.yaml", "payload.json"))
+    model = model or identified
+    assert main(["identify", first, "--arm", "psm", "--output", identified]) == 0
+    assert main(["recalibrate", first, "--model", model, "--output", again]) == 0
+    assert main(["payload", first, second, "--model", model, "--json", payload]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results_from_csv(tmp_path_factory, motions):
+    folder = tmp_path_factory.mktemp("csv")
+    paths = [both(folder, f"motion{k}", load_arm("psm"), "npz", motion, "")[0] for k, motion in enumerate(motions)]
+    return results(folder / "results", *paths, None)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_motion_from_a_bag(tmp_path, kind):
-    arm = load_arm("psm")
-    motion = clean_motion()
-    csv, bag = both(tmp_path, "motion", arm, kind, motion, "/PSM1/measured_js")
-    generator = np.random.default_rng(3)
-    changed = motion.tau + 0.02 * np.std(motion.tau, axis=0) * (
-        np.sin(motion.q) + generator.normal(size=motion.q.shape)
-    )
-    loaded = both(tmp_path, "loaded", arm, kind, replace(motion, tau=changed), "/PSM1/measured_js")
-    for source, with_payload, name in ((csv, loaded[0], "csv"), (bag, loaded[1], "bag")):
-        model, again = tmp_path / f"{name}.yaml", tmp_path / f"{name}_again.yaml"
-        result = str(tmp_path / f"payload_{name}.json")
-        assert main(["identify", source, "--arm", "psm", "--output", str(model)]) == 0
-        assert main(["recalibrate", source, "--model", str(model), "--output", str(again)]) == 0
-        assert main(["payload", source, with_payload, "--model", str(tmp_path / "csv.yaml"), "--json", result]) == 0
-    same_models(tmp_path / "csv.yaml", tmp_path / "bag.yaml")
-    same_numbers(tmp_path / "payload_csv.json", tmp_path / "payload_bag.json")
+@pytest.mark.parametrize("kind", (*BAG_KINDS, "v5"))
+def test_motion(tmp_path, kind, motions, results_from_csv):
+    arm, expected = load_arm("psm"), results_from_csv
+    paths = [
+        both(tmp_path, f"motion{k}", arm, kind, motion, "/PSM1/measured_js")[1] for k, motion in enumerate(motions)
+    ]
+    found = results(tmp_path / "results", *paths, str(expected / "model.yaml"))
+    same_models(expected / "model.yaml", found / "model.yaml")
+    same_models(expected / "again.yaml", found / "again.yaml")
+    same_numbers(expected / "payload.json", found / "payload.json")
