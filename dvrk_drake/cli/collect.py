@@ -21,9 +21,10 @@ _TASK = one_of("Task (one is required)")
 
 @app.command(group=HARDWARE)
 def record(
+    file: Annotated[str, Parameter(metavar="FILE")],
+    /,
     *,
     arm: Arm,
-    output: Annotated[str, Parameter(metavar="FILE")],
     duration: Annotated[Seconds | None, Parameter(metavar="S")] = None,
     lcm_url: LcmUrl = "",
     key: Key = None,
@@ -33,7 +34,7 @@ def record(
     The file contains only complete rows, even after Ctrl-C or an error.
 
     Args:
-        output: New file: .csv for a CSV recording, .log for an LCM log.
+        file: New file: .mcap for a bag that opens in ROS 2 and Foxglove, .csv for a CSV, .log for an LCM log.
         duration: Duration [s], counted from the first status message. Default: until Ctrl-C.
     """
     from dvrk_drake.models.arm import load_arm
@@ -41,12 +42,12 @@ def record(
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.recorder import Recorder
     from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.recordings.recording_stream import check_stream_output
+    from dvrk_drake.recordings.recording_stream import LCM_LOG, check_stream_output
 
     recorded = load_arm(arm)
-    check_stream_output(output)
+    check_stream_output(file, LCM_LOG)
     url = open_lcm(lcm_url).get_lcm_url()
-    recorder = Recorder(recorded, output, url, load_key(key))
+    recorder = Recorder(recorded, file, url, load_key(key))
     line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
     print(f"recording {recorded.name} on LCM {url}; Ctrl-C ends the recording", flush=True)
@@ -54,8 +55,8 @@ def record(
         recorder.run(float("inf") if duration is None else duration, stopped, line.show)
     finally:
         line.clear()
-    print_written(output, f"{recorder.stream.num_used} rows")
-    print_notes(output, recorder.notes())
+    print_written(file, f"{recorder.stream.num_used} rows")
+    print_notes(file, recorder.notes())
 
 
 @app.command(group=HARDWARE)

@@ -42,7 +42,7 @@ RENAMED = {
     "predict": {"": "--model"},
     "recalibrate": {"": "--model"},
     "convert": {"": "--output", "--format": "--input-format"},
-    "record": {"": "--output"},
+    "record": {"--output": "FILE, the first argument"},
     "key": {"": "--output"},
     "identify": {"--tables": "--verbose", "--slow-parts": "--low-speed-segments"},
     "compare-gc": {"--plot": "--plots"},

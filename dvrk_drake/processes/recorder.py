@@ -14,7 +14,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
-from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
+from dvrk_drake.recordings.recording_stream import (
+    LCM_LOG,
+    RecordingFile,
+    check_stream_output,
+    open_recording_file,
+)
 
 #: Longest time until the first status [s]. Time without a status after which the status line reports missing statuses
 #: [s].
@@ -50,7 +55,7 @@ class Recorder:
         Raises:
             RecordingError: A new file cannot be created at `path`.
         """
-        check_stream_output(path)
+        check_stream_output(path, LCM_LOG)
         self.stream = StatusStream(arm.name, arm.num_joints)
         self.num_received = 0
         self.foreign: Counter[str] = Counter()
@@ -94,7 +99,7 @@ class Recorder:
                 show(self.describe)
         finally:
             if self._file is not None:
-                self._file.close()
+                self._file.close(lambda share: show(lambda: f"{self._path}: index {share:.0%}"))
 
     def describe(self) -> str:
         """Returns the text of the status line: the number of rows, the rate, lost messages and the state of the arm."""

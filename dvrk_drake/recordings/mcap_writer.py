@@ -1,4 +1,4 @@
-"""Writes the joint states of an arm to an MCAP bag that ROS 2 tools and Foxglove open.
+"""Writes the joint states of an arm to an MCAP bag that ROS 2 tools and Foxglove open, at once or during a recording.
 
 The bag has the topics of a dVRK with `sensor_msgs/JointState` messages, as `ros_bag` reads them. The format is
 described at https://mcap.dev/spec and https://mcap.dev/spec/registry (profile ros2).
@@ -6,16 +6,19 @@ described at https://mcap.dev/spec and https://mcap.dev/spec/registry (profile r
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.errors import RecordingError
+from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.ros_bag import JOINT_STATE
 
 if TYPE_CHECKING:
@@ -27,6 +30,8 @@ _FIRST_STAMP = 1_000_000_000
 _POSE_INTERVAL = 1.0
 #: Largest header stamp [ns]: the seconds are a signed 32-bit integer.
 _LAST_STAMP = (2**31 - 1) * 1_000_000_000
+#: Messages between two reports of progress.
+_REPORT = 4096
 
 
 class JointStateTopic(NamedTuple):
@@ -57,11 +62,11 @@ def joint_state_topics(arm: Arm, namespace: str | None = None) -> tuple[JointSta
 class McapWriter:
     """Writes JointState messages in the CDR encoding to an MCAP stream."""
 
-    def __init__(self, stream: IO[bytes], topics: tuple[JointStateTopic, ...], *, chunked: bool = True) -> None:
+    def __init__(self, stream: Any, topics: tuple[JointStateTopic, ...], *, chunked: bool = True) -> None:
         """Begins a bag.
 
         Args:
-            stream: Binary stream to write to.
+            stream: Binary stream, or object with its methods write and tell.
             topics: Topics of the bag.
             chunked: Whether to compress and index the messages in chunks. If False, each message is written at once.
         """
@@ -100,7 +105,12 @@ class McapWriter:
             stamp: Header stamp, and time of publication [ns].
             q, qd, tau: Positions, velocities and efforts (n,) of all joints of the arm. None: not in the message.
             log_time: Time of arrival [ns]. Default: `stamp`.
+
+        Raises:
+            RecordingError: The stamp is 0, negative or too large.
         """
+        if not 0 < stamp <= _LAST_STAMP:
+            raise RecordingError(f"a measurement at {stamp / 1e9:g} s; header stamps are above 0, up to 2147483647 s")
         empty = np.empty(0)
         message = self._state(
             header=self._header(stamp=self._time(*divmod(stamp, 1_000_000_000)), frame_id=""),
@@ -121,6 +131,84 @@ class McapWriter:
     def finish(self) -> None:
         """Writes the index and the end of the bag. The stream remains open."""
         self._writer.finish()
+
+
+class GrowingMcap(McapWriter):
+    """Bag of a running recording. After each message, the file contains it.
+
+    If the process is terminated, the end of the bag is missing. `mcap recover` then restores all complete messages.
+    """
+
+    def __init__(self, path: str | Path, topics: tuple[JointStateTopic, ...]) -> None:
+        """Creates the file.
+
+        Raises:
+            RecordingError: The file exists or cannot be written.
+        """
+        self._path, self._file = path, GrowingFile(path)
+        super().__init__(_Records(self._file), topics, chunked=False)
+
+    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
+        """Ends the bag, and groups its messages in compressed chunks with an index, which takes 10 us per message.
+
+        Args:
+            progress: Callback that receives the completed share 0..1.
+
+        Raises:
+            RecordingError: The end or the index cannot be written. The file contains all complete messages.
+        """
+        try:
+            self.finish()
+        finally:
+            self._file.close()
+        try:
+            _pack(self._path, progress)
+        except DvrkDrakeError as error:
+            raise RecordingError(f"{self._path} is complete, but has no index: {error}") from error
+
+
+class _Records:
+    """Stream of a `Writer` that appends each record to a file by one write."""
+
+    def __init__(self, file: GrowingFile) -> None:
+        self._file, self._size = file, 0
+
+    def write(self, data: bytes) -> None:
+        if data:
+            self._file.append(data)
+            self._size += len(data)
+
+    def tell(self) -> int:
+        return self._size
+
+
+def _pack(path: str | Path, progress: Callable[[float], object]) -> None:
+    """Replaces a bag without chunks by one with compressed chunks and an index, atomically."""
+    from mcap.records import Channel, Header, Message, Schema
+    from mcap.stream_reader import StreamReader
+    from mcap.writer import Writer
+
+    with open(path, "rb") as source, atomic_write(path, "wb") as stream:
+        writer, size, count = Writer(stream), os.path.getsize(path), 0
+        seen: set[tuple[type, int]] = set()
+        for record in StreamReader(source).records:
+            if isinstance(record, Header):
+                writer.start(record.profile, record.library)
+            elif isinstance(record, Message):
+                writer.add_message(
+                    record.channel_id, record.log_time, record.data, record.publish_time, record.sequence
+                )
+                count += 1
+                if count % _REPORT == 0:
+                    progress(source.tell() / size)
+            # The end of a bag repeats its schemas and channels.
+            elif isinstance(record, (Schema, Channel)) and (type(record), record.id) not in seen:
+                seen.add((type(record), record.id))
+                if isinstance(record, Schema):
+                    writer.register_schema(record.name, record.encoding, record.data)
+                else:
+                    writer.register_channel(record.topic, record.message_encoding, record.schema_id, record.metadata)
+        writer.finish()
 
 
 def write_mcap(recording: Recording, path: str | Path, arm: Arm) -> None:
