@@ -7,7 +7,7 @@ described at https://mcap.dev/spec and https://mcap.dev/spec/registry (profile r
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -62,12 +62,12 @@ def joint_state_topics(arm: Arm, namespace: str | None = None) -> tuple[JointSta
 class McapWriter:
     """Writes JointState messages in the CDR encoding to an MCAP stream."""
 
-    def __init__(self, stream: Any, topics: tuple[JointStateTopic, ...], *, chunked: bool = True) -> None:
+    def __init__(self, stream: Any, topics: Iterable[str], *, chunked: bool = True) -> None:
         """Begins a bag.
 
         Args:
             stream: Binary stream, or object with its methods write and tell.
-            topics: Topics of the bag.
+            topics: Names of the topics of the bag.
             chunked: Whether to compress and index the messages in chunks. If False, each message is written at once.
         """
         # These imports take 0.2 s, and most commands write no bag.
@@ -84,9 +84,7 @@ class McapWriter:
         self._writer.start(Profile.ROS2, f"dvrk-drake {version('dvrk-drake')}")
         definition, _ = store.generate_msgdef(JOINT_STATE, ros_version=2)
         schema = self._writer.register_schema(JOINT_STATE, SchemaEncoding.ROS2, definition.encode())
-        self._channels = {
-            topic.name: self._writer.register_channel(topic.name, MessageEncoding.CDR, schema) for topic in topics
-        }
+        self._channels = {topic: self._writer.register_channel(topic, MessageEncoding.CDR, schema) for topic in topics}
         self._counts = dict.fromkeys(self._channels, 0)
 
     def write(
@@ -139,7 +137,7 @@ class GrowingMcap(McapWriter):
     If the process is terminated, the end of the bag is missing. `mcap recover` then restores all complete messages.
     """
 
-    def __init__(self, path: str | Path, topics: tuple[JointStateTopic, ...]) -> None:
+    def __init__(self, path: str | Path, topics: Iterable[str]) -> None:
         """Creates the file.
 
         Raises:
@@ -230,7 +228,7 @@ def write_mcap(recording: Recording, path: str | Path, arm: Arm) -> None:
     stamps = _stamps(joints, path)
     topics = joint_state_topics(arm)
     with atomic_write(path, "wb") as stream:
-        writer = McapWriter(stream, topics)
+        writer = McapWriter(stream, [topic.name for topic in topics])
         for row, stamp in enumerate(stamps):
             q, qd, tau = (None if part is None else part[row] for part in (joints.q, joints.qd, joints.tau))
             assert q is not None

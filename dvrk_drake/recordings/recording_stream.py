@@ -48,20 +48,20 @@ class RecordingFile(Protocol):
         """Completes and closes the file. `progress` receives the completed share 0..1."""
 
 
-def check_stream_output(path: str | Path, *other: str) -> None:
+def check_stream_output(path: str | Path, accepted: tuple[str, ...] = (".csv", ".mcap", LCM_LOG)) -> None:
     """Checks that a recording can be created at a path.
 
     Args:
         path: Path of the recording.
-        other: Accepted endings of the file name besides .csv and .mcap.
+        accepted: Accepted endings of the file name.
 
     Raises:
         RecordingError: The file exists, its folder does not exist or is not writable, or the ending of the file name is
             not accepted.
     """
     path = Path(path)
-    if path.suffix not in (accepted := (".csv", ".mcap", *other)):
-        raise RecordingError(f"{path}: the file name must end in {', '.join(accepted[:-1])} or {accepted[-1]}")
+    if path.suffix not in accepted:
+        raise RecordingError(f"{path}: the file name must end in {' or '.join(accepted)}")
     if os.path.lexists(path):
         raise RecordingError(f"{path} already exists, and a recording is never overwritten. Choose another file.")
     if not path.parent.is_dir():
@@ -81,7 +81,7 @@ def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> Rec
     Raises:
         RecordingError: See `check_stream_output`; additionally if the file cannot be written.
     """
-    check_stream_output(path, LCM_LOG)
+    check_stream_output(path)
     suffix = Path(path).suffix
     if suffix == LCM_LOG:
         return _LogFile(path, status_channel(arm))
@@ -120,7 +120,7 @@ class _McapFile:
 
     def __init__(self, path: str | Path, arm: Arm) -> None:
         self._topics = joint_state_topics(arm)
-        self._bag = GrowingMcap(path, self._topics)
+        self._bag = GrowingMcap(path, [topic.name for topic in self._topics])
 
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         if status is not None:
