@@ -317,7 +317,7 @@ COMMANDS = {
     "run --arm mtml --model mtml.yaml --mode hold --gains gains.yaml": ("mtml.yaml", "gains.yaml"),
     "collect --arm psm --poses poses.yaml --output collection.csv": ("poses.yaml", "collection.csv"),
     "collect --arm psm --poses poses.yaml --random 2": ("poses.yaml",),
-    "record --arm arm.yaml --output out.csv": ("arm.yaml",),
+    "record out.csv --arm arm.yaml": ("arm.yaml",),
     "reproduce fig4 --data . --folder out": ("mtm_2015_good72.csv",),
 }
 

@@ -1,4 +1,4 @@
-"""Commands that record an arm over LCM: record and collect."""
+"""Commands that record an arm: record and collect."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of, whole_number
 from dvrk_drake.cli.lcm import ControlledArm, ready_controller
 from dvrk_drake.cli.support import check_output, interrupt_ends_process, load_key, print_notes, print_written
-from dvrk_drake.errors import CollectionError
+from dvrk_drake.errors import CollectionError, RecordingError
 
 if TYPE_CHECKING:
     from dvrk_drake.processes.live_status import LiveLine
@@ -21,41 +21,56 @@ _TASK = one_of("Task (one is required)")
 
 @app.command(group=HARDWARE)
 def record(
+    file: Annotated[str, Parameter(metavar="FILE")],
+    /,
     *,
     arm: Arm,
-    output: Annotated[str, Parameter(metavar="FILE")],
     duration: Annotated[Seconds | None, Parameter(metavar="S")] = None,
     lcm_url: LcmUrl = "",
     key: Key = None,
+    ros: Annotated[bool, Parameter(show_default=False)] = False,
+    topic: Annotated[str | None, Parameter(metavar="TOPIC")] = None,
+    domain: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
 ) -> None:
-    """Record the measurements of an arm over LCM.
+    """Record the measurements of an arm over LCM or ROS 2.
 
     The file contains only complete rows, even after Ctrl-C or an error.
 
     Args:
-        output: New file: .csv for a CSV recording, .log for an LCM log.
-        duration: Duration [s], counted from the first status message. Default: until Ctrl-C.
+        file: New file: .mcap for a bag that opens in ROS 2 and Foxglove, .csv for a CSV, .log for an LCM log.
+        duration: Duration [s], counted from the first message. Default: until Ctrl-C.
+        ros: Record the JointState messages of a dVRK over ROS 2 instead of LCM, to an .mcap bag.
+        topic: With --ros: JointState topic or its namespace. Default: measured_js of the arm.
+        domain: With --ros: ROS domain. Default: $ROS_DOMAIN_ID, or else 0.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.recorder import Recorder
+    from dvrk_drake.processes.ros_recorder import RosRecorder
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.recordings.recording_stream import check_stream_output
 
+    if ros and (lcm_url or key):
+        raise RecordingError("--lcm-url and --key do not apply to --ros")
+    if not ros and (topic is not None or domain is not None):
+        raise RecordingError("--topic and --domain require --ros")
     recorded = load_arm(arm)
-    check_stream_output(output)
-    url = open_lcm(lcm_url).get_lcm_url()
-    recorder = Recorder(recorded, output, url, load_key(key))
+    recorder: Recorder | RosRecorder
+    if ros:
+        recorder = RosRecorder(recorded, file, topic, domain)
+    else:
+        check_stream_output(file)
+        recorder = Recorder(recorded, file, open_lcm(lcm_url).get_lcm_url(), load_key(key))
     line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
-    print(f"recording {recorded.name} on LCM {url}; Ctrl-C ends the recording", flush=True)
+    print(f"recording {recorded.name} on {recorder.source}; Ctrl-C ends the recording", flush=True)
     try:
         recorder.run(float("inf") if duration is None else duration, stopped, line.show)
     finally:
         line.clear()
-    print_written(output, f"{recorder.stream.num_used} rows")
-    print_notes(output, recorder.notes())
+    print_written(file, f"{recorder.num_rows} rows")
+    print_notes(file, recorder.notes())
 
 
 @app.command(group=HARDWARE)

@@ -46,7 +46,7 @@ RENAMED = {
         "--variable": "--arrays poses=NAME",
         "--input-format": "--coordinates wpi for wpi-csv files, and not needed for other formats",
     },
-    "record": {"": "--output"},
+    "record": {"--output": "FILE, the first argument"},
     "key": {"": "--output"},
     "identify": {"--tables": "--verbose", "--slow-parts": "--low-speed-segments"},
     "compare-gc": {"--plot": "--plots"},

@@ -65,16 +65,16 @@ def convert(
     recording: Recording,
     /,
     *,
-    output: Annotated[str, Parameter(metavar="FILE.csv")],
+    output: Annotated[str, Parameter(metavar="FILE")],
     file: FileOptions = _FILE,
     arm: Annotated[str | None, Parameter(metavar="ARM")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Convert a recording to a CSV with a header.
+    """Convert a recording to a CSV with a header, or to an MCAP bag.
 
     Args:
-        output: CSV file to write.
-        arm: Convert to joint coordinates of this arm. Required for a ROS bag, where it selects the topic.
+        output: File to write: .csv, or .mcap for ROS 2 tools and Foxglove.
+        arm: Convert to joint coordinates of this arm. Required to read or write a bag.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording
 

@@ -31,7 +31,7 @@ def simulate(
         Parameter(group=_SCENARIO, help="Regulate this arm at its home position."),
     ] = None,
     set: Set = None,
-    output: Annotated[str | None, Parameter(metavar="RECORDING.csv")] = None,
+    output: Annotated[str | None, Parameter(metavar="RECORDING")] = None,
     plots: Plots = None,
     meshcat: Annotated[bool, Parameter(show_default=False)] = False,
     overwrite: Overwrite = False,
@@ -41,7 +41,7 @@ def simulate(
 
     Args:
         scenario: YAML file with the arm, controller, motion and simulated effects.
-        output: CSV file to write, with t [s], and q, qd and tau of all joints [rad, m, N m, N].
+        output: File to write: a CSV with t [s], and q, qd and tau of all joints [rad, m, N m, N], or an .mcap bag.
         meshcat: Show the simulation in a web browser, in real time.
     """
     from dvrk_drake.models.arm import known_arms
@@ -63,7 +63,7 @@ def simulate(
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
     argument = (scenario or f"--arm {arm}") if folder is None else None
     if output is not None:
-        dvrk.write_recording(simulation.recording, output)
+        dvrk.write_recording(simulation.recording, output, loaded.mounted_arm)
     print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=argument, verbose=verbose)
     if output is not None:
         print_written(output, f"{len(simulation.recording)} rows")

@@ -76,6 +76,8 @@ class Arm:
         identification: Settings for recordings of the arm, and bounds of the mass distribution of the links.
         effects: Friction, cable and sensor effects of the real arm. A simulation includes only those that are named in
             `simulated_effects`.
+        separate_joint: Name of the joint that the dVRK publishes on ROS topics of its own, e.g. "jaw"; "" if there is
+            none.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -107,6 +109,7 @@ class Arm:
     friction_coordinates: dict[str, NDArray[np.float64]] = field(metadata=COUPLINGS)
     identification: IdentificationSettings
     effects: ArmEffects
+    separate_joint: str = ""
 
     def __post_init__(self) -> None:
         self.check()
@@ -377,6 +380,8 @@ def _build_arm(
     position_limits = {**instrument.position_limits, **description.position_limits}
     if set(joints) != set(position_limits):
         raise ArmError(f"{path}: position_limits must have one entry for each of {', '.join(mechanism.joints)}")
+    if (separate := instrument.separate_joint) and separate not in instrument.joints:
+        raise ArmError(f'{path}: separate_joint is "{separate}"; allowed: {", ".join(instrument.joints)}')
     if missing := set(joints) - set(facts.joint_names):
         raise ArmError(f"{path}: the SDF has no joint {', '.join(sorted(missing))}")
     limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
@@ -411,6 +416,7 @@ def _build_arm(
         },
         identification=_identification_settings(path, mechanism, instrument),
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
+        separate_joint=instrument.separate_joint,
     )
 
 

@@ -152,10 +152,12 @@ class Instrument:
     `joint_from_actuator` is the disc coupling as defined by the dVRK: joint position = sum of coefficient * actuator
     position. `friction_coordinates` are additional coordinates along which friction acts, besides joints and actuators.
     Each name is mapped to the joint coefficients of its coordinate: coordinate = sum of coefficient * joint position.
+    `separate_joint` is the joint that the dVRK publishes on topics of its own, `/<ARM>/<joint>/...`, if there is one.
     """
 
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
+    separate_joint: str = ""
     joint_from_actuator: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
     position_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     gains: Gains = field(default_factory=Gains)

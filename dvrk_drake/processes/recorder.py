@@ -14,7 +14,11 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
-from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
+from dvrk_drake.recordings.recording_stream import (
+    RecordingFile,
+    check_stream_output,
+    open_recording_file,
+)
 
 #: Longest time until the first status [s]. Time without a status after which the status line reports missing statuses
 #: [s].
@@ -29,10 +33,29 @@ _FOREIGN = (StatusFilter.OTHER_SESSION, StatusFilter.JUMP, StatusFilter.NOT_AUTH
 _POLL = 0.1
 
 
+class Rate:
+    """Number of messages in the last second."""
+
+    def __init__(self) -> None:
+        """Creates a counter without messages."""
+        self._arrivals: deque[float] = deque()
+
+    def add(self, now: float) -> None:
+        """Counts a message that arrives at the time `now` [s]."""
+        self._arrivals.append(now)
+
+    def per_second(self, now: float) -> int | None:
+        """Returns the number of messages since `now` - 1 s, or None if the last message is older than `SILENCE`."""
+        while self._arrivals and self._arrivals[0] < now - 1:
+            self._arrivals.popleft()
+        return len(self._arrivals) if self._arrivals and self._arrivals[-1] >= now - SILENCE else None
+
+
 class Recorder:
     """Appends every status of one arm to a new file in real time.
 
     Attributes:
+        source: Network and its URL, for messages.
         stream: Filter that counts accepted and rejected statuses.
         num_received: Number of messages on the arm's status channel.
         foreign: Number of messages that do not belong to the arm's session and were not recorded, for each reason.
@@ -51,6 +74,7 @@ class Recorder:
             RecordingError: A new file cannot be created at `path`.
         """
         check_stream_output(path)
+        self.source = f"LCM {url}"
         self.stream = StatusStream(arm.name, arm.num_joints)
         self.num_received = 0
         self.foreign: Counter[str] = Counter()
@@ -59,11 +83,16 @@ class Recorder:
         self._channel = status_channel(arm)
         self._file: RecordingFile | None = None
         self._other_channels: Counter[str] = Counter()
-        self._arrivals: deque[float] = deque()
+        self._rate = Rate()
         self._lcm = lcm.LCM(url)
         # The subscription includes all arms, so that an error message can list the channels with messages.
         self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._receive)
         self._subscription.set_queue_capacity(_QUEUE)
+
+    @property
+    def num_rows(self) -> int:
+        """Number of recorded measurements."""
+        return self.stream.num_used
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
         """Records until `stopped` returns true, or until `duration` has elapsed since the first status.
@@ -94,21 +123,18 @@ class Recorder:
                 show(self.describe)
         finally:
             if self._file is not None:
-                self._file.close()
+                self._file.close(lambda share: show(lambda: f"{self._path}: index {share:.0%}"))
 
     def describe(self) -> str:
         """Returns the text of the status line: the number of rows, the rate, lost messages and the state of the arm."""
-        now = time.monotonic()
-        while self._arrivals and self._arrivals[0] < now - 1:
-            self._arrivals.popleft()
-        status = self.stream.last
+        status, rate = self.stream.last, self._rate.per_second(time.monotonic())
         if status is None:
             return f"waiting for {self._channel}"
-        if not self._arrivals or self._arrivals[-1] < now - SILENCE:
+        if rate is None:
             return f"{self._arm.name}: no more statuses; {self.stream.num_used} rows"
         parts = [
             f"{self._arm.name}: {self.stream.num_used} rows",
-            f"{len(self._arrivals)} Hz",
+            f"{rate} Hz",
             f"{self.stream.num_lost} lost",
             describe_state(status.guard_state, status.fault_text),
         ]
@@ -129,7 +155,7 @@ class Recorder:
         if reason in _FOREIGN:
             self.foreign[reason] += 1
             return
-        self._arrivals.append(now)
+        self._rate.add(now)
         status = self.stream.accept(data)
         if self._file is None:
             if self.stream.last is None:

@@ -1,4 +1,4 @@
-"""Writes recordings of all formats as CSV, with notes on properties of the data."""
+"""Writes recordings of all formats as CSV or MCAP, with notes on properties of the data."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def convert(
     skip_invalid: bool = False,
     progress: Progress | None = None,
 ) -> Recording:
-    """Reads a recording and writes it as a CSV for `read_recording`, atomically and with full precision.
+    """Reads a recording and writes it as a CSV or an MCAP bag for `read_recording`, atomically and with full precision.
 
     Args:
         path: Path of the recording.
-        output: Path of the CSV to write; an existing file is replaced.
+        output: Path of the file to write: .mcap for a bag, anything else for a CSV. An existing file is replaced.
         arm: The data are written in the joint coordinates of this arm. If None, they are written in the coordinates of
-            the recording. A ROS bag and a file of the cisst collector require the arm.
+            the recording. An MCAP bag, and reading a ROS bag or a file of the cisst collector, require the arm.
         coordinates, topic, arrays, rate, skip_invalid, progress: See `read_recording`.
 
     Returns:
@@ -60,7 +60,7 @@ def convert(
     if arm is not None:
         recording = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
-    write_recording(recording, output)
+    write_recording(recording, output, arm)
     return dataclasses.replace(recording, notes=(*recording.notes, *_properties(recording)))
 
 

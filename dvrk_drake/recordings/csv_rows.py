@@ -312,10 +312,11 @@ class GrowingFile:
             ) from error
         if written != len(row):
             self._file.truncate(end)
+            self._file.seek(end)
             raise RecordingError(
                 f"{self._path} cannot be written: no space left. The file ends with its last complete row."
             )
 
-    def close(self) -> None:
-        """Closes the file."""
+    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
+        """Closes the file, which is complete already: `progress` is not called."""
         self._file.close()

@@ -244,14 +244,16 @@ def column_names(prefix: str, num_joints: int) -> list[str]:
     return ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
 
 
-def write_recording(recording: Recording, path: str | Path) -> None:
-    """Writes a CSV for `read_recording`, atomically and with full precision.
+def write_recording(recording: Recording, path: str | Path, arm: Arm | None = None) -> None:
+    """Writes a CSV, or an MCAP bag for ROS 2 and Foxglove, for `read_recording`, atomically and with full precision.
 
     Args:
-        recording: Recording in the coordinates to write. A CSV does not state the coordinates.
-        path: Path of the file; an existing file is replaced.
+        recording: Recording to write. A CSV does not state the coordinates. A bag is in joint coordinates.
+        path: Path of the file: .mcap for a bag, anything else for a CSV. An existing file is replaced.
+        arm: Arm whose joints are named in a bag; not needed for a CSV. See `write_mcap` for the times in a bag.
 
     Raises:
+        RecordingError: The recording cannot be written as a bag, see `write_mcap`, or `arm` is missing.
         DvrkDrakeError: The folder does not exist or cannot be written.
 
     Example:
@@ -260,6 +262,13 @@ def write_recording(recording: Recording, path: str | Path) -> None:
         >>> open("positions.csv").readline().rstrip()
         't,q1,q2,q3,q4,q5,q6,q7'
     """
+    if Path(path).suffix == ".mcap":
+        from dvrk_drake.recordings.mcap_writer import write_mcap
+
+        if arm is None:
+            raise RecordingError(f"{path}: an MCAP bag needs the arm whose joints it names: --arm (arm= in Python)")
+        write_mcap(recording, path, arm)
+        return
     columns, header = [], []
     for prefix, block in (
         ("t", recording.t),

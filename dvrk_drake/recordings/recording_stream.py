@@ -1,4 +1,4 @@
-"""Writes the statuses of an arm to a CSV or an LCM log while they are received.
+"""Writes the statuses of an arm to a CSV, an MCAP bag or an LCM log while they are received.
 
 If the process is terminated, the file ends with the last complete row. The last rows before a power failure may be
 lost.
@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
+
+import numpy as np
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
@@ -17,8 +20,11 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
+from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
 from dvrk_drake.recordings.recording import column_names
 
+#: Ending of the file name of an LCM log.
+LCM_LOG = ".log"
 #: Additional columns of a CSV, after the columns of a Recording. They identify the status of each row.
 _ORIGIN = ("utime", "sequence", "guard_state")
 
@@ -38,20 +44,24 @@ class RecordingFile(Protocol):
             RecordingError: The file can no longer be written; it ends with its last complete row.
         """
 
-    def close(self) -> None:
-        """Closes the file."""
+    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
+        """Completes and closes the file. `progress` receives the completed share 0..1."""
 
 
-def check_stream_output(path: str | Path) -> None:
+def check_stream_output(path: str | Path, accepted: tuple[str, ...] = (".csv", ".mcap", LCM_LOG)) -> None:
     """Checks that a recording can be created at a path.
 
+    Args:
+        path: Path of the recording.
+        accepted: Accepted endings of the file name.
+
     Raises:
-        RecordingError: The file exists, its folder does not exist or is not writable, or the file name ends in neither
-            .csv nor .log.
+        RecordingError: The file exists, its folder does not exist or is not writable, or the ending of the file name is
+            not accepted.
     """
     path = Path(path)
-    if path.suffix not in (".csv", ".log"):
-        raise RecordingError(f"{path}: the file name must end in .csv or .log (LCM log)")
+    if path.suffix not in accepted:
+        raise RecordingError(f"{path}: the file name must end in {' or '.join(accepted)}")
     if os.path.lexists(path):
         raise RecordingError(f"{path} already exists, and a recording is never overwritten. Choose another file.")
     if not path.parent.is_dir():
@@ -64,13 +74,18 @@ def check_stream_output(path: str | Path) -> None:
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:
-    """Creates the file at `path`. A .csv contains the statuses that `stream` accepts. A .log contains all messages.
+    """Creates the file at `path`.
+
+    A .csv and an .mcap bag contain the statuses that `stream` accepts. A .log contains all messages.
 
     Raises:
         RecordingError: See `check_stream_output`; additionally if the file cannot be written.
     """
     check_stream_output(path)
-    return _CsvFile(path, stream) if Path(path).suffix == ".csv" else _LogFile(path, status_channel(arm))
+    suffix = Path(path).suffix
+    if suffix == LCM_LOG:
+        return _LogFile(path, status_channel(arm))
+    return _CsvFile(path, stream) if suffix == ".csv" else _McapFile(path, arm)
 
 
 class _CsvFile(GrowingFile):
@@ -98,3 +113,20 @@ class _LogFile(GrowingFile):
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         self.append(event_bytes(LcmEvent(self._number, utime, self._channel, data)))
         self._number += 1
+
+
+class _McapFile:
+    """Bag with the JointState messages of a dVRK. The header stamps are the times of the measurements."""
+
+    def __init__(self, path: str | Path, arm: Arm) -> None:
+        self._topics = joint_state_topics(arm)
+        self._bag = GrowingMcap(path, [topic.name for topic in self._topics])
+
+    def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
+        if status is not None:
+            q, qd, tau = np.array(measurements(status)).reshape(3, -1)
+            for topic in self._topics:
+                self._bag.write(topic, 1000 * status.utime, q, qd, tau, 1000 * utime)
+
+    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
+        self._bag.close(progress)

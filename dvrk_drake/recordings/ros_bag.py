@@ -12,7 +12,7 @@ import hashlib
 import math
 import re
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -67,7 +67,8 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
     reader = _Bag(path)
     with reader:
         connections = reader.joint_state_topics()
-        name = _choose_topic(path, arm, options.topic, connections)
+        listed = {name: f"{name} ({connections[name].msgcount})" for name in connections}
+        name = choose_topic(path, arm, options.topic, listed)
         jaw = name.rpartition("/")[0] + "/jaw/measured_js"
         has_jaw = jaw in connections
         share = connections[name].msgcount + (connections[jaw].msgcount if has_jaw else 0)
@@ -166,25 +167,39 @@ class _Connections(NamedTuple):
         return sum(connection.msgcount for connection in self.connections)
 
 
-def _choose_topic(path: Path, arm: Arm, topic: str | None, topics: dict[str, _Connections]) -> str:
-    listed = ", ".join(f"{name} ({topics[name].msgcount})" for name in topics) or "none"
-    available = f"Topics with JointState messages: {listed}."
+def fitting_topics(arm: Arm, topic: str | None, names: Iterable[str]) -> list[str]:
+    """Returns the JointState topics that fit an arm or the topic or namespace `topic`, see `read_joint_states`."""
     if topic is not None:
-        for name in (topic, f"{topic.rstrip('/')}/measured_js"):
-            if name in topics:
-                return name
-        raise RecordingError(f"{path}: has no JointState topic {topic}. {available}")
+        return [name for name in (topic, f"{topic.rstrip('/')}/measured_js") if name in names][:1]
     pattern = re.compile(rf"(/.*)?/{re.escape(arm.name)}[0-9]*/measured_js")
-    fitting = [name for name in topics if pattern.fullmatch(name)]
+    return [name for name in names if pattern.fullmatch(name)]
+
+
+def choose_topic(source: str | Path, arm: Arm, topic: str | None, topics: Mapping[str, str]) -> str:
+    """Returns the only JointState topic that fits, see `fitting_topics`.
+
+    Args:
+        source: Bag or network with the topics, for messages.
+        arm: Arm whose joints are read.
+        topic: Topic or its namespace. None: the topic of the arm.
+        topics: Text for messages for each topic.
+
+    Raises:
+        RecordingError: No topic fits, or several topics.
+    """
+    fitting = fitting_topics(arm, topic, topics)
     if len(fitting) == 1:
         return fitting[0]
+    available = f"Topics with JointState messages: {', '.join(topics.values()) or 'none'}."
+    if topic is not None:
+        raise RecordingError(f"{source}: has no JointState topic {topic}. {available}")
     if fitting:
         raise RecordingError(
-            f"{path}: several topics fit {arm.name}: {', '.join(fitting)}. Choose one with --topic TOPIC "
+            f"{source}: several topics fit {arm.name}: {', '.join(fitting)}. Choose one with --topic TOPIC "
             "(topic= in Python)."
         )
     raise RecordingError(
-        f"{path}: has no topic /{arm.name}/measured_js. {available} Choose one with --topic TOPIC (topic= in Python)."
+        f"{source}: has no topic /{arm.name}/measured_js. {available} Choose one with --topic TOPIC (topic= in Python)."
     )
 
 

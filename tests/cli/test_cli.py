@@ -188,7 +188,7 @@ WRITE_A_FILE = [
     "transparency --arm mtml --output",
     "teleop --output",
     "key --output",
-    "record --arm mtml --lcm-url memq:// --output",
+    "record --arm mtml --lcm-url memq://",
 ]
 #: Commands that never replace a file.
 KEEP_ALWAYS = ("key", "record")

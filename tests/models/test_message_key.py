@@ -81,7 +81,7 @@ def test_invalid_keys_are_refused_in_one_line(tmp_path, content, mode, message, 
     for command in (
         ["run", "--arm", "mtml"],
         ["arm", "--arm", "mtml"],
-        ["record", "--arm", "mtml", "--output", str(tmp_path / "a.csv")],
+        ["record", str(tmp_path / "a.csv"), "--arm", "mtml"],
     ):
         assert main([*command, "--key", str(path), "--lcm-url", "memq://"]) == 2
         said = capsys.readouterr().err

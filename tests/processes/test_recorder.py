@@ -13,7 +13,7 @@ from dvrk_drake.recordings.reading import read_recording
 KEY = MessageKey(bytes(range(32)))
 
 
-@pytest.fixture(params=[".csv", ".log"])
+@pytest.fixture(params=[".csv", ".log", ".mcap"])
 def recorder(request, tmp_path, monkeypatch):
     """Returns a factory of recorders with a function `receive` for a message and its time of arrival [s]."""
     clock = SimpleNamespace(now=100.0)
@@ -33,12 +33,17 @@ def recorder(request, tmp_path, monkeypatch):
     return make
 
 
+def recording_of(recorder):
+    recorder._file.close()
+    return read_recording(recorder.path, ARM)
+
+
 def test_first_of_two_arms_with_one_name_is_recorded(recorder):
     made = recorder()
     for k, (first, second) in enumerate(zip(statuses(50), statuses(50, session_id=5), strict=True)):
         made.receive(first, 1e-3 * k)
         made.receive(second, 1e-3 * k)
-    assert len(read_recording(made.path, ARM)) == 50
+    assert len(recording_of(made)) == 50
     assert made.notes() == ["messages not recorded, of another session: 50"]
 
 
@@ -51,7 +56,7 @@ def test_spoofed_status_does_not_end_recording(recorder, field):
             (spoofed,) = statuses(1, sequence=status.sequence + 1, utime=status.utime + 500)
             setattr(spoofed, field, 2**62)
             made.receive(spoofed, 1e-3 * k)
-    assert len(read_recording(made.path, ARM)) == 50
+    assert len(recording_of(made)) == 50
     assert sum(made.foreign.values()) == 1
 
 
@@ -63,7 +68,7 @@ def test_restarted_arm_is_recorded_after_one_second(recorder, silence, rows):
     for k, status in enumerate(messages[20:]):
         status.session_id = 78
         made.receive(status, 0.019 + silence + 1e-3 * k)
-    assert len(read_recording(made.path, ARM)) == rows
+    assert len(recording_of(made)) == rows
     assert made.foreign.total() == 40 - rows
 
 
@@ -72,5 +77,5 @@ def test_key_accepts_only_signed_statuses(recorder):
     for k, status in enumerate(statuses(50)):
         made.receive(status, 1e-3 * k)
         made.receive(KEY.sign(status.encode()), 1e-3 * k)
-    assert len(read_recording(made.path, ARM)) == 50
+    assert len(recording_of(made)) == 50
     assert made.notes() == ["messages not recorded, not signed with this key: 50"]

@@ -1,10 +1,15 @@
 """Tests LCM logs as recordings: values, notes on omitted messages, and damaged logs."""
 
+import contextlib
 import resource
 
 import lcm
 import numpy as np
 import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from static_poses import motion_with_pauses
 from status_logs import ARM, START, N, log_bytes, statuses
 
@@ -269,12 +274,58 @@ def test_file_is_complete_after_each_message(tmp_path, suffix):
 
 
 def test_unwritable_outputs_are_refused(tmp_path):
-    for name, message in {"a.txt": r"must end in \.csv or \.log", "no/a.csv": "its folder does not exist"}.items():
+    for name, message in {
+        "a.txt": r"must end in \.csv, \.mcap or \.log",
+        "no/a.csv": "its folder does not exist",
+    }.items():
         with pytest.raises(RecordingError, match=message):
             open_recording_file(tmp_path / name, ARM, StatusStream("MTML", N))
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".log"])
+def messages_in(path):
+    """Returns the number of complete messages of a bag that may have no end."""
+    count = 0
+    with path.open("rb") as file, contextlib.suppress(EndOfFile):
+        for record in StreamReader(file).records:
+            count += isinstance(record, Message)
+    return count
+
+
+def test_bag_grows_by_messages_and_has_an_index_at_the_end(tmp_path):
+    stream, path, messages = StatusStream("MTML", N), tmp_path / "a.mcap", changed(7, guard_state=Status.STATE_OFF)
+    file = open_recording_file(path, ARM, stream)
+    for k, message in enumerate(messages):
+        data = message.encode()
+        file.write(data, message.utime + 500, stream.accept(data))
+        assert messages_in(path) == sum(m.guard_state != Status.STATE_OFF for m in messages[: k + 1])
+    killed = tmp_path / "killed.mcap"
+    killed.write_bytes(path.read_bytes()[:-3])
+    shares = []
+    file.close(shares.append)
+    used = [m for m in messages if m.guard_state]
+    assert_same_numbers(read_recording(path, ARM), used)
+    with path.open("rb") as bag:
+        reader = make_reader(bag, validate_crcs=True)
+        assert len(reader.get_summary().chunk_indexes) == 1
+        logged = [(message.publish_time, message.log_time) for _, _, message in reader.iter_messages()]
+    assert logged == [(1000 * m.utime, 1000 * m.utime + 500_000) for m in used]
+    assert messages_in(killed) == len(used) - 1
+    with pytest.raises(
+        RecordingError, match=r"killed\.mcap: the bag cannot be read .* `mcap recover` can repair it\.$"
+    ):
+        read_recording(killed, ARM)
+
+
+def test_time_that_ros_cannot_represent_is_refused(tmp_path):
+    stream = StatusStream("MTML", N)
+    file = open_recording_file(tmp_path / "a.mcap", ARM, stream)
+    (message,) = statuses(1, utime=0)
+    with pytest.raises(RecordingError, match="header stamps are above 0"):
+        file.write(message.encode(), 1, stream.accept(message.encode()))
+    file.close()
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".log", ".mcap"])
 def test_full_disk_ends_the_file_with_a_complete_row(tmp_path, suffix):
     stream = StatusStream("MTML", N)
     path = tmp_path / f"a{suffix}"

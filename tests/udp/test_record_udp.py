@@ -1,7 +1,9 @@
 """`dvrk-drake record` beside LCM's own lcm-logger and lcm-logplayer, all real processes on a network of their own."""
 
+import contextlib
 import os
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -10,6 +12,9 @@ from pathlib import Path
 import lcm
 import numpy as np
 import pytest
+from mcap.exceptions import EndOfFile
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from own_network import end, inside, outside, run_inside, start
 from status_logs import ARM, log_bytes, statuses
 from waiting import TIMEOUT, wait_until
@@ -32,9 +37,7 @@ def test_runs_in_a_separate_network(request):
 def start_records(paths, *options, arms=("mtml", "mtml")):
     """Starts recorders together and waits until they listen, because each waits only 10 s for a status."""
     command = [sys.executable, "-m", "dvrk_drake.cli", "record"]
-    started = [
-        (start(*command, "--arm", arm, "--output", path, *options), arm) for path, arm in zip(paths, arms, strict=False)
-    ]
+    started = [(start(*command, path, "--arm", arm, *options), arm) for path, arm in zip(paths, arms, strict=False)]
     for process, arm in started:
         line = process.stdout.readline()
         assert line.startswith(f"recording {arm.upper()} on LCM udpm://239.255.76.67:76"), line
@@ -182,6 +185,28 @@ def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
             if not path.name.endswith("logger.log"):
                 assert not [note for note in recording.notes if "missing in the sequence" not in note]
             assert all(values == original[utime] for utime, values in by_utime(path).items())
+
+
+@inside
+def test_bag_ends_with_index_and_survives_kill(tmp_path, played):
+    paths = [tmp_path / "ended.mcap", tmp_path / "killed.mcap"]
+    recorders = start_records(paths)
+    play(played, "--speed=0.25")
+    last = max(by_utime(played))
+    stamp = struct.pack("<iI", last // 10**6, last % 10**6 * 1000)
+    wait_until(lambda: all(stamp in path.read_bytes() for path in paths), "the last message")
+    said = end(recorders[0], signal.SIGTERM)
+    assert recorders[0].returncode == 0, said
+    end(recorders[1], signal.SIGKILL)
+    original, recording = read_recording(played, ARM), read_recording(paths[0], ARM)
+    assert len(recording) >= 0.95 * len(original)
+    for name in ("q", "qd", "tau"):
+        assert set(map(tuple, getattr(recording, name))) <= set(map(tuple, getattr(original, name)))
+    count = 0
+    with paths[1].open("rb") as file, contextlib.suppress(EndOfFile):
+        for record in StreamReader(file).records:
+            count += isinstance(record, Message)
+    assert count >= 0.95 * len(original)
 
 
 @inside

@@ -1,0 +1,173 @@
+"""Process that records the joint states of one arm from ROS 2 to a bag, started by `dvrk-drake record --ros`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dvrk_drake.errors import DvrkDrakeError, RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.processes.recorder import FIRST_STATUS, Rate
+from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
+from dvrk_drake.recordings.recording_stream import check_stream_output
+from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
+
+if TYPE_CHECKING:
+    from dvrk_drake.processes.ros_topics import JointState, RosDomain, Subscription
+
+#: Longest wait for a message between two checks for a stop [s].
+_POLL = 0.1
+#: Time after the discovery of the first fitting topic in which other fitting topics are discovered [s].
+_DISCOVERY = 1.0
+
+
+class RosRecorder:
+    """Writes the JointState messages of one arm to a new bag in real time, as they were published.
+
+    Attributes:
+        source: ROS domain, for messages.
+        num_rows: Number of recorded messages of the arm, without those of a joint with a topic of its own.
+    """
+
+    def __init__(self, arm: Arm, path: str | Path, topic: str | None = None, domain: int | None = None) -> None:
+        """Creates a recorder. The file is created when the topic of the arm is found.
+
+        Args:
+            arm: Arm whose joint states are recorded. Its `separate_joint` is recorded from a topic of its own.
+            path: Path of the new bag, *.mcap.
+            topic: JointState topic or its namespace. Default: the only topic `/<ARM>/measured_js`, in any namespace,
+                where ARM is the name of the arm, optionally followed by a number.
+            domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+
+        Raises:
+            RecordingError: A new bag cannot be created at `path`.
+            DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
+        """
+        check_stream_output(path, (".mcap",))
+        self._arm, self._path, self._topic = arm, path, topic
+        self._domain = open_ros_domain(domain)
+        self.source = self._domain.name
+        self.num_rows = 0
+        self._num_invalid = 0
+        self._rate = Rate()
+        self._subscriptions: list[Subscription] = []
+        self._silent: set[str] = set()
+        self._bag: GrowingMcap | None = None
+
+    def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
+        """Records until `stopped` returns true, or until `duration` has elapsed since the first message.
+
+        Args:
+            duration: Duration of the recording [s], which may be infinite.
+            stopped: Function that returns whether to stop. It is called at least every 0.1 s.
+            show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
+                function that returns the text of the status line.
+
+        Raises:
+            RecordingError: No topic or several topics fit, no valid message arrived within 10 s, the messages have
+                other joints, or the file cannot be written.
+        """
+        self._subscribe(stopped)
+        end = time.monotonic() + FIRST_STATUS
+        try:
+            while not stopped() and time.monotonic() < end:
+                self._domain.wait(_POLL)
+                before = self._bag
+                for subscription in self._subscriptions:
+                    for message, published in subscription.take():
+                        self._record(subscription, message, published)
+                if before is None and self._bag is not None:
+                    end = time.monotonic() + duration
+                show(self.describe)
+        finally:
+            if self._bag is not None:
+                self._bag.close(lambda share: show(lambda: f"{self._path}: index {share:.0%}"))
+        if self._bag is None:
+            raise RecordingError(self._no_message_reason(stopped()))
+
+    def describe(self) -> str:
+        """Returns the text of the status line: the number of messages, the rate, and lost messages."""
+        rate = self._rate.per_second(time.monotonic())
+        if self._bag is None:
+            return f"waiting for a valid message on {self._subscriptions[0].topic}"
+        if rate is None:
+            return f"{self._arm.name}: no more messages; {self.num_rows} rows"
+        parts = [f"{self._arm.name}: {self.num_rows} rows", f"{rate} Hz", f"{self._num_lost()} lost"]
+        return ", ".join([*parts, *(f"no message on {topic}" for topic in sorted(self._silent))])
+
+    def notes(self) -> list[str]:
+        """Returns one line for lost messages, for invalid messages, and for each topic without messages."""
+        counts = {
+            "messages lost by DDS": self._num_lost(),
+            "messages with header stamp 0, which marks invalid data": self._num_invalid,
+        }
+        silent = [f"no message on {topic}; commands of dvrk-drake need this topic" for topic in sorted(self._silent)]
+        return [*(f"{text}: {count}" for text, count in counts.items() if count), *silent]
+
+    def _subscribe(self, stopped: Callable[[], bool]) -> None:
+        """Waits for the topic of the arm, and subscribes to it and to the topic of a separate joint."""
+        start, found = time.monotonic(), None
+        topics: dict[str, bool] = {}
+        while not stopped():
+            topics, now = self._domain.joint_state_topics(), time.monotonic()
+            if found is None and fitting_topics(self._arm, self._topic, topics):
+                found = now
+            if now > (start + FIRST_STATUS if found is None else found + _DISCOVERY):
+                break
+            self._domain.wait(_POLL)
+        main = choose_topic(self.source, self._arm, self._topic, {name: name for name in topics})
+        others = joint_state_topics(self._arm, main.rpartition("/")[0])[1:]
+        for name in (main, *(topic.name for topic in others)):
+            self._subscriptions.append(self._domain.subscribe(name, reliable=topics.get(name, True)))
+            self._silent.add(name)
+
+    def _record(self, subscription: Subscription, message: JointState, published: int) -> None:
+        """Writes a message. The bag is created at the first valid message of the arm."""
+        if subscription is self._subscriptions[0]:
+            is_valid = bool(message.header.stamp.sec or message.header.stamp.nanosec)
+            self._num_invalid += not is_valid
+            if self._bag is None and is_valid:
+                self._check_joints(message)
+                self._bag = GrowingMcap(self._path, [each.topic for each in self._subscriptions])
+        if self._bag is None:
+            return
+        # ROS 2 uses version 1 of the CDR encoding.
+        self._bag.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, time.time_ns())
+        self._silent.discard(subscription.topic)
+        if subscription is self._subscriptions[0]:
+            self.num_rows += 1
+            self._rate.add(time.monotonic())
+
+    def _check_joints(self, message: JointState) -> None:
+        needed = [joint for joint in self._arm.joint_names if joint != self._arm.separate_joint]
+        if missing := [joint for joint in needed if joint not in message.name]:
+            raise RecordingError(
+                f"{self._subscriptions[0].topic} has the joints {', '.join(message.name) or 'none'}; {self._arm.name} "
+                f"also needs {', '.join(missing)}. Check --arm, --topic and the instrument."
+            )
+
+    def _no_message_reason(self, stopped: bool) -> str:
+        topic = f"{self._subscriptions[0].topic} of {self.source}"
+        if self._num_invalid:
+            return f"{topic}: all {self._num_invalid} messages have header stamp 0 (invalid data). Home the arm first."
+        if stopped:
+            return f"{self._path} was not written: the recording ended before the first message on {topic}"
+        return f"no message within {FIRST_STATUS:.0f} s on {topic}"
+
+    def _num_lost(self) -> int:
+        return sum(subscription.num_lost for subscription in self._subscriptions)
+
+
+def open_ros_domain(domain: int | None = None) -> RosDomain:
+    """Joins a ROS domain, see `RosDomain`.
+
+    Raises:
+        DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
+    """
+    try:
+        from dvrk_drake.processes.ros_topics import RosDomain
+    except ModuleNotFoundError as error:
+        raise DvrkDrakeError("ROS 2 needs cyclonedds: pip install dvrk-drake[ros]") from error
+    return RosDomain(domain)

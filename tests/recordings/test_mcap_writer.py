@@ -1,0 +1,122 @@
+"""MCAP bags of recordings: exact round trips, and readers that are independent of this package."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from recordings import random_recording, six_joint_arm
+from rosbags.highlevel import AnyReader
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.mcap_writer import joint_state_topics
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+
+ARMS = {name: load_arm(name) for name in ("mtml", "psm")}
+TOPICS = {"mtml": ["/MTML/measured_js"], "psm": ["/PSM/jaw/measured_js", "/PSM/measured_js"]}
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("absent", [(), ("qd",), ("tau",), ("qd", "tau")])
+def test_round_trip_is_exact(tmp_path, name, absent):
+    arm, recording = ARMS[name], random_recording(**dict.fromkeys(absent))
+    recording.q[0, :3] = [5e-324, -0.0, 0.1 + 0.2]
+    write_recording(recording, tmp_path / "a.mcap", arm)
+    again = read_recording(tmp_path / "a.mcap", arm)
+    assert not again.notes
+    assert again.coordinates == "joint"
+    np.testing.assert_allclose(again.t, recording.t, rtol=0, atol=1e-9)  # stamps are whole nanoseconds
+    for block in ("q", "qd", "tau"):
+        if block in absent:
+            assert getattr(again, block) is None
+        else:
+            np.testing.assert_array_equal(getattr(again, block), getattr(recording, block))
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_independent_readers_accept_the_bag(tmp_path, name):
+    """`mcap` checks the checksums of chunks and summary; rosbags compiles the message type from the schema."""
+    arm, path, num_rows = ARMS[name], tmp_path / "a.mcap", 5000
+    recording = random_recording(num_rows, t=3.5 + 0.002 * np.arange(num_rows))
+    write_recording(recording, path, arm)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        (schema,) = summary.schemas.values()
+        assert (schema.name, schema.encoding) == ("sensor_msgs/msg/JointState", "ros2msg")
+        definitions = schema.data.decode().split("=" * 80 + "\n")
+        assert [text.partition("\n")[0] for text in definitions[1:]] == [
+            f"MSG: {dependency}" for dependency in ("std_msgs/Header", "builtin_interfaces/Time")
+        ]
+        assert {channel.topic for channel in summary.channels.values()} == set(TOPICS[name])
+        assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+        assert summary.statistics.message_count == num_rows * len(TOPICS[name])
+        assert set(summary.statistics.channel_message_counts.values()) == {num_rows}
+        assert len(summary.chunk_indexes) > 1
+        log_times = [message.log_time for _, channel, message in reader.iter_messages(topics=TOPICS[name][-1:])]
+    with AnyReader([path]) as bag:  # without a default type store: the types come from the schema
+        assert sorted(bag.topics) == TOPICS[name]
+        messages = [
+            (time, bag.deserialize(data, connection.msgtype))
+            for connection, time, data in bag.messages()
+            if connection.topic == f"/{arm.name}/measured_js"
+        ]
+    stamps = [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for _, message in messages]
+    assert stamps == [time for time, _ in messages] == log_times
+    np.testing.assert_array_equal(np.diff(stamps), 2_000_000)
+    joints = [joint for joint in arm.joint_names if joint != "jaw"]
+    assert all(message.name == joints for _, message in messages)
+    np.testing.assert_array_equal([message.effort for _, message in messages], recording.tau[:, : len(joints)])
+
+
+def test_poses_without_times_remain_poses(tmp_path):
+    poses = random_recording(200, t=None, qd=None)
+    write_recording(poses, tmp_path / "poses.mcap", ARMS["mtml"])
+    again = read_recording(tmp_path / "poses.mcap", ARMS["mtml"])
+    np.testing.assert_allclose(again.t, np.arange(200), rtol=0, atol=1e-9)
+    assert not again.is_motion
+    assert again.motion(ARMS["mtml"]) == ""
+    np.testing.assert_array_equal(again.tau, poses.tau)
+
+
+def test_actuator_coordinates_are_converted(tmp_path):
+    arm = ARMS["mtml"]
+    recording = random_recording(coordinates="actuator")
+    write_recording(recording, tmp_path / "a.mcap", arm)
+    again = read_recording(tmp_path / "a.mcap", arm)
+    np.testing.assert_array_equal(again.tau, recording.in_joint_coordinates(arm).tau)
+    np.testing.assert_allclose(again.in_actuator_coordinates(arm).q, recording.q, atol=1e-12)
+
+
+def test_arm_without_the_separate_joint_has_one_topic():
+    (topic,) = joint_state_topics(six_joint_arm(), "/davinci/PSM3")
+    assert topic.name == "/davinci/PSM3/measured_js"
+    assert topic.columns == list(range(6))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"t": np.zeros(20)}, r"a\.csv, line 3: t = 0 s is not later than the previous row; .* at least 1 ns"),
+        ({"t": np.arange(20) * 1e-10}, r"line 3: t = 1e-10 s is not later"),
+        ({"t": np.append(np.arange(19), np.nan)}, r"x\.mcap was not written: .* finite times"),
+        ({"t": np.arange(20) * 1e9}, r"x\.mcap was not written: .* up to 2\.14748e\+09 s"),
+        ({"q": np.zeros((0, 7)), "t": None, "qd": None, "tau": None}, "has no rows"),
+        ({"q": np.zeros((20, 6)), "qd": None, "tau": None}, r"a\.csv has 6 joints, but MTML has 7"),
+    ],
+)
+def test_what_a_bag_cannot_hold_is_refused(tmp_path, change, message):
+    recording = replace(random_recording(), source="a.csv", lines=np.arange(20) + 2, **change)
+    with pytest.raises(RecordingError, match=message):
+        write_recording(recording, tmp_path / "x.mcap", ARMS["mtml"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bag_needs_an_arm(tmp_path):
+    with pytest.raises(RecordingError, match=r"x\.mcap: an MCAP bag needs the arm .*: --arm"):
+        write_recording(Recording(q=np.zeros((3, 7))), tmp_path / "x.mcap")
+    assert list(tmp_path.iterdir()) == []
