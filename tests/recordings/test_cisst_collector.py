@@ -52,7 +52,7 @@ def test_orders_joints_by_name(mtm, tmp_path):
     np.testing.assert_array_equal(read_recording(path, mtm).q, q[:, ::-1])
 
 
-def test_tables_of_the_input_and_output_are_in_actuator_coordinates(mtm, tmp_path):
+def test_io_tables_are_in_actuator_coordinates(mtm, tmp_path):
     q, qd, tau = blocks(4, 7)
     path = write_collection(tmp_path, ACTUATORS, joint_state("measured_js", [], times(4), q, qd, tau))
     read = read_recording(path, mtm)

@@ -27,7 +27,7 @@ def test_21_columns_are_motions_of_wpi_at_200_hz(tmp_path):
     np.testing.assert_array_equal(read_recording(path, rate=10).t, [0, 0.1, 0.2, 0.3])
 
 
-def test_the_roll_of_a_psm_in_motions_of_wpi_is_that_of_the_joint(tmp_path):
+def test_wpi_motions_have_the_roll_of_the_joint(tmp_path):
     psm = load_arm("psm")
     rows = 1e-2 * wpi_rows()
     recording = read_recording(write_wpi(tmp_path, rows), psm)

@@ -13,7 +13,8 @@ from rosbags.highlevel import AnyReader
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.mcap_writer import joint_state_topics
-from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
 
 ARMS = {name: load_arm(name) for name in ("mtml", "psm")}
 TOPICS = {"mtml": ["/MTML/measured_js"], "psm": ["/PSM/jaw/measured_js", "/PSM/measured_js"]}
