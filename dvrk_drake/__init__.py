@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm, load_arm
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording, write_recording
+    from dvrk_drake.recordings.samples import write_samples
     from dvrk_drake.systems.arm_station import ArmStation
     from dvrk_drake.systems.arm_view import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
@@ -53,6 +54,7 @@ _MODULES = {
     "start_meshcat": "systems.arm_view",
     "validate": "analysis.validation",
     "write_recording": "recordings.recording",
+    "write_samples": "recordings.samples",
 }
 
 __all__ = [
@@ -78,6 +80,7 @@ __all__ = [
     "start_meshcat",
     "validate",
     "write_recording",
+    "write_samples",
 ]
 
 

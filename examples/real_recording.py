@@ -1,6 +1,7 @@
-"""Identifies a real right master arm from a recording, like `dvrk-drake identify`.
+"""Identifies a right master arm from a recording, like `dvrk-drake identify`.
 
-python real_recording.py FILE.csv [MODEL.yaml]
+dvrk-drake samples samples
+python real_recording.py samples/mtm_poses.csv [MODEL.yaml]
 
 The script writes the model only if MODEL.yaml is given.
 """

@@ -20,7 +20,7 @@ ONE_PYTHON = (
     *("recordings/test_collection_file", "recordings/test_lcm_log", "recordings/test_pose_file"),
     *("recordings/test_recording", "recordings/test_conversion", "recordings/test_public_recordings_document"),
     *("recordings/test_array_file", "recordings/test_csv_without_header", "recordings/test_cisst_collector"),
-    *("recordings/test_reading", "recordings/test_ros_bag"),
+    *("recordings/test_reading", "recordings/test_ros_bag", "recordings/test_samples"),
     *("export/test_dvrk_mtm_gravity_compensation", "export/test_dvrk_psm_gravity_compensation"),
     "dynamics/test_nearest_links",
     "systems/guard/",

@@ -3,18 +3,16 @@
 import os
 import pty
 import re
+import shutil
 import subprocess
 import sys
 import urllib.request
 
-import numpy as np
 import pytest
 from repository import ROOT
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.samples import SAMPLES_FOLDER
 
 EXAMPLES = ROOT / "examples"
 PAGE_SCRIPTS = ["hold_an_arm.py", "teleoperation.py"]
@@ -81,18 +79,13 @@ def test_page_is_served_until_enter_on_a_terminal(tmp_path):
 
 @pytest.mark.slow
 def test_model_is_written_to_the_given_path(tmp_path):
-    arm, generator = load_arm("mtmr"), np.random.default_rng(0)
-    model = compile_static_model(arm)
-    q = arm.sample_poses(40, generator, margin=0.05)
-    tau = model.torque(q, model.gravity.base_values)
-    tau += 0.003 * arm.effort_limits * generator.normal(size=q.shape)
     poses = tmp_path / "poses.csv"
-    write_recording(Recording(q=q, tau=tau), poses)
+    shutil.copyfile(SAMPLES_FOLDER / "mtm_poses.csv", poses)
     assert run(tmp_path, "real_recording.py", "poses.csv").returncode == 0
     assert list(tmp_path.iterdir()) == [poses]
     assert run(tmp_path, "real_recording.py", "poses.csv", "own.yaml").returncode == 0
     before = (tmp_path / "own.yaml").read_bytes()
-    assert IdentifiedModel.load(tmp_path / "own.yaml").arm.name == arm.name
+    assert IdentifiedModel.load(tmp_path / "own.yaml").arm.name == "MTMR"
     again = run(tmp_path, "real_recording.py", "poses.csv", "own.yaml")
     assert again.returncode == 1 and "already exists" in again.stderr
     assert (tmp_path / "own.yaml").read_bytes() == before

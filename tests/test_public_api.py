@@ -194,15 +194,10 @@ def test_readme_example_is_short_and_has_one_import():
 
 def test_readme_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arm, generator = dvrk.load_arm("mtmr"), np.random.default_rng(0)
-    model = dvrk.IdentifiedModel.from_arm(arm)
-    for name, count in (("poses.csv", 40), ("other_day.csv", 12)):
-        q = arm.sample_poses(count, generator, margin=0.05)
-        tau = model.holding_torque(q) + 0.003 * arm.effort_limits * generator.normal(size=q.shape)
-        dvrk.write_recording(dvrk.Recording(q=q, tau=tau), name)
+    dvrk.write_samples("samples")
     exec(compile(readme_example(), "README.md", "exec"), {})
     assert (tmp_path / "model.yaml").is_file()
-    assert "verdict" in capsys.readouterr().out
+    assert capsys.readouterr().out.startswith("verdict usable")
 
 
 @pytest.fixture(scope="module")

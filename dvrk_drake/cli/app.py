@@ -1,8 +1,8 @@
 """Command-line application: groups of commands, and options that several commands share.
 
-An option has the same name in all commands. Input files (recordings, scenarios, studies) and the file of `record` are
-positional arguments. All other arguments are options, e.g. --arm, --model, --output (a file), --folder, --plots (a
-folder), --json, --overwrite and --verbose.
+An option has the same name in all commands. Input files (recordings, scenarios, studies), the file of `record` and the
+folder of `samples` are positional arguments. All other arguments are options, e.g. --arm, --model, --output (a file),
+--folder, --plots (a folder), --json, --overwrite and --verbose.
 """
 
 from __future__ import annotations

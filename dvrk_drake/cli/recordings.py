@@ -1,4 +1,4 @@
-"""Commands for recordings: check and convert."""
+"""Commands for recordings: samples, check and convert."""
 
 from __future__ import annotations
 
@@ -9,10 +9,27 @@ from cyclopts import Parameter
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli.app import IDENTIFY, Arm, FileOptions, Json, Overwrite, Plots, Recording, Verbose, app
-from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_notes, print_written, write_json
+from dvrk_drake.cli.support import Steps, check_output, new_folder, plots_folder, print_notes, print_written, write_json
 from dvrk_drake.errors import RecordingError
 
 _FILE = FileOptions()
+
+
+@app.command(group=IDENTIFY)
+def samples(folder: str, /, *, overwrite: Overwrite = False) -> None:
+    """Write sample recordings of simulated arms, as CSV and MCAP.
+
+    Args:
+        folder: Folder to write to, which must be new or empty.
+    """
+    from dvrk_drake.recordings.samples import SAMPLES
+
+    target = new_folder(folder, overwrite=overwrite)
+    with Steps("writing") as steps:
+        files = dvrk.write_samples(target, overwrite=True, progress=steps)
+    for file in files:
+        print_written(file)
+    print(f"Next: dvrk-drake check {files[0]} --arm {SAMPLES[files[0].stem]}")
 
 
 @app.command(group=IDENTIFY)

@@ -218,6 +218,7 @@ WRITE_A_FOLDER = [
     "transparency --arm mtml --plots",
     "demo --folder",
     "reproduce fig7 --folder",
+    "samples",
 ]
 
 

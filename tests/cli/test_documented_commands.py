@@ -1,4 +1,4 @@
-"""The commands in the documentation are valid: lines can be parsed, and all options exist."""
+"""The commands in the documentation are valid: lines can be parsed, all options exist, and the samples work."""
 
 import re
 import shlex
@@ -7,6 +7,7 @@ import pytest
 from cyclopts import CycloptsError
 from repository import ROOT
 
+from dvrk_drake.cli import main
 from dvrk_drake.cli.app import app
 from dvrk_drake.cli.program import COMMANDS  # noqa: F401  (adds the commands)
 
@@ -38,6 +39,17 @@ def test_documented_commands_are_valid(page):
         command, _, rest = found["words"].partition("#")[0].partition(" ")
         unknown = set(re.findall(r"(?<!\S)\[?(--[a-z][a-z-]*)", rest)) - options_of(command)
         assert not unknown, f"dvrk-drake {found['words']}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if "/mtm_poses.csv" in page.read_text()], ids=lambda p: p.name)
+def test_commands_with_samples_run(page, tmp_path, monkeypatch):
+    """The commands of a page run in their order, as a new user enters them."""
+    monkeypatch.chdir(tmp_path)
+    for found in LINE.finditer(page.read_text()):
+        words = shlex.split(found["words"], comments=True)
+        if any(word.startswith("samples") for word in words):
+            assert main(words) == 0, f"dvrk-drake {found['words']}"
 
 
 def test_printed_commands_have_valid_options():
