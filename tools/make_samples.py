@@ -1,10 +1,11 @@
-"""Makes the sample recordings dvrk_drake/samples/*.csv by simulation, in about three minutes.
+"""Makes the sample recordings dvrk_drake/samples/*.csv by simulation, in about two minutes.
 
 python tools/make_samples.py
 
 The simulated arms have the friction, cables, stops, encoders, motors and delays of their arm files, except that the MTM
 has no wrist spring (see `perturbed_ground_truth`). The masses of their links differ from the SDF by up to 20 %, so an
-identified model is more accurate than the nominal model. Repeated runs with the same packages give the same files.
+identified model is more accurate than the nominal model. Repeated runs on the same computer with the same packages give
+the same files.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ RANGES = {
     "mtmr": ((-0.2, 0.40, -0.20, 0.5, 0.7, 0.0, 0.0), (0.75, 0.42, 0.38, 1.3, 1.5, 0.6, 1.8)),
     "psm": ((0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.3), (1.0, 0.7, 0.09, 1.6, 0.9, 0.9, 0.6)),
 }
-#: Decimal places. Only q5 to q7 of an MTM have a resolution that is coarser by several places.
+#: Decimal places: at least the resolution of the encoders and of the measured currents.
 DECIMALS = {"t": 3, "q": 6, "qd": 4, "tau": 5}
 
 
@@ -56,8 +57,8 @@ def static_poses(truth: GroundTruth, name: str, progress: Callable[[float], obje
 def motion(truth: GroundTruth, name: str, progress: Callable[[float], object]) -> dvrk.Recording:
     """Returns an excitation motion under position control.
 
-    A dVRK computes the velocity from the time between two encoder counts, which is almost exact. Therefore qd is the
-    true velocity, without the low-pass filter of the simulated encoders.
+    A dVRK computes velocities from the time between two encoder counts, with small error and delay. Therefore qd is the
+    true velocity instead of the filtered velocity of the simulated encoders.
     """
     arm = dvrk.load_arm(name)
     trajectory = desired_motion(arm)
