@@ -208,7 +208,7 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
     stamps, messages = array("q"), array("q")
     blocks = {name: array("d") for name in ("position", "velocity", "effort")}
     present: list[tuple[str, array]] = []
-    unstamped, late, invalid, last = 0, 0, 0, 0
+    unstamped, late, invalid, last, first_late = 0, 0, 0, 0, ""
     topic = connections.topic
     for number, message in enumerate(bag.messages(connections), 1):
         if number % _REPORT == 0:
@@ -242,6 +242,7 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
             continue
         if stamp <= last:
             late += 1
+            first_late = first_late or f"message {number} is {1e-9 * (last - stamp):g} s before the previous one"
             continue
         last = stamp
         stamps.append(stamp)
@@ -262,8 +263,8 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
         raise RecordingError(f"{bag.path}: {topic} has no usable message ({reasons})")
     if late > len(stamps):
         raise RecordingError(
-            f"{bag.path}: the header stamps of {topic} do not increase in {late} of {late + len(stamps)} messages. "
-            "Record a bag while the console publishes measured data."
+            f"{bag.path}: the header stamps of {topic} do not increase in {late} of {late + len(stamps)} messages: "
+            f"{first_late}. Cut the bag where the clock was set, or record again."
         )
     q, qd, tau = (np.frombuffer(block).reshape(len(stamps), -1) if block else None for block in blocks.values())
     assert q is not None
