@@ -278,7 +278,7 @@ def test_file_is_complete_after_each_message(tmp_path, suffix):
 
 def test_unwritable_outputs_are_refused(tmp_path):
     for name, message in {
-        "a.txt": r"must end in \.csv, \.mcap or \.log",
+        "a.txt": r"must end in \.csv or \.mcap or \.log",
         "no/a.csv": "its folder does not exist",
     }.items():
         with pytest.raises(RecordingError, match=message):
