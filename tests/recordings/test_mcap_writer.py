@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +16,7 @@ from rosbags.highlevel import AnyReader
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.mcap_writer import joint_state_topics
+from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
 from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 ARMS = {name: load_arm(name) for name in ("mtml", "psm")}
@@ -120,3 +124,34 @@ def test_bag_needs_an_arm(tmp_path):
     with pytest.raises(RecordingError, match=r"x\.mcap: an MCAP bag needs the arm .*: --arm"):
         write_recording(Recording(q=np.zeros((3, 7))), tmp_path / "x.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("tool", ["mcap", "pymcap-cli"])
+def test_command_lines_accept_and_recover_bags(tmp_path, tool):
+    """`mcap` is the tool of the format's authors, `pymcap-cli` an independent one with the same commands, from PyPI."""
+    program = shutil.which(tool, path=os.pathsep.join([os.path.dirname(sys.executable), os.environ.get("PATH", "")]))
+    if program is None:
+        pytest.skip(f"the command line {tool} is not installed")
+
+    def run(*arguments):
+        return subprocess.run([program, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    arm, recording = ARMS["psm"], random_recording(300)
+    write_recording(recording, tmp_path / "once.mcap", arm)
+    topics = joint_state_topics(arm)
+    growing = GrowingMcap(tmp_path / "grown.mcap", [topic.name for topic in topics])
+    for k in range(len(recording)):
+        for topic in topics:
+            growing.write(topic, 10**9 + k * 10**6, recording.q[k], recording.qd[k], recording.tau[k])
+    (tmp_path / "killed.mcap").write_bytes((tmp_path / "grown.mcap").read_bytes()[:-1])
+    growing.close()
+    for name in ("once.mcap", "grown.mcap"):
+        assert "600" in run("info", name).stdout
+        doctor = run("doctor", name)
+        assert doctor.returncode == 0, doctor.stdout + doctor.stderr
+    assert run("doctor", "killed.mcap").returncode != 0
+    run("recover", "killed.mcap", "-o", "recovered.mcap")  # pymcap-cli returns 3, because data are lost
+    # The last message, of the jaw, is not complete.
+    recovered = read_recording(tmp_path / "recovered.mcap", arm)
+    np.testing.assert_array_equal(recovered.q[:-1], recording.q[:-1])
+    np.testing.assert_array_equal(recovered.q[-1, :6], recording.q[-1, :6])
