@@ -107,7 +107,10 @@ class McapWriter:
             RecordingError: The stamp is 0, negative or too large.
         """
         if not 0 < stamp <= _LAST_STAMP:
-            raise RecordingError(f"a measurement at {stamp / 1e9:g} s; header stamps are above 0, up to 2147483647 s")
+            raise RecordingError(
+                f"the time of a measurement is {stamp / 1e9:g} s; a bag needs times above 0 s, up to "
+                f"{_LAST_STAMP / 1e9:.0f} s"
+            )
         empty = np.empty(0)
         message = self._state(
             header=self._header(stamp=self._time(*divmod(stamp, 1_000_000_000)), frame_id=""),
