@@ -141,7 +141,10 @@ def damaged(mtm):
     yield {topic: joint_states(stamps(10), names, q[:, :5], qd, tau)}, "5 numbers in `position`, but 7 joints"
     yield {topic: joint_states(stamps(10), (), q)}, "names no joints"
     yield {topic: joint_states(stamps(10), [names[0]] * 7, q)}, "names a joint twice"
-    yield {topic: joint_states(still, names, q, qd, tau)}, "do not increase in 9 of 10 messages: message 2 is 0 s before"
+    yield (
+        {topic: joint_states(still, names, q, qd, tau)},
+        "do not increase in 9 of 10 messages: message 2 is 0 s before",
+    )
     yield {topic: joint_states(np.zeros(10), names, q, qd, tau)}, "no usable message.*header stamp 0"
     yield {topic: []}, "no messages"
     yield {}, "JointState messages: none"
