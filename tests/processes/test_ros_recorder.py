@@ -14,7 +14,7 @@ from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes import ros_recorder as module
 from dvrk_drake.processes.ros_recorder import RosRecorder
-from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.reading import read_recording
 
 ros = pytest.importorskip("dvrk_drake.processes.ros_topics", reason="needs cyclonedds (pip install dvrk-drake[ros])")
 
