@@ -13,6 +13,7 @@ from dvrk_drake.cli.app import (
     Coordinates,
     Gravity,
     Json,
+    Locked,
     Model,
     Overwrite,
     Plots,
@@ -56,6 +57,7 @@ def identify(
     method: Literal["robust", "paper"] = "robust",
     low_speed_segments: LowSpeedSegments = False,
     gravity: Gravity = None,
+    locked: Locked = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -71,7 +73,7 @@ def identify(
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, overwrite=overwrite)
-    recorded_arm = mounted(dvrk.load_arm(arm), gravity)
+    recorded_arm = mounted(dvrk.load_arm(arm), gravity, locked)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
         read = dvrk.read_recording(recording, recorded_arm, coordinates, topic=topic, progress=steps)
@@ -241,6 +243,7 @@ def payload(
     coordinates: Coordinates = "joint",
     topic: Topic = None,
     gravity: Gravity = None,
+    locked: Locked = None,
     json: Json = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -259,10 +262,12 @@ def payload(
 
     if model is not None and gravity is not None:
         raise ModelError("--gravity requires --arm; with --model, the gravity vector of the model is used")
+    if model is not None and locked is not None:
+        raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
     if json is not None:
         check_output(json, reference, loaded, overwrite=overwrite)
     identified = None if model is None else dvrk.IdentifiedModel.load(model)
-    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if identified is None else identified.arm
+    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
         without_payload, with_payload = (
             dvrk.read_recording(path, recorded_arm, coordinates, topic=topic, progress=steps)

@@ -8,9 +8,10 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import IDENTIFY, Arm, Coordinates, Json, Overwrite, Plots, Topic, Verbose, app
-from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_notes, print_written, write_json
+from dvrk_drake.cli.app import IDENTIFY, Arm, Coordinates, Json, Locked, Overwrite, Plots, Topic, Verbose, app
+from dvrk_drake.cli.support import Steps, check_output, mounted, plots_folder, print_notes, print_written, write_json
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.locked_joints import locked_option
 
 
 @app.command(group=IDENTIFY)
@@ -21,6 +22,7 @@ def check(
     arm: Arm,
     coordinates: Coordinates = "joint",
     topic: Topic = None,
+    locked: Locked = None,
     json: Json = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
@@ -36,7 +38,7 @@ def check(
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
 
-    recorded_arm = dvrk.load_arm(arm)
+    recorded_arm = mounted(dvrk.load_arm(arm), None, locked)
     if json is not None:
         check_output(json, recording, overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
@@ -46,7 +48,7 @@ def check(
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if json is not None:
         write_json(json, report.as_dict())
-    options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"
+    options = (arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}") + locked_option(recorded_arm)
     print_report(make_console(), report, arm=options, verbose=verbose)
     if json is not None:
         print_written(json)

@@ -23,6 +23,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
@@ -361,9 +362,11 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
         if len(missing) == num_joints and not needed:
             continue
         if missing:
+            recorded = num_joints - len(missing)
+            hint = lock_hint(arm, recorded) if arm and prefix == "q" and missing == names[recorded:] else ""
             raise RecordingError(
                 f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
-                f"needs {_expected_columns(num_joints)}{_joint_list(arm)}"
+                f"needs {_expected_columns(num_joints)}{_joint_list(arm)}{hint and f'. {hint}'}"
             )
         if f"{prefix}{num_joints + 1}" in header:
             raise RecordingError(

@@ -346,6 +346,11 @@ def _with_jaw(path: Path, arm: _Topic, jaw: _Topic, joint: str) -> tuple[_Topic,
 
 def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> list[int]:
     """Returns the column of each joint of the arm. Joints that are not in the arm are ignored."""
+    if recorded := [joint for joint in arm.locked_joints if joint in names]:
+        raise RecordingError(
+            f"{path}: {topic} contains {', '.join(recorded)}, but --locked states positions of these joints; allowed: "
+            "only joints that are not recorded"
+        )
     if missing := [joint for joint in arm.joint_names if joint not in names]:
         advice = "Check --arm and --topic."
         if missing == [arm.joint_names[-1]] == ["jaw"]:

@@ -17,6 +17,7 @@ from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 
@@ -52,6 +53,10 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     source = recording.source or "recording"
     report = RecordingReport(source, arm.name, "motion" if recording.is_motion else "poses", len(recording))
     findings = [Finding("note", "reading", source, note.removesuffix("."), "") for note in recording.notes]
+    if arm.locked_joints:
+        what = f"the recording does not contain these joints, which are assumed at rest at {locked_text(arm)} [rad, m]"
+        advice = "Their friction, motors and efforts are not identifiable. The model is valid only for these positions."
+        findings.append(Finding("note", "locked joints", ", ".join(arm.locked_joints), what, advice))
     try:
         joints = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
