@@ -159,10 +159,9 @@ def _effects(effects: ArmEffects, coordinates: Iterable[str], actuators: list[st
     encoder, effort = effects.encoder, effects.effort
     return dataclasses.replace(
         effects,
-        **{
-            group: [effect for effect in getattr(effects, group) if effect.coordinate in coordinates]
-            for group in ("friction", "cables", "springs")
-        },
+        friction=[effect for effect in effects.friction if effect.coordinate in coordinates],
+        cables=[effect for effect in effects.cables if effect.coordinate in coordinates],
+        springs=[effect for effect in effects.springs if effect.coordinate in coordinates],
         stretch=only(effects.stretch),
         saturation=only(effects.saturation),
         encoder=encoder and dataclasses.replace(encoder, resolution=only(encoder.resolution)),

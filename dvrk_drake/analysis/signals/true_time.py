@@ -96,7 +96,7 @@ _ITERATIONS = 8
 
 
 #: A row repeats the previous row only while the arm moves: while the speed of a joint exceeds this share of its RMS
-#: speed. Without qd, the speed is the difference of the positions this number of rows before and after the row.
+#: speed. Without qd, the speed is the displacement over this number of rows, before or after the row.
 MOVING_SHARE, SPEED_ROWS = 0.05, 10
 #: Smallest displacement over these rows, as a multiple of the smallest step of the position (encoder count).
 MIN_STEPS = 3.0
@@ -199,9 +199,10 @@ def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
     else:
         rows, q = np.arange(len(recording)), recording.q
         after, before = np.minimum(rows + SPEED_ROWS, len(q) - 1), np.maximum(rows - SPEED_ROWS, 0)
-        speed = np.abs(q[after] - q[before])
+        speed = np.minimum(np.abs(q[after] - q), np.abs(q - q[before]))
         steps = np.abs(np.diff(q, axis=0))
-        count = np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=np.inf)
+        changed = steps > SAME_VALUE * np.sqrt(np.mean(q**2, axis=0))
+        count = np.min(np.where(changed, steps, np.inf), axis=0, initial=np.inf)
         speed = np.where(speed >= MIN_STEPS * count, speed, 0.0)
     moves = np.any(speed > MOVING_SHARE * np.sqrt(np.mean(speed**2, axis=0)), axis=1)
     return np.asarray(repeats & moves, dtype=bool)
