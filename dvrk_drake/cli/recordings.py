@@ -11,7 +11,6 @@ import dvrk_drake as dvrk
 from dvrk_drake.cli.app import IDENTIFY, Arm, Coordinates, Json, Locked, Overwrite, Plots, Topic, Verbose, app
 from dvrk_drake.cli.support import Steps, check_output, mounted, plots_folder, print_notes, print_written, write_json
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.locked_joints import locked_option
 
 
 @app.command(group=IDENTIFY)
@@ -35,6 +34,7 @@ def check(
     Args:
         recording: CSV with columns q1..qn, tau1..taun (optionally t, qd1..qdn), ROS bag, or LCM log.
     """
+    from dvrk_drake.models.locked_joints import locked_option
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
 

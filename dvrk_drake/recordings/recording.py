@@ -296,6 +296,8 @@ def read_recording(
         if coordinates != "joint":
             raise RecordingError(f"{path}: an LCM log is in joint coordinates, not in {coordinates} coordinates")
         _refuse_topic(path, topic)
+        if arm is not None and arm.locked_joints:
+            raise RecordingError(f"{path}: an LCM log contains all joints of {arm.name}, so --locked is not accepted")
         log = read_status_log(path, arm)
         return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes, "event")
     share = step_progress(progress, "reading")

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
+from dvrk_drake.models.locked_joints import lock_hint
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -352,7 +353,9 @@ def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> li
             "only joints that are not recorded"
         )
     if missing := [joint for joint in arm.joint_names if joint not in names]:
-        advice = "Check --arm and --topic."
+        recorded = arm.num_joints - len(missing)
+        hint = lock_hint(arm, recorded) if missing == list(arm.joint_names[recorded:]) else ""
+        advice = f"Check --arm and --topic.{hint and f' {hint}'}"
         if missing == [arm.joint_names[-1]] == ["jaw"]:
             advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well."
         raise RecordingError(

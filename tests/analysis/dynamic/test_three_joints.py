@@ -88,7 +88,7 @@ def test_commands_end_to_end(folder, capsys):
     assert prediction.read_text().startswith("tau1,tau2,tau3\n")
 
 
-def test_file_of_the_controller_contains_the_instrument_as_it_was_held(folder):
+def test_controller_file_contains_the_held_instrument(folder):
     """The chain has a straight instrument, but its last link can represent any rigid instrument."""
     model = IdentifiedModel.from_arm(ARM)
     assert kinematic_compensation(model).error.max() < 1e-6
