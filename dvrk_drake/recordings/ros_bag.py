@@ -353,8 +353,8 @@ def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> li
             "only joints that are not recorded"
         )
     if missing := [joint for joint in arm.joint_names if joint not in names]:
-        recorded = arm.num_joints - len(missing)
-        hint = lock_hint(arm, recorded) if missing == list(arm.joint_names[recorded:]) else ""
+        count = arm.num_joints - len(missing)
+        hint = lock_hint(arm, count) if missing == list(arm.joint_names[count:]) else ""
         advice = f"Check --arm and --topic.{hint and f' {hint}'}"
         if missing == [arm.joint_names[-1]] == ["jaw"]:
             advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well."
