@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
+from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.recording import Recording
 
@@ -327,8 +328,15 @@ def _with_jaw(path: Path, arm: _Topic, jaw: _Topic, joint: str) -> tuple[_Topic,
 
 def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> list[int]:
     """Returns the column of each joint of the arm. Joints that are not in the arm are ignored."""
+    if recorded := [joint for joint in arm.locked_joints if joint in names]:
+        raise RecordingError(
+            f"{path}: {topic} contains {', '.join(recorded)}, but --locked states positions of these joints; allowed: "
+            "only joints that are not recorded"
+        )
     if missing := [joint for joint in arm.joint_names if joint not in names]:
-        advice = "Check --arm and --topic."
+        count = arm.num_joints - len(missing)
+        hint = lock_hint(arm, count) if missing == list(arm.joint_names[count:]) else ""
+        advice = f"Check --arm and --topic.{hint and f' {hint}'}"
         if missing == [arm.joint_names[-1]] == ["jaw"]:
             advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well."
         raise RecordingError(

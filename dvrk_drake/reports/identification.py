@@ -25,6 +25,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.locked_joints import locked_option, locked_text
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -48,7 +49,7 @@ def print_identification(
     verdicts = cross_validated_verdicts(result.model)
     next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     if worst(verdicts)[0] == "do not use":
-        next_command = f"dvrk-drake check {_source(result.recording)} --arm {result.model.arm.source}"
+        next_command = f"dvrk-drake check {_source(result.recording)} --arm {_arm_options(result.model.arm)}"
     if isinstance(result, DynamicIdentification):
         actuators = result.model.dynamic_model.section.actuators
         fit, held_out = (
@@ -69,6 +70,23 @@ def print_identification(
         _print_pose_errors(console, result, verdicts, verbose)
         if verbose:
             _print_pose_details(console, result)
+    _print_locked_joints(console, result.model.arm)
+
+
+def _print_locked_joints(console: Console, arm: Arm) -> None:
+    """Prints which joints are not in the recording, and for which of their positions the model is valid."""
+    if arm.locked_joints:
+        console.print(
+            f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {locked_text(arm)} "
+            "[rad, m], and it has no efforts of these joints.",
+            style="yellow",
+            markup=False,
+        )
+
+
+def _arm_options(arm: Arm) -> str:
+    """Returns the value of --arm, and the option --locked if joints are locked."""
+    return arm.source + locked_option(arm)
 
 
 def _source(recording: Recording) -> str:
@@ -97,10 +115,12 @@ def print_validation(
     verdicts, model = validation.verdicts, validation.model
     source = _source(validation.recording)
     next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode damped"
+    if model.arm.locked_joints:  # run requires all joints
+        next_command = f"dvrk-drake predict {source} --model {model_path} --output FILE.csv"
     if validation.of_same_recording:
         next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     elif validation.verdict == "do not use":
-        next_command = f"dvrk-drake check {source} --arm {model.arm.source}"
+        next_command = f"dvrk-drake check {source} --arm {_arm_options(model.arm)}"
         # Errors above 100 % are due to wrong signs, units or coordinates, which a refit of friction does not correct.
         plausible = all(error is None or error <= 1 for error in validation.relative_errors.values())
         if isinstance(validation, DynamicValidation) and plausible:
@@ -117,6 +137,7 @@ def print_validation(
         error = _largest_error(model.arm, errors, torques)
         _print_verdict(console, verdicts, error, next_command)
         _print_pose_validation(console, validation, verbose)
+    _print_locked_joints(console, model.arm)
 
 
 def print_recalibration(
