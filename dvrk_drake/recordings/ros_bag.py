@@ -169,7 +169,7 @@ class _Connections(NamedTuple):
 
 
 def fitting_topics(arm: Arm, topic: str | None, names: Iterable[str]) -> list[str]:
-    """Returns the JointState topics that fit an arm or the topic or namespace `topic`, see `read_joint_states`."""
+    """Returns the JointState topics that fit an arm or the topic or namespace `topic`, see `read_ros_bag`."""
     if topic is not None:
         return [name for name in (topic, f"{topic.rstrip('/')}/measured_js") if name in names][:1]
     pattern = re.compile(rf"(/.*)?/{re.escape(arm.name)}[0-9]*/measured_js")

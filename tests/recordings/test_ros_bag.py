@@ -94,15 +94,15 @@ def test_locked_joints_are_not_in_the_bag(psm, tmp_path):
     locked = psm.with_locked_joints(dict.fromkeys(psm.joint_names[3:], 0.0))
     q, qd, tau = blocks(5, 3)
     path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": joint_states(stamps(5), psm.joint_names[:3], q, qd, tau)})
-    np.testing.assert_array_equal(read_joint_states(path, locked).q, q)
+    np.testing.assert_array_equal(read_recording(path, locked).q, q)
     with pytest.raises(RecordingError, match="--locked roll=0 wrist_pitch=0 wrist_yaw=0 jaw=0"):
-        read_joint_states(path, psm)
+        read_recording(path, psm)
     (tmp_path / "whole").mkdir()
     q, qd, tau = blocks(5, 7)
     rows = joint_states(stamps(5), psm.joint_names, q, qd, tau)
     path = write_bag(tmp_path / "whole", "mcap", {"/PSM1/measured_js": rows})
     with pytest.raises(RecordingError, match="contains roll, wrist_pitch, wrist_yaw, jaw, but --locked states"):
-        read_joint_states(path, locked)
+        read_recording(path, locked)
 
 
 def test_reads_the_named_arm_of_several(psm, tmp_path):
