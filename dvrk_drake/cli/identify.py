@@ -83,7 +83,7 @@ def identify(
 
         plot_identification(folder, result)
     console = make_console()
-    print_identification(console, result, model_path=output, verbose=verbose)
+    print_identification(console, result, model_path=output, file_options=file.as_text(), verbose=verbose)
     if result.note:
         console.print(result.note)
     print_warnings(console, result.warnings)
@@ -152,7 +152,7 @@ def validate(
 
         plot_validation(folder, validation)
     console = make_console()
-    print_validation(console, validation, model_path=model, saved=save, verbose=verbose)
+    print_validation(console, validation, model_path=model, file_options=file.as_text(), saved=save, verbose=verbose)
     if validation.note:
         console.print(validation.note)
     print_warnings(console, validation.warnings)

@@ -36,7 +36,12 @@ _NAME_WIDTH = 64
 
 
 def print_identification(
-    console: Console, result: Identification, *, model_path: str = "MODEL.yaml", verbose: bool = False
+    console: Console,
+    result: Identification,
+    *,
+    model_path: str = "MODEL.yaml",
+    file_options: str = "",
+    verbose: bool = False,
 ) -> None:
     """Prints the verdict and the cross-validated error of each joint.
 
@@ -44,12 +49,15 @@ def print_identification(
         console: Console to print to.
         result: Result for static poses or for a motion.
         model_path: Path of the written model, for the suggested next command.
+        file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
         verbose: Whether to print each parameter with its standard error, and the excluded measurements.
     """
     verdicts = cross_validated_verdicts(result.model)
     next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     if worst(verdicts)[0] == "do not use":
-        next_command = f"dvrk-drake check {_source(result.recording)} --arm {_arm_options(result.model.arm)}"
+        next_command = (
+            f"dvrk-drake check {_source(result.recording, file_options)} --arm {_arm_options(result.model.arm)}"
+        )
     if isinstance(result, DynamicIdentification):
         actuators = result.model.dynamic_model.section.actuators
         fit, held_out = (
@@ -89,10 +97,9 @@ def _arm_options(arm: Arm) -> str:
     return arm.source + locked_option(arm)
 
 
-def _source(recording: Recording) -> str:
-    """Returns the path of a recording and the option for its coordinates, as arguments of a command."""
-    coordinates = "" if recording.coordinates == "joint" else f" --coordinates {recording.coordinates}"
-    return f"{recording.source or 'RECORDING.csv'}{coordinates}"
+def _source(recording: Recording, file_options: str) -> str:
+    """Returns the path of a recording and the options to read it, as arguments of a command."""
+    return f"{recording.source or 'RECORDING.csv'}{file_options}"
 
 
 def print_validation(
@@ -100,6 +107,7 @@ def print_validation(
     validation: Validation,
     *,
     model_path: str = "MODEL.yaml",
+    file_options: str = "",
     saved: bool = False,
     verbose: bool = False,
 ) -> None:
@@ -109,11 +117,12 @@ def print_validation(
         console: Console to print to.
         validation: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
+        file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
         saved: Whether the verdicts are stored in the model file, from which the command `run` reads them.
         verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
     """
     verdicts, model = validation.verdicts, validation.model
-    source = _source(validation.recording)
+    source = _source(validation.recording, file_options)
     next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode damped"
     if model.arm.locked_joints:  # run requires all joints
         next_command = f"dvrk-drake predict {source} --model {model_path} --output FILE.csv"
