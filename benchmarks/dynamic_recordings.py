@@ -96,16 +96,16 @@ def main() -> None:
 
 
 def read_public(path: Path, arm: Arm) -> Recording:
-    """Reads a recording in actuator coordinates; exits with a message if the check refuses it."""
+    """Reads a recording in the coordinates of WPI; exits with a message if the check refuses it."""
     try:
-        recording = read_recording(path, arm, "actuator")
+        recording = read_recording(path, arm, "wpi")
     except RecordingError as error:
         sys.exit(str(error))
     refusals = [f for f in check_recording(recording, arm).findings if f.severity == "refusal"]
     if refusals:
         sys.exit(
-            f"{path}: {refusals[0].where}: {refusals[0].what}. This benchmark requires actuator coordinates. Convert "
-            "the public file without --arm."
+            f"{path}: {refusals[0].where}: {refusals[0].what}. This benchmark requires the coordinates of the public "
+            "file. Convert it without --arm."
         )
     return recording
 

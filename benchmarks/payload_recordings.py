@@ -2,8 +2,8 @@
 
     python benchmarks/payload_recordings.py FOLDER
 
-FOLDER contains psm_one.csv, psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in actuator
-coordinates, with a header and times (docs/public_recordings.md).
+FOLDER contains psm_one.csv, psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in the
+coordinates "wpi", with a header and times (docs/public_recordings.md).
 
 The first table contains the estimated payloads. The second table shows how the model error depends on the duration of
 the recording to which friction is refitted. The third table compares the model errors after refitting to the same
@@ -47,7 +47,7 @@ def main() -> int:
     arm = load_arm("psm")
 
     def read(name: str) -> Recording:
-        return read_recording(options.folder / f"{name}.csv", arm, "actuator")
+        return read_recording(options.folder / f"{name}.csv", arm, "wpi")
 
     models = {name: identify_dynamic(read(name), arm).model for name in ("psm_one_no_weight", "psm_one")}
     for reference, model in models.items():

@@ -61,4 +61,4 @@ def test_public_recordings_are_read_without_options(benchmark, shared_data, arm,
     path = shared_data / "trajectories" / f"{file}.csv"
     if not path.is_file():
         pytest.skip(f"needs {path}")
-    assert benchmark.read_public(path, load_arm(arm)).coordinates == "actuator"
+    assert benchmark.read_public(path, load_arm(arm)).coordinates == "joint"

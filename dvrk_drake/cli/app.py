@@ -86,6 +86,15 @@ Gravity = Annotated[
         "the arm file.",
     ),
 ]
+Locked = Annotated[
+    list[str] | None,
+    Parameter(
+        metavar="NAME=POSITION ..",
+        consume_multiple=True,
+        help="Joints that were held and are not in the recording, with their positions [rad; m if prismatic], e.g. "
+        "roll=0 jaw=0. The recording contains the other joints as q1, q2, ...",
+    ),
+]
 Overwrite = Annotated[
     bool, Parameter(show_default=False, help="Replace existing files, and write into folders that are not empty.")
 ]

@@ -106,6 +106,7 @@ def export(
         if format in ("sdf", "urdf"):
             print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")
     if diff:
+        loaded.arm.refuse_locked_joints("--diff")
         bodies = model_bodies(loaded)
         sys.stdout.write(sdf_difference(loaded.arm, bodies.links, bodies.rotors))
 

@@ -13,6 +13,7 @@ from dvrk_drake.cli.app import (
     FileOptions,
     Gravity,
     Json,
+    Locked,
     Model,
     Overwrite,
     Plots,
@@ -53,6 +54,7 @@ def identify(
     method: Literal["robust", "paper"] = "robust",
     low_speed_segments: LowSpeedSegments = False,
     gravity: Gravity = None,
+    locked: Locked = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -68,7 +70,7 @@ def identify(
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, overwrite=overwrite)
-    recorded_arm = mounted(dvrk.load_arm(arm), gravity)
+    recorded_arm = mounted(dvrk.load_arm(arm), gravity, locked)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
         read = file.read(recording, recorded_arm, steps)
@@ -81,7 +83,7 @@ def identify(
 
         plot_identification(folder, result)
     console = make_console()
-    print_identification(console, result, model_path=output, verbose=verbose)
+    print_identification(console, result, model_path=output, file_options=file.as_text(), verbose=verbose)
     if result.note:
         console.print(result.note)
     print_warnings(console, result.warnings)
@@ -150,7 +152,7 @@ def validate(
 
         plot_validation(folder, validation)
     console = make_console()
-    print_validation(console, validation, model_path=model, saved=save, verbose=verbose)
+    print_validation(console, validation, model_path=model, file_options=file.as_text(), saved=save, verbose=verbose)
     if validation.note:
         console.print(validation.note)
     print_warnings(console, validation.warnings)
@@ -234,6 +236,7 @@ def payload(
     link: Annotated[str | None, Parameter(metavar="NAME")] = None,
     file: FileOptions = _FILE,
     gravity: Gravity = None,
+    locked: Locked = None,
     json: Json = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -252,10 +255,12 @@ def payload(
 
     if model is not None and gravity is not None:
         raise ModelError("--gravity requires --arm; with --model, the gravity vector of the model is used")
+    if model is not None and locked is not None:
+        raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
     if json is not None:
         check_output(json, reference, loaded, overwrite=overwrite)
     identified = None if model is None else dvrk.IdentifiedModel.load(model)
-    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if identified is None else identified.arm
+    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
         without_payload, with_payload = (file.read(path, recorded_arm, steps) for path in (reference, loaded))
         for recording in (without_payload, with_payload):

@@ -204,7 +204,8 @@ def _friction_compensator(
             "--friction-ratio and --hysteresis-ratio require --model; with compensated friction, an inaccurate "
             "gravity model makes the arm creep"
         )
-    arm, model = load_arm(controlled.arm), IdentifiedModel.load(controlled.model)
+    arm = load_arm(controlled.arm)
+    model = IdentifiedModel.load(controlled.model, arm)
     error = holding_error(model)
     if ratio and not error.any():
         raise ControllerError(

@@ -8,8 +8,17 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import IDENTIFY, Arm, FileOptions, Json, Overwrite, Plots, Recording, Verbose, app
-from dvrk_drake.cli.support import Steps, check_output, new_folder, plots_folder, print_notes, print_written, write_json
+from dvrk_drake.cli.app import IDENTIFY, Arm, FileOptions, Json, Locked, Overwrite, Plots, Recording, Verbose, app
+from dvrk_drake.cli.support import (
+    Steps,
+    check_output,
+    mounted,
+    new_folder,
+    plots_folder,
+    print_notes,
+    print_written,
+    write_json,
+)
 from dvrk_drake.errors import RecordingError
 
 _FILE = FileOptions()
@@ -39,6 +48,7 @@ def check(
     *,
     arm: Arm,
     file: FileOptions = _FILE,
+    locked: Locked = None,
     json: Json = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
@@ -48,10 +58,11 @@ def check(
 
     The exit code is 2 if the recording is not suitable for identification.
     """
+    from dvrk_drake.models.locked_joints import locked_option
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
 
-    recorded_arm = dvrk.load_arm(arm)
+    recorded_arm = mounted(dvrk.load_arm(arm), None, locked)
     if json is not None:
         check_output(json, recording, overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
@@ -61,7 +72,8 @@ def check(
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if json is not None:
         write_json(json, report.as_dict())
-    print_report(make_console(), report, arm=arm + file.as_text(), verbose=verbose)
+    options = arm + locked_option(recorded_arm) + file.as_text()
+    print_report(make_console(), report, arm=options, verbose=verbose)
     if json is not None:
         print_written(json)
     if folder is not None:
@@ -85,6 +97,7 @@ def convert(
     output: Annotated[str, Parameter(metavar="FILE")],
     file: FileOptions = _FILE,
     arm: Annotated[str | None, Parameter(metavar="ARM")] = None,
+    locked: Locked = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Convert a recording to a CSV with a header, or to an MCAP bag.
@@ -96,7 +109,9 @@ def convert(
     from dvrk_drake.recordings.conversion import convert as convert_recording
 
     check_output(output, recording, overwrite=overwrite)
-    loaded = None if arm is None else dvrk.load_arm(arm)
+    if arm is None and locked is not None:
+        raise RecordingError("--locked requires --arm")
+    loaded = None if arm is None else mounted(dvrk.load_arm(arm), None, locked)
     with Steps("reading") as steps:
         converted = convert_recording(recording, output, arm=loaded, progress=steps, **file.as_arguments())
     print_written(output, f"{len(converted)} rows, {converted.coordinates} coordinates")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -29,7 +30,7 @@ from rich.progress import (
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import leave
-from dvrk_drake.errors import DvrkDrakeError, ModelError
+from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -229,11 +230,32 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
         print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
 
 
-def mounted(arm: Arm, gravity: Sequence[float] | None) -> Arm:
-    """Returns the arm with the gravity vector given with --gravity. Without --gravity, returns the arm unchanged."""
-    if gravity is None:
-        return arm
-    return arm.with_gravity(gravity)
+def mounted(arm: Arm, gravity: Sequence[float] | None, locked: Sequence[str] | None = None) -> Arm:
+    """Returns the arm with the gravity vector given with --gravity and the locked joints given with --locked.
+
+    Args:
+        arm: Arm given with --arm.
+        gravity: Gravity vector [m/s^2]. None: the vector in the arm file.
+        locked: Arguments NAME=POSITION of --locked. None: no locked joints.
+
+    Raises:
+        ArmError: The gravity vector or a locked joint is not valid.
+    """
+    if gravity is not None:
+        arm = arm.with_gravity(gravity)
+    positions: dict[str, float] = {}
+    for argument in locked or ():
+        name, _, number = argument.partition("=")
+        try:
+            position = float(number)
+        except ValueError:
+            position = math.nan
+        if not (name and math.isfinite(position)):
+            raise ArmError(f"--locked {argument}: allowed: NAME=POSITION [rad, m], e.g. {arm.joint_names[-1]}=0")
+        if name in positions:
+            raise ArmError(f"--locked {argument}: {name} is given twice; give one position for each joint")
+        positions[name] = position
+    return arm.with_locked_joints(positions)
 
 
 class Steps:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -84,12 +84,13 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
     parameters = [StandardParameter(label, axis) for label in kept for axis in ("", "x", "y", "z")]
     lengths = named_lengths(plant, bodies, frames)
     regressor = _regressor_at_random_poses(plant, arm, list(kept.values()))
+    order = _preference_order(parameters, _locked_labels(plant, arm, kept))
     return GravityParameters(
         arm=arm,
         standard_parameters=tuple(parameters),
         to_standard=_to_standard(plant, arm, list(kept.values())),
         lengths={name: length for name, length in lengths.items() if name != "1"},
-        base=reduce_to_base(regressor, parameters, _preference_order(parameters), lengths),
+        base=reduce_to_base(regressor, parameters, order, lengths),
     )
 
 
@@ -220,17 +221,26 @@ def named_lengths(
     return lengths
 
 
-def _preference_order(parameters: Sequence[StandardParameter]) -> list[int]:
+def _locked_labels(plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, tuple[RigidBody, RigidTransform]]) -> set[str]:
+    """Returns the labels of the links that do not move relative to their parents, because their joints are locked."""
+    rows = zip(arm.tree_joint_names, arm.linkage.matrix, strict=True)
+    locked = {plant.GetJointByName(name).child_body().index() for name, row in rows if not np.any(row)}
+    return {label for label, (body, _) in bodies.items() if body.index() in locked}
+
+
+def _preference_order(parameters: Sequence[StandardParameter], locked: Collection[str] = ()) -> list[int]:
     """Returns parameter indices, with the parameters that are preferred as base parameters first.
 
     The order is: first moments of numbered links from tip to base, first moments of the linkage, masses from base to
     tip. With this order, masses are combined with the first moments of preceding links. Only masses that a prismatic
-    joint lifts form a separate base parameter, such as "(m3+...+m7)".
+    joint lifts form a separate base parameter, such as "(m3+...+m7)". The links behind a locked joint are combined
+    with the link that carries them, so they come last.
     """
 
     def key(index: int) -> tuple:
         p = parameters[index]
         number = int(p.label) if p.label.isdigit() else 0
-        return (not p.axis, -number if p.axis else number or math.inf, p.label, p.axis)
+        is_locked = p.label in locked
+        return (not p.axis, is_locked, -number if p.axis else number or math.inf, p.label, p.axis)
 
     return sorted(range(len(parameters)), key=key)

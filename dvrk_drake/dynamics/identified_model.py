@@ -30,6 +30,7 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.models.schema_fault import formerly, missing_key, schema_fault, with_current_keys, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
@@ -40,9 +41,10 @@ if TYPE_CHECKING:
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
 #: Format of the files that `IdentifiedModel.save` writes.
-FORMAT = "dvrk_drake identified model 4"
-#: Formats of earlier versions that can be read. In format 2, `arm` is a name or an absolute path.
-_EARLIER_FORMATS = ("dvrk_drake identified model 3", "dvrk_drake identified model 2")
+FORMAT = "dvrk_drake identified model 5"
+#: Formats of earlier versions that can be read. In formats 2 to 4, there are no locked joints. In format 2, `arm` is a
+#: name or an absolute path.
+_EARLIER_FORMATS = tuple(f"dvrk_drake identified model {version}" for version in (4, 3, 2))
 #: Allowed range of measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
 
@@ -159,11 +161,13 @@ class _Header:
         format: Version of the file's keys.
         arm: URL or name of an arm of this package, or path of an arm file relative to the model file.
         gravity: Gravity vector (3,) in the arm's base frame [m/s^2].
+        locked_joints: Positions of the joints that were not recorded [rad, m], see `Arm.with_locked_joints`.
     """
 
     format: str = ""
     arm: str = ""
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
+    locked_joints: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
 
 
 @dataclass(kw_only=True)
@@ -179,7 +183,8 @@ class IdentifiedModel(_Identified):
     is applied to each joint.
 
     Attributes:
-        arm: Arm with the gravity vector for which the base parameters were identified.
+        arm: Arm with the gravity vector for which the base parameters were identified. If the recording did not
+            contain all joints, the arm has locked joints, and the model is valid only for their positions.
         base_parameters: Base parameters in the order of `gravity_parameters(arm).base`. For a model identified from a
             motion, the base parameters are computed from the links in `dynamics`.
         effects: Position-dependent effects of a model identified from poses. The list is empty if the model has
@@ -235,8 +240,8 @@ class IdentifiedModel(_Identified):
 
         Args:
             path: Path of the model file.
-            arm: Expected arm. A model of an arm with another name is rejected. The returned model has the arm that the
-                model file names, not this object.
+            arm: Expected arm. A model of an arm with another name or other joints is rejected. The returned model has
+                the arm that the model file names, not this object.
 
         Raises:
             ModelError: The file does not exist, is not a model file, does not match the arm that it names, or is not a
@@ -246,16 +251,21 @@ class IdentifiedModel(_Identified):
         # Reject an unknown version before its keys are checked.
         version = content.get("format") if isinstance(content, dict) else None
         if version and version not in (FORMAT, *_EARLIER_FORMATS):
-            raise ModelError(f'{path}: format is "{version}"; allowed: "{FORMAT}", 3 and 2. Identify the arm again')
+            raise ModelError(f'{path}: format is "{version}"; allowed: "{FORMAT}", 4, 3 and 2. Identify the arm again')
         content = with_current_keys(ModelFile, content, str(path))
+        if version in _EARLIER_FORMATS:
+            content.setdefault("locked_joints", {})
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A missing number would otherwise silently become 0.
         if key := missing_key(ModelFile, content):
             raise ModelError(f"{path}: {key} is missing")
         try:
             own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
+            own_arm = own_arm.with_locked_joints(file.locked_joints)
             if arm is not None and own_arm.name != arm.name:
                 raise ModelError(f"the model is for {own_arm.name}, not for {arm.name}")
+            if arm is not None and own_arm.joint_names != arm.joint_names:
+                raise ModelError(_other_joints(own_arm, arm))
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
         except ArmError as error:
@@ -280,7 +290,8 @@ class IdentifiedModel(_Identified):
 
     def _file(self, arm: str) -> ModelFile:
         parts = {part.name: getattr(self, part.name) for part in fields(_Identified)}
-        return ModelFile(format=FORMAT, arm=arm, gravity=self.arm.gravity.tolist(), **parts)
+        header = {"gravity": self.arm.gravity.tolist(), "locked_joints": dict(self.arm.locked_joints)}
+        return ModelFile(format=FORMAT, arm=arm, **header, **parts)
 
     def check(self) -> None:
         """Raises ModelError unless the parameters match the arm."""
@@ -401,6 +412,16 @@ def _arm_reference(path: str | Path, arm: Arm) -> str:
     if not os.path.isabs(arm.source):
         return f"{PACKAGE_URL}arms/{arm.source}.yaml"
     return os.path.relpath(arm.source, os.path.dirname(os.path.realpath(path)))
+
+
+def _other_joints(own: Arm, arm: Arm) -> str:
+    """Returns a message on a model whose joints are not those of the expected arm."""
+    if not own.locked_joints:
+        return f"the model is for the joints {', '.join(own.joint_names)}; allowed: {', '.join(arm.joint_names)}"
+    return (
+        f"the model is valid only with locked joints ({locked_text(own)}), because the recording did not contain them; "
+        f"allowed: a model of the joints {', '.join(arm.joint_names)}. Identify a recording of these joints"
+    )
 
 
 def _arm_argument(path: str | Path, name: str) -> str:

@@ -132,6 +132,7 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
         ModelError: The model is not of an MTM, or the file belongs to another arm.
     """
     arm = model.arm
+    arm.refuse_locked_joints("a comparison")
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(f"{arm.name} is not an MTM; only the gravity-compensation file of an MTM can be compared")
     known = [name.upper() for name in known_arms()]

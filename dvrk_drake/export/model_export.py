@@ -72,13 +72,15 @@ def prepare_export(
 ) -> ModelExport:
     """Returns the content that `export_model` writes. See `export_model` for arguments and errors."""
     origin = origin or f"a model of {model.arm.name}"
+    if format not in get_args(Format):
+        raise ModelError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
+    if format != "dvrk-kinematic-gc":  # this file contains only yaw, pitch and insertion of a PSM
+        model.arm.refuse_locked_joints(f"the format {format}")
     if format in ("sdf", "urdf"):
         return ModelExport(model, format, origin, bodies=model_bodies(model))
     if format == "dvrk-kinematic-gc":
         file = kinematic_compensation(model, **({} if tolerance is None else {"tolerance": tolerance}))
         return ModelExport(model, format, origin, compensation=file)
-    if format != "dvrk-gc":
-        raise ModelError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
     coulomb = None if friction is False else dry_friction(model) if friction is True else friction
     given = {
         "tolerance": tolerance,

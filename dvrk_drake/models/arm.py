@@ -30,6 +30,7 @@ from dvrk_drake.models.arm_schema import (
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.locked_joints import lock_joints, locked_text
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, suggest_name, within
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
@@ -78,6 +79,8 @@ class Arm:
             `simulated_effects`.
         separate_joint: Name of the joint that the dVRK publishes on ROS topics of its own, e.g. "jaw"; "" if there is
             none.
+        locked_joints: Positions of the joints that are locked [rad, m], see `with_locked_joints`. They are not among
+            the n independent joints.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -110,12 +113,14 @@ class Arm:
     identification: IdentificationSettings
     effects: ArmEffects
     separate_joint: str = ""
+    locked_joints: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
 
     def __post_init__(self) -> None:
         self.check()
 
     def __repr__(self) -> str:
-        return f"<Arm {self.name}: {self.source}>"
+        locked = f", locked {locked_text(self)}" if self.locked_joints else ""
+        return f"<Arm {self.name}: {self.source}{locked}>"
 
     def check(self) -> None:
         """Checks the range of all numbers, the order of the limits and the number of elements of each vector.
@@ -261,6 +266,39 @@ class Arm:
             ArmError: `gravity` does not have three elements, or its norm exceeds 30 m/s^2.
         """
         return _mounted(self, tuple(_checked_gravity(gravity).tolist()))
+
+    def with_locked_joints(self, positions: Mapping[str, float]) -> Arm:
+        """Returns the arm with locked joints, as with `pydrake.multibody.tree.Joint.Lock`.
+
+        The returned arm has only the other joints. Its dynamics are those of these joints while the locked joints are
+        at rest at the given positions. Use it for recordings of some of the joints.
+
+        Args:
+            positions: Mapping from the name of each locked joint to its position [rad, m].
+
+        Raises:
+            ArmError: A joint is unknown, a position violates the limits, all joints are locked, or a motor moves a
+                locked joint together with another joint.
+
+        Example:
+            >>> import dvrk_drake as dvrk
+            >>> arm = dvrk.load_arm("psm").with_locked_joints({"roll": 0, "wrist_pitch": 0, "wrist_yaw": 0, "jaw": 0})
+            >>> arm.num_joints, arm.joint_names
+            (3, ('yaw', 'pitch', 'insertion'))
+        """
+        return lock_joints(self, positions)
+
+    def refuse_locked_joints(self, use: str) -> None:
+        """Raises ArmError if the arm has locked joints.
+
+        Args:
+            use: What requires all joints, for the message, e.g. "a controller".
+        """
+        if self.locked_joints:
+            raise ArmError(
+                f"{self.name} has locked joints ({locked_text(self)}), but {use} requires all joints; use a model that "
+                "was identified from a recording of all joints"
+            )
 
 
 @cache

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, read_numbers
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.recording import Recording, column_names
@@ -89,7 +90,7 @@ def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict
         f"joints: {3 * n} columns (q, qd, tau) or {2 * n} (q, tau)"
     )
     if arm is not None and width % 2 == 0 and width // 2 < n:
-        message += f". The file may have {width // 2} joints: {arm.name} has {', '.join(arm.joint_names)}"
+        message += f". {lock_hint(arm, width // 2)}"
     if path.name.startswith("StateDataCollection"):
         message += f". Files of the cisst collector need their description {path.with_suffix('.desc').name}"
     raise RecordingError(message)
@@ -106,9 +107,11 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
         if len(missing) == num_joints and not needed:
             continue
         if missing:
+            recorded = num_joints - len(missing)
+            hint = lock_hint(arm, recorded) if arm and prefix == "q" and missing == names[recorded:] else ""
             raise RecordingError(
                 f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
-                f"needs {_expected_columns(num_joints)}{_joint_list(arm)}"
+                f"needs {_expected_columns(num_joints)}{_joint_list(arm)}{hint and f'. {hint}'}"
             )
         if f"{prefix}{num_joints + 1}" in header:
             raise RecordingError(

@@ -233,10 +233,12 @@ def read_status_log(path: Path, options: FileOptions) -> Recording:
         options: Arm whose statuses are read; None if the log has statuses of only one arm.
 
     Raises:
-        RecordingError: The file is not an LCM log or has no usable status, or the arm is None and the log has statuses
-            of several arms.
+        RecordingError: The file is not an LCM log or has no usable status, the arm has locked joints, or the arm
+            is None and the log has statuses of several arms.
     """
     arm = options.arm
+    if arm is not None and arm.locked_joints:
+        raise RecordingError(f"{path}: an LCM log contains all joints of {arm.name}, so --locked is not accepted")
     log = LcmLogReader(path)
     channel = status_channel(arm) if arm else _only_status_channel(log)
     stream = StatusStream(arm.name, arm.num_joints) if arm else None

@@ -72,7 +72,6 @@ class McapWriter:
         """
         # These imports take 0.2 s, and most commands write no bag.
         from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
-        from mcap.writer import Writer
         from rosbags.typesys import Stores, get_typestore
 
         store = get_typestore(Stores.ROS2_JAZZY)
@@ -80,7 +79,7 @@ class McapWriter:
         self._state, self._header, self._time = (
             store.types[name] for name in (JOINT_STATE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
         )
-        self._writer: Any = Writer(stream, use_chunking=chunked)
+        self._writer = _new_writer(stream, chunked=chunked)
         self._writer.start(Profile.ROS2, f"dvrk-drake {version('dvrk-drake')}")
         definition, _ = store.generate_msgdef(JOINT_STATE, ros_version=2)
         schema = self._writer.register_schema(JOINT_STATE, SchemaEncoding.ROS2, definition.encode())
@@ -108,7 +107,10 @@ class McapWriter:
             RecordingError: The stamp is 0, negative or too large.
         """
         if not 0 < stamp <= _LAST_STAMP:
-            raise RecordingError(f"a measurement at {stamp / 1e9:g} s; header stamps are above 0, up to 2147483647 s")
+            raise RecordingError(
+                f"the time of a measurement is {stamp / 1e9:g} s; a bag needs times above 0 s, up to "
+                f"{_LAST_STAMP / 1e9:.0f} s"
+            )
         empty = np.empty(0)
         message = self._state(
             header=self._header(stamp=self._time(*divmod(stamp, 1_000_000_000)), frame_id=""),
@@ -180,14 +182,21 @@ class _Records:
         return self._size
 
 
+def _new_writer(stream: Any, *, chunked: bool = True) -> Any:
+    from mcap.writer import IndexType, Writer
+
+    # The library would write pointers to the empty indexes of attachments and metadata, which the format does not have.
+    indexes = IndexType.CHUNK | IndexType.MESSAGE if chunked else IndexType.NONE
+    return Writer(stream, use_chunking=chunked, index_types=indexes)
+
+
 def _pack(path: str | Path, progress: Callable[[float], object]) -> None:
     """Replaces a bag without chunks by one with compressed chunks and an index, atomically."""
     from mcap.records import Channel, Header, Message, Schema
     from mcap.stream_reader import StreamReader
-    from mcap.writer import Writer
 
     with open(path, "rb") as source, atomic_write(path, "wb") as stream:
-        writer, size, count = Writer(stream), os.path.getsize(path), 0
+        writer, size, count = _new_writer(stream), os.path.getsize(path), 0
         seen: set[tuple[type, int]] = set()
         for record in StreamReader(source).records:
             if isinstance(record, Header):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
+from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.recording import Recording
 
@@ -168,7 +169,7 @@ class _Connections(NamedTuple):
 
 
 def fitting_topics(arm: Arm, topic: str | None, names: Iterable[str]) -> list[str]:
-    """Returns the JointState topics that fit an arm or the topic or namespace `topic`, see `read_joint_states`."""
+    """Returns the JointState topics that fit an arm or the topic or namespace `topic`, see `read_ros_bag`."""
     if topic is not None:
         return [name for name in (topic, f"{topic.rstrip('/')}/measured_js") if name in names][:1]
     pattern = re.compile(rf"(/.*)?/{re.escape(arm.name)}[0-9]*/measured_js")
@@ -208,7 +209,7 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
     stamps, messages = array("q"), array("q")
     blocks = {name: array("d") for name in ("position", "velocity", "effort")}
     present: list[tuple[str, array]] = []
-    unstamped, late, invalid, last = 0, 0, 0, 0
+    unstamped, late, invalid, last, first_late = 0, 0, 0, 0, ""
     topic = connections.topic
     for number, message in enumerate(bag.messages(connections), 1):
         if number % _REPORT == 0:
@@ -242,6 +243,7 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
             continue
         if stamp <= last:
             late += 1
+            first_late = first_late or f"message {number} is {1e-9 * (last - stamp):g} s before the previous one"
             continue
         last = stamp
         stamps.append(stamp)
@@ -262,8 +264,8 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
         raise RecordingError(f"{bag.path}: {topic} has no usable message ({reasons})")
     if late > len(stamps):
         raise RecordingError(
-            f"{bag.path}: the header stamps of {topic} do not increase in {late} of {late + len(stamps)} messages. "
-            "Record a bag while the console publishes measured data."
+            f"{bag.path}: the header stamps of {topic} do not increase in {late} of {late + len(stamps)} messages: "
+            f"{first_late}. Cut the bag where the clock was set, or record again."
         )
     q, qd, tau = (np.frombuffer(block).reshape(len(stamps), -1) if block else None for block in blocks.values())
     assert q is not None
@@ -326,8 +328,15 @@ def _with_jaw(path: Path, arm: _Topic, jaw: _Topic, joint: str) -> tuple[_Topic,
 
 def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> list[int]:
     """Returns the column of each joint of the arm. Joints that are not in the arm are ignored."""
+    if recorded := [joint for joint in arm.locked_joints if joint in names]:
+        raise RecordingError(
+            f"{path}: {topic} contains {', '.join(recorded)}, but --locked states positions of these joints; allowed: "
+            "only joints that are not recorded"
+        )
     if missing := [joint for joint in arm.joint_names if joint not in names]:
-        advice = "Check --arm and --topic."
+        count = arm.num_joints - len(missing)
+        hint = lock_hint(arm, count) if missing == list(arm.joint_names[count:]) else ""
+        advice = f"Check --arm and --topic.{hint and f' {hint}'}"
         if missing == [arm.joint_names[-1]] == ["jaw"]:
             advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well."
         raise RecordingError(

@@ -18,6 +18,7 @@ from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, K
 from dvrk_drake.export.model_export import ModelExport
 from dvrk_drake.export.sdf import LinkChange, changed_links
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
@@ -140,12 +141,14 @@ def _print_kinematic_compensation(
         f"The file differs from the model by at most {file.error[j]:.1e} {units[j]} ({ARM_JOINTS[j]}), at rest.",
         "enter the path of the file in the JSON file of the arm",
     )
-    table = make_table(
-        "Largest difference from the model at rest", "", "straight instrument", "change by a bent wrist", ""
-    )
+    locked = locked_text(export.model.arm)
+    columns = (f"with {locked}",) if locked else ("straight instrument", "change by a bent wrist")
+    table = make_table("Largest difference from the model at rest", "", *columns, "")
     for name, error, wrist, unit in zip(ARM_JOINTS, file.error, file.wrist, units, strict=True):
-        table.add_row(name, f"{error:.1e}", f"{wrist:.1e}", unit)
+        table.add_row(name, f"{error:.1e}", *([] if locked else [f"{wrist:.1e}"]), unit)
     console.print(table)
+    if locked:
+        print_note(console, "The torque for other positions of the instrument is not identified.")
     if verbose:
         console.print()
         table = make_table("Links of the chain, centre of mass in the DH frame", "", "mass [kg]", "x, y, z [mm]")

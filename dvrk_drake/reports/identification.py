@@ -25,6 +25,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.locked_joints import locked_option, locked_text
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -35,7 +36,12 @@ _NAME_WIDTH = 64
 
 
 def print_identification(
-    console: Console, result: Identification, *, model_path: str = "MODEL.yaml", verbose: bool = False
+    console: Console,
+    result: Identification,
+    *,
+    model_path: str = "MODEL.yaml",
+    file_options: str = "",
+    verbose: bool = False,
 ) -> None:
     """Prints the verdict and the cross-validated error of each joint.
 
@@ -43,12 +49,15 @@ def print_identification(
         console: Console to print to.
         result: Result for static poses or for a motion.
         model_path: Path of the written model, for the suggested next command.
+        file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
         verbose: Whether to print each parameter with its standard error, and the excluded measurements.
     """
     verdicts = cross_validated_verdicts(result.model)
     next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     if worst(verdicts)[0] == "do not use":
-        next_command = f"dvrk-drake check {_source(result.recording)} --arm {result.model.arm.source}"
+        next_command = (
+            f"dvrk-drake check {_source(result.recording, file_options)} --arm {_arm_options(result.model.arm)}"
+        )
     if isinstance(result, DynamicIdentification):
         actuators = result.model.dynamic_model.section.actuators
         fit, held_out = (
@@ -69,12 +78,28 @@ def print_identification(
         _print_pose_errors(console, result, verdicts, verbose)
         if verbose:
             _print_pose_details(console, result)
+    _print_locked_joints(console, result.model.arm)
 
 
-def _source(recording: Recording) -> str:
-    """Returns the path of a recording and the option for its coordinates, as arguments of a command."""
-    coordinates = "" if recording.coordinates == "joint" else f" --coordinates {recording.coordinates}"
-    return f"{recording.source or 'RECORDING.csv'}{coordinates}"
+def _print_locked_joints(console: Console, arm: Arm) -> None:
+    """Prints which joints are not in the recording, and for which of their positions the model is valid."""
+    if arm.locked_joints:
+        console.print(
+            f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {locked_text(arm)} "
+            "[rad, m], and it has no efforts of these joints.",
+            style="yellow",
+            markup=False,
+        )
+
+
+def _arm_options(arm: Arm) -> str:
+    """Returns the value of --arm, and the option --locked if joints are locked."""
+    return arm.source + locked_option(arm)
+
+
+def _source(recording: Recording, file_options: str) -> str:
+    """Returns the path of a recording and the options to read it, as arguments of a command."""
+    return f"{recording.source or 'RECORDING.csv'}{file_options}"
 
 
 def print_validation(
@@ -82,6 +107,7 @@ def print_validation(
     validation: Validation,
     *,
     model_path: str = "MODEL.yaml",
+    file_options: str = "",
     saved: bool = False,
     verbose: bool = False,
 ) -> None:
@@ -91,16 +117,19 @@ def print_validation(
         console: Console to print to.
         validation: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
+        file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
         saved: Whether the verdicts are stored in the model file, from which the command `run` reads them.
         verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
     """
     verdicts, model = validation.verdicts, validation.model
-    source = _source(validation.recording)
+    source = _source(validation.recording, file_options)
     next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode damped"
+    if model.arm.locked_joints:  # run requires all joints
+        next_command = f"dvrk-drake predict {source} --model {model_path} --output FILE.csv"
     if validation.of_same_recording:
         next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     elif validation.verdict == "do not use":
-        next_command = f"dvrk-drake check {source} --arm {model.arm.source}"
+        next_command = f"dvrk-drake check {source} --arm {_arm_options(model.arm)}"
         # Errors above 100 % are due to wrong signs, units or coordinates, which a refit of friction does not correct.
         plausible = all(error is None or error <= 1 for error in validation.relative_errors.values())
         if isinstance(validation, DynamicValidation) and plausible:
@@ -117,6 +146,7 @@ def print_validation(
         error = _largest_error(model.arm, errors, torques)
         _print_verdict(console, verdicts, error, next_command)
         _print_pose_validation(console, validation, verbose)
+    _print_locked_joints(console, model.arm)
 
 
 def print_recalibration(

@@ -17,6 +17,7 @@ from dvrk_drake.analysis.payload.payload import (
     equally_good_links,
 )
 from dvrk_drake.analysis.payload.point_mass import MAX_MASS
+from dvrk_drake.models.locked_joints import locked_option
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
@@ -44,7 +45,11 @@ def print_payload(
     elif payload.found and names:
         answer += f" A payload on {names[0]} explains the change of the efforts better."
     clear = payload.found and not names
-    command = f"--arm {result.model.arm.source}" if model_path is None else f"--model {model_path}"
+    command = (
+        f"--arm {result.model.arm.source}{locked_option(result.model.arm)}"
+        if model_path is None
+        else f"--model {model_path}"
+    )
     command = f"dvrk-drake payload REFERENCE LOADED {command} " + ("--json FILE" if clear else "--link LINK")
     print_answer(console, answer, command, "green" if clear else "yellow")
     if payload.found:

@@ -41,7 +41,11 @@ def station_ports(arm: Arm) -> StationPorts:
     """Returns the ports of a station. Their names are those of Drake's iiwa driver with the arm's name as a prefix.
 
     Each port has n numbers, or 2n for a state, in the arm's order of joints [rad, rad/s, N m; m, m/s, N].
+
+    Raises:
+        ArmError: The arm has locked joints.
     """
+    arm.refuse_locked_joints("a station")
     n, name = arm.num_joints, arm.name.lower()
     return StationPorts(
         inputs={f"{name}.effort_commanded": n},
@@ -150,6 +154,7 @@ class ArmStation(Diagram):
             StationError: The configuration of the plant is not valid for an arm, or `plant_arm` has other joints.
         """
         super().__init__()
+        arm.refuse_locked_joints("a station")
         self._arm = arm
         self._ground_truth_arm = plant_arm or arm
         self._plant_effects: PlantEffects | None = None

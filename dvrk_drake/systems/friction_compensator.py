@@ -75,6 +75,7 @@ class FrictionCompensator(LeafSystem):
             ControllerError: A number is out of range.
         """
         super().__init__()
+        friction.arm.refuse_locked_joints("a friction compensator")
         check_ratios(ratio, hysteresis_ratio)
         if not (1 <= widening <= 10 and 0 < period < 1):
             raise ControllerError(

@@ -101,11 +101,13 @@ class GravityPidController(LeafSystem):
 
         Raises:
             ModelError: The model is not valid for its arm.
+            ArmError: The arm of the model has locked joints.
             ControllerError: A period, gain, mode or limit is invalid.
         """
         super().__init__()
         model.check()
         arm = model.arm
+        arm.refuse_locked_joints("a controller")
         self._arm, self._joint_names = arm, arm.joint_names
         n = arm.num_joints
         limits = np.asarray(arm.effort_limits if effort_limits is None else effort_limits, float)

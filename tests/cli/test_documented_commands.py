@@ -42,7 +42,9 @@ def test_documented_commands_are_valid(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if "dvrk-drake samples" in page.read_text()], ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "dvrk-drake samples" in page.read_text()], ids=lambda p: p.name
+)
 def test_commands_with_samples_run(page, tmp_path, monkeypatch):
     """The commands of a page run in their order, as a new user enters them."""
     monkeypatch.chdir(tmp_path)

@@ -131,7 +131,9 @@ def test_a_file_with_a_number_outside_its_range_is_refused(name):
 def test_an_arm_with_a_number_outside_its_range_is_refused(name, value):
     arm = load_arm("mtml")
     effects = dataclasses.replace(arm.effects, stretch={"outer_yaw": Cable(1000.0, 1.0)})
-    whole = dataclasses.replace(arm, effects=effects, friction_coordinates={"pulley": np.eye(7)[0]})
+    whole = dataclasses.replace(
+        arm, effects=effects, friction_coordinates={"pulley": np.eye(7)[0]}, locked_joints={"held": 0.0}
+    )
     with pytest.raises(ArmError, match=r"allowed: |gravity \(") as refused:
         changed(whole, IN_OBJECTS[name][0], value)
     assert "\n" not in str(refused.value)

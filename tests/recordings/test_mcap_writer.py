@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +14,12 @@ from mcap.reader import make_reader
 from recordings import random_recording, six_joint_arm
 from rosbags.highlevel import AnyReader
 
+from dvrk_drake.analysis.identification import identify
+from dvrk_drake.analysis.static.static_identification import StaticIdentification
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.mcap_writer import joint_state_topics
+from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording
 
@@ -84,6 +91,21 @@ def test_poses_without_times_remain_poses(tmp_path):
     np.testing.assert_array_equal(again.tau, poses.tau)
 
 
+@pytest.mark.parametrize("name", ARMS)
+def test_bag_of_poses_gives_the_model_of_the_csv(tmp_path, name):
+    """With more than `MIN_ROWS` poses, a bag with shorter intervals would be a motion."""
+    arm, generator = ARMS[name], np.random.default_rng(3)
+    q = arm.sample_poses(120, generator, margin=0.05)
+    tau = IdentifiedModel.from_arm(arm).holding_torque(q) * generator.normal(1.0, 0.02, q.shape)
+    torques = []
+    for file in ("poses.csv", "poses.mcap"):
+        write_recording(Recording(q=q, tau=tau), tmp_path / file, arm)
+        result = identify(read_recording(tmp_path / file, arm), arm)
+        assert isinstance(result, StaticIdentification)
+        torques.append(result.model.holding_torque(q))
+    np.testing.assert_allclose(*torques, atol=1e-12)
+
+
 def test_actuator_coordinates_are_converted(tmp_path):
     arm = ARMS["mtml"]
     recording = random_recording(coordinates="actuator")
@@ -121,3 +143,34 @@ def test_bag_needs_an_arm(tmp_path):
     with pytest.raises(RecordingError, match=r"x\.mcap: an MCAP bag needs the arm .*: --arm"):
         write_recording(Recording(q=np.zeros((3, 7))), tmp_path / "x.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("tool", ["mcap", "pymcap-cli"])
+def test_command_lines_accept_and_recover_bags(tmp_path, tool):
+    """`mcap` is the tool of the format's authors, `pymcap-cli` an independent one with the same commands, from PyPI."""
+    program = shutil.which(tool, path=os.pathsep.join([os.path.dirname(sys.executable), os.environ.get("PATH", "")]))
+    if program is None:
+        pytest.skip(f"the command line {tool} is not installed")
+
+    def run(*arguments):
+        return subprocess.run([program, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    arm, recording = ARMS["psm"], random_recording(300)
+    write_recording(recording, tmp_path / "once.mcap", arm)
+    topics = joint_state_topics(arm)
+    growing = GrowingMcap(tmp_path / "grown.mcap", [topic.name for topic in topics])
+    for k in range(len(recording)):
+        for topic in topics:
+            growing.write(topic, 10**9 + k * 10**6, recording.q[k], recording.qd[k], recording.tau[k])
+    (tmp_path / "killed.mcap").write_bytes((tmp_path / "grown.mcap").read_bytes()[:-1])
+    growing.close()
+    for name in ("once.mcap", "grown.mcap"):
+        assert "600" in run("info", name).stdout
+        doctor = run("doctor", name)
+        assert doctor.returncode == 0, doctor.stdout + doctor.stderr
+    assert run("doctor", "killed.mcap").returncode != 0
+    run("recover", "killed.mcap", "-o", "recovered.mcap")  # pymcap-cli returns 3, because data are lost
+    # The last message, of the jaw, is not complete.
+    recovered = read_recording(tmp_path / "recovered.mcap", arm)
+    np.testing.assert_array_equal(recovered.q[:-1], recording.q[:-1])
+    np.testing.assert_array_equal(recovered.q[-1, :6], recording.q[-1, :6])

@@ -90,6 +90,21 @@ def test_names_the_missing_topic_of_the_jaw(psm, tmp_path):
         read_recording(path, psm)
 
 
+def test_locked_joints_are_not_in_the_bag(psm, tmp_path):
+    locked = psm.with_locked_joints(dict.fromkeys(psm.joint_names[3:], 0.0))
+    q, qd, tau = blocks(5, 3)
+    path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": joint_states(stamps(5), psm.joint_names[:3], q, qd, tau)})
+    np.testing.assert_array_equal(read_recording(path, locked).q, q)
+    with pytest.raises(RecordingError, match="--locked roll=0 wrist_pitch=0 wrist_yaw=0 jaw=0"):
+        read_recording(path, psm)
+    (tmp_path / "whole").mkdir()
+    q, qd, tau = blocks(5, 7)
+    rows = joint_states(stamps(5), psm.joint_names, q, qd, tau)
+    path = write_bag(tmp_path / "whole", "mcap", {"/PSM1/measured_js": rows})
+    with pytest.raises(RecordingError, match="contains roll, wrist_pitch, wrist_yaw, jaw, but --locked states"):
+        read_recording(path, locked)
+
+
 def test_reads_the_named_arm_of_several(psm, tmp_path):
     first, second = blocks(5, 7, seed=1), blocks(5, 7, seed=2)
     topics = {
@@ -141,7 +156,10 @@ def damaged(mtm):
     yield {topic: joint_states(stamps(10), names, q[:, :5], qd, tau)}, "5 numbers in `position`, but 7 joints"
     yield {topic: joint_states(stamps(10), (), q)}, "names no joints"
     yield {topic: joint_states(stamps(10), [names[0]] * 7, q)}, "names a joint twice"
-    yield {topic: joint_states(still, names, q, qd, tau)}, "do not increase in 9 of 10"
+    yield (
+        {topic: joint_states(still, names, q, qd, tau)},
+        "do not increase in 9 of 10 messages: message 2 is 0 s before",
+    )
     yield {topic: joint_states(np.zeros(10), names, q, qd, tau)}, "no usable message.*header stamp 0"
     yield {topic: []}, "no messages"
     yield {}, "JointState messages: none"

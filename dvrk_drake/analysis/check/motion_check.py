@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport
+from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.signals.effort_lag import LAG_STEP, MAX_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.signals.low_pass import resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionSignals, motion_signals
@@ -16,6 +16,7 @@ from dvrk_drake.analysis.signals.repetition import find_period, repeatability_fl
 from dvrk_drake.analysis.signals.true_time import (
     TrueTime,
     VelocityAgreement,
+    distinct_rows,
     repeated_block,
     repeated_rows,
     true_time,
@@ -24,7 +25,7 @@ from dvrk_drake.analysis.signals.true_time import (
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
 
-#: Smallest reported share of repeated rows. Smaller shares can occur by chance.
+#: Smallest share of repeated rows for a warning. A smaller share hardly changes a model and is a note.
 MIN_REPEATED = 0.005
 #: Smallest difference of two shares of rows for a warning that a signal (q, qd or tau) comes from a slower topic: the
 #: share of rows that repeat this signal, and the share of rows that repeat all signals.
@@ -60,7 +61,7 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
     clock = true_time(actuators)
     t = np.asarray(actuators.t)
     duration, rate = float(t[-1] - t[0]), 1 / interval
-    findings = [*_rows(actuators, clock), *_gap_findings(recording, gaps)]
+    findings = [*_times(clock), *_gap_findings(recording, gaps)]
     report = replace(
         report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
     )
@@ -78,8 +79,11 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
     work = _work(signals)
     findings += _velocities(agreement, names) + _lags(lags, names) + _correlated_joints(signals, moving, names)
     findings += _wrong_signs(work, lags, arm)
-    even_times = t[0] + np.arange(len(t)) * (duration / (len(t) - 1))
-    rows = actuators if np.ptp(np.diff(t)) < 1e-3 / rate else _resampled(actuators, even_times)
+    rows = actuators
+    if distinct_rows(actuators).stalled:
+        rows = _resampled(_true_rows(actuators, clock), rate)
+    elif np.ptp(np.diff(t)) >= 1e-3 / rate:
+        rows = _resampled(actuators, rate)
     period = find_period(rows.q, rate)
     report, more = _noise(report, rows, rate, period, arm)
     findings += more
@@ -99,25 +103,43 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
     return replace(report, joints=joints), findings
 
 
-def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
+def repeated_row_findings(actuators: Recording) -> list[Finding]:
+    """Returns findings for rows that repeat the previous row, in all signals or only in some of them.
+
+    Args:
+        actuators: Motion in actuator coordinates. Its times need not increase.
+    """
     findings = []
-    all_signals = float(np.mean(repeated_rows(actuators)))
+    repeats = repeated_rows(actuators)
+    all_signals, count = float(np.mean(repeats)), int(np.sum(repeats))
     blocks = {
         name: float(np.mean(repeated_block(block)))
         for name, block in (("q", actuators.q), ("qd", actuators.qd), ("tau", actuators.tau))
         if block is not None and np.any(block)
     }
-    if all_signals > MIN_REPEATED:
-        shares = ", ".join(f"{name} {100 * share:.1f} %" for name, share in blocks.items())
-        what = f"{100 * all_signals:.1f} % of the rows repeat the previous row ({shares})"
-        advice = "Repeated rows are not used. They occur if a topic is polled too fast. Record each message once."
-        findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=all_signals))
-    for name, share in blocks.items():
+    if count:
+        share = f"{100 * all_signals:.2g} %" if all_signals < 0.01 else f"{100 * all_signals:.1f} %"
+        what = (
+            f"{count} row{'s' * (count != 1)} ({share}) repeat{'s' * (count == 1)} all signals of the previous row "
+            f"while the arm moves, first at {actuators.where(int(np.argmax(repeats)))}"
+        )
+        advice = "Usual causes: the recorder read faster than the arm published, or messages were lost."
+        if actuators.has_increasing_times and distinct_rows(actuators).stalled:
+            advice = "The time stalled: positions and velocities agree only without the intervals of these rows."
+        advice += " Repeated rows are not used. Record each message once, with its time stamp."
+        severity: Severity = "warning" if all_signals > MIN_REPEATED else "note"
+        findings.append(Finding(severity, "repeated rows", "rows", what, advice, size=all_signals))
+    for name, share_of_signal in blocks.items():
         # Constant channels are reported by another check.
-        if all_signals + MIN_EXTRA < share < 1 - 2 / len(actuators):
-            what = f"{100 * share:.1f} % of the rows repeat {name} but not the other signals"
+        if all_signals + MIN_EXTRA < share_of_signal < 1 - 2 / len(actuators):
+            what = f"{100 * share_of_signal:.1f} % of the rows repeat {name} but not the other signals"
             advice = f"{name} comes from a slower topic and is late by up to one interval of that topic."
-            findings.append(Finding("warning", "repeated channel", name, what, advice, size=share))
+            findings.append(Finding("warning", "repeated channel", name, what, advice, size=share_of_signal))
+    return findings
+
+
+def _times(clock: TrueTime) -> list[Finding]:
+    findings = []
     if clock.reconstructed and clock.jitter > MIN_JITTER:
         what = (
             "time stamps disagree with the positions and velocities (intervals deviate by "
@@ -238,8 +260,15 @@ def _wrong_signs(work: NDArray[np.float64], lags: EffortLag, arm: Arm) -> list[F
     return findings
 
 
-def _resampled(actuators: Recording, times: NDArray[np.float64]) -> Recording:
+def _true_rows(actuators: Recording, clock: TrueTime) -> Recording:
+    """Returns the rows that do not repeat the previous row, at their true times."""
+    qd = None if actuators.qd is None else actuators.qd[clock.rows]
+    return Recording(actuators.q[clock.rows], actuators.measured_effort()[clock.rows], qd, clock.t, "actuator")
+
+
+def _resampled(actuators: Recording, rate: float) -> Recording:
     t = np.asarray(actuators.t)
+    times = np.arange(t[0], t[-1], 1 / rate)
     q, tau = (resample(t, x, times) for x in (actuators.q, actuators.measured_effort()))
     qd = None if actuators.qd is None else resample(t, actuators.qd, times)
     return Recording(q, tau, qd, times, "actuator")

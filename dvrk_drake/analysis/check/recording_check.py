@@ -9,16 +9,18 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
-from dvrk_drake.analysis.check.motion_check import check_motion
+from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
 from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.signals.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Smallest range of the positions of a joint that moves [rad], [m].
 MIN_RANGE = 0.02, 0.002
@@ -34,8 +36,6 @@ IMPOSSIBLE_EXCESS = 0.3
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
 #: Largest relative error of the recorded times, estimated from q and qd. A larger error indicates a wrong unit or rate.
 TIME_TOLERANCE = 0.05
-#: Number of rows between two positions whose difference is compared with the integral of qd.
-BLOCK = 20
 _ORDER: dict[Severity, int] = {"refusal": 0, "warning": 1, "note": 2}
 
 
@@ -52,6 +52,10 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     source = recording.source or "recording"
     report = RecordingReport(source, arm.name, "motion" if recording.is_motion else "poses", len(recording))
     findings = [Finding("note", "reading", source, note.removesuffix("."), "") for note in recording.notes]
+    if arm.locked_joints:
+        what = f"the recording does not contain these joints, which are assumed at rest at {locked_text(arm)} [rad, m]"
+        advice = "Their friction, motors and efforts are not identifiable. The model is valid only for these positions."
+        findings.append(Finding("note", "locked joints", ", ".join(arm.locked_joints), what, advice))
     try:
         joints = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
@@ -64,6 +68,8 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     joint_signals = _joint_signals(joints, arm)
     findings += _positions(joints, arm, joint_signals)
     findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm, report.kind)
+    if report.kind == "motion":
+        findings += repeated_row_findings(recording.in_actuator_coordinates(arm))
     time = _time(recording, report.kind)
     findings += time
     report = replace(report, joints=joint_signals)
@@ -197,8 +203,13 @@ def _time(recording: Recording, kind: str) -> list[Finding]:
         what = f"times do not increase in {count} row{'s' * (count != 1)}, first at {recording.where(row)}"
         severity: Severity = "refusal" if kind == "motion" else "warning"
         advice = "Sort the rows by time, and use the times of one clock [s]."
+        if np.all(repeated_rows(recording)[decreasing + 1]):
+            advice = "These rows repeat the previous row and its time. Remove them."
         return [Finding(severity, "time goes back", "t", what, advice, size=float(count))]
-    factor = _time_factor(recording)
+    if recording.qd is None or len(t) < MIN_ROWS:
+        return []
+    rows, times, _ = distinct_rows(recording)
+    factor = time_factor(times, recording.q[rows], recording.qd[rows])
     if factor is None or abs(factor - 1) < TIME_TOLERANCE:
         return []
     units = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
@@ -207,30 +218,6 @@ def _time(recording: Recording, kind: str) -> list[Finding]:
     what = f"times increase {factor:.4g} times as fast as q and qd imply ({cause})"
     advice = "Use t in s, q in rad (m) and qd in rad/s (m/s)."
     return [Finding("refusal", "wrong time", "t", what, advice, size=factor)]
-
-
-def _time_factor(recording: Recording) -> float | None:
-    """Returns the ratio of recorded to true time, or None if the ratio is not identifiable.
-
-    At least two joints must move, and the ratios of most of these joints must agree within 10 %.
-    """
-    t, q, qd = recording.t, recording.q, recording.qd
-    if t is None or qd is None or len(t) < MIN_ROWS:
-        return None
-    # Differences over several rows reduce the effects of jitter and repeated rows.
-    integrals = np.diff(
-        np.vstack([q[:1] * 0, np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(t)[:, None], axis=0)])[::BLOCK], axis=0
-    )
-    dq = np.diff(q[::BLOCK], axis=0)
-    moving = np.sqrt(np.mean(qd**2, axis=0)) > REST_SPEED[1]
-    squares = np.sum(dq**2, axis=0) * np.sum(integrals**2, axis=0)
-    correlated = np.sum(dq * integrals, axis=0) > 0.6 * np.sqrt(squares)
-    used = moving & correlated & (squares > 0)
-    if np.sum(used) < 2:
-        return None
-    factors = np.sqrt(np.sum(integrals[:, used] ** 2, axis=0) / np.sum(dq[:, used] ** 2, axis=0))
-    factor = float(np.median(factors))
-    return factor if np.mean(np.abs(factors / factor - 1) < 0.1) > 0.5 else None
 
 
 def _what_and_advice(error: Exception, source: str) -> tuple[str, str]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.low_pass import central_difference, low_pass, resample
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Cut-off frequency of the low-pass filter for the comparison of velocities [Hz]. Motions have lower frequencies, and
 #: most timing jitter has higher frequencies.
@@ -95,6 +95,32 @@ MIN_INTERVAL = 0.02
 _ITERATIONS = 8
 
 
+#: A row repeats the previous row only while the arm moves: while the speed of a joint exceeds this share of its RMS
+#: speed. Without qd, the speed is the displacement over this number of rows, before or after the row.
+MOVING_SHARE, SPEED_ROWS = 0.05, 10
+#: Smallest displacement over these rows, as a multiple of the smallest step of the position (encoder count).
+MIN_STEPS = 3.0
+#: Number of rows between two positions whose difference is compared with the integral of qd.
+BLOCK = 20
+#: Time stalls if it increases too fast by at least the first number with the intervals of repeated rows, and if the
+#: error without these intervals is at most the second number times as large.
+MIN_STALL, STALL_RATIO = 0.02, 0.5
+
+
+class DistinctRows(NamedTuple):
+    """Rows of a motion that do not repeat the previous row.
+
+    Attributes:
+        rows: Indices (k,) of the rows.
+        t: Recorded times (k,) of the rows, without the intervals of repeated rows if `stalled` [s].
+        stalled: True if the recorded times continue at repeated rows although the motion does not.
+    """
+
+    rows: NDArray[np.int_]
+    t: NDArray[np.float64]
+    stalled: bool
+
+
 class TrueTime(NamedTuple):
     """True times of the rows of a motion.
 
@@ -128,9 +154,7 @@ def true_time(recording: Recording) -> TrueTime:
     Raises:
         RecordingError: The recording has no times, or they do not increase.
     """
-    t = increasing_times(recording)
-    rows = np.flatnonzero(~repeated_rows(recording))
-    recorded = t[rows]
+    rows, recorded, _ = distinct_rows(recording)
     if recording.qd is None or len(rows) < MIN_ROWS:
         return TrueTime(rows, recorded, 0.0, False)
     q, qd, mean = recording.q[rows], recording.qd[rows], float(np.mean(np.diff(recorded)))
@@ -164,11 +188,73 @@ def _without_drift(
 
 
 def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
-    """Returns a mask (m,) of the rows that repeat q, qd and tau of the previous row, without rows at zero velocity."""
+    """Returns a mask (m,) of the rows that repeat q, qd and tau of the previous row while the arm moves.
+
+    Rows at rest are not included, because quantised measurements at rest are equal.
+    """
     blocks = [block for block in (recording.q, recording.qd, recording.tau) if block is not None]
     repeats = np.all([repeated_block(block) for block in blocks], axis=0)
-    moves = np.any(np.abs(recording.qd) > 0, axis=1) if recording.qd is not None else np.ones(len(recording), bool)
+    if recording.qd is not None:
+        speed = np.abs(recording.qd)
+    else:
+        rows, q = np.arange(len(recording)), recording.q
+        after, before = np.minimum(rows + SPEED_ROWS, len(q) - 1), np.maximum(rows - SPEED_ROWS, 0)
+        speed = np.minimum(np.abs(q[after] - q), np.abs(q - q[before]))
+        steps = np.abs(np.diff(q, axis=0))
+        changed = steps > SAME_VALUE * np.sqrt(np.mean(q**2, axis=0))
+        count = np.min(np.where(changed, steps, np.inf), axis=0, initial=np.inf)
+        speed = np.where(speed >= MIN_STEPS * count, speed, 0.0)
+    moves = np.any(speed > MOVING_SHARE * np.sqrt(np.mean(speed**2, axis=0)), axis=1)
     return np.asarray(repeats & moves, dtype=bool)
+
+
+def distinct_rows(recording: Recording) -> DistinctRows:
+    """Returns the rows that do not repeat the previous row, with their recorded times.
+
+    Rows are repeated if the recorder reads faster than the arm publishes. The times of the other rows are then correct.
+    In other recordings, rows are repeated while the time of the arm stalls, but the recorded times continue. The motion
+    then has jumps of the time. Both cases are distinguished by the integral of qd (`time_factor`).
+
+    Raises:
+        RecordingError: The recording has no times, or they do not increase.
+    """
+    t = increasing_times(recording)
+    repeats = repeated_rows(recording)
+    rows = np.flatnonzero(~repeats)
+    if recording.qd is None or len(rows) < MIN_ROWS or len(rows) == len(t):
+        return DistinctRows(rows, t[rows], False)
+    running = np.where(repeats, 0.0, np.diff(t, prepend=t[0]))
+    candidates = t[rows], t[0] + np.cumsum(running)[rows]
+    factors = [time_factor(times, recording.q[rows], recording.qd[rows]) for times in candidates]
+    if factors[0] is None or factors[1] is None:
+        return DistinctRows(rows, candidates[0], False)
+    stalled = factors[0] - 1 > MIN_STALL and abs(factors[1] - 1) < STALL_RATIO * (factors[0] - 1)
+    return DistinctRows(rows, candidates[int(stalled)], bool(stalled))
+
+
+def time_factor(t: NDArray[np.float64], q: NDArray[np.float64], qd: NDArray[np.float64]) -> float | None:
+    """Returns the ratio of recorded to true time, or None if the ratio is not identifiable.
+
+    At least two joints must move, and the ratios of most of these joints must agree within 10 %.
+
+    Args:
+        t: Recorded times (m,) [s].
+        q, qd: Positions [rad, m] and velocities (m, n).
+    """
+    # Differences over several rows reduce the effects of jitter and repeated rows.
+    integrals = np.diff(
+        np.vstack([q[:1] * 0, np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(t)[:, None], axis=0)])[::BLOCK], axis=0
+    )
+    dq = np.diff(q[::BLOCK], axis=0)
+    moving = np.sqrt(np.mean(qd**2, axis=0)) > REST_SPEED[1]
+    squares = np.sum(dq**2, axis=0) * np.sum(integrals**2, axis=0)
+    correlated = np.sum(dq * integrals, axis=0) > 0.6 * np.sqrt(squares)
+    used = moving & correlated & (squares > 0)
+    if np.sum(used) < 2:
+        return None
+    factors = np.sqrt(np.sum(integrals[:, used] ** 2, axis=0) / np.sum(dq[:, used] ** 2, axis=0))
+    factor = float(np.median(factors))
+    return factor if np.mean(np.abs(factors / factor - 1) < 0.1) > 0.5 else None
 
 
 def repeated_block(block: NDArray[np.float64]) -> NDArray[np.bool_]:

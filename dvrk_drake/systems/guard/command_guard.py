@@ -182,6 +182,7 @@ class CommandGuard:
         self.settings = settings or GuardSettings()
         self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
+        arm.refuse_locked_joints("a command guard")
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
         self.state = lcmt_dvrk_status.STATE_HOLD
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""

@@ -60,6 +60,7 @@ class DvrkCommandSender(LeafSystem):
             sender_id: Identifier of the sender. None: a random identifier is used.
         """
         super().__init__()
+        arm.refuse_locked_joints("a sender of commands")
         n = arm.num_joints
         self._arm_name, self._num_joints = arm.name, n
         self._sender_id = sender_id or draw_id()

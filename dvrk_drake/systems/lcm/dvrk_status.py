@@ -138,6 +138,7 @@ class DvrkStatusReceiver(LeafSystem):
     def __init__(self, arm: Arm) -> None:
         """Creates the receiver of `arm`. For messages of another arm or size, the outputs are NaN."""
         super().__init__()
+        arm.refuse_locked_joints("a receiver of statuses")
         n = arm.num_joints
         self._arm_name, self._num_joints = arm.name, n
         self._status = self.DeclareAbstractInputPort("lcmt_dvrk_status", AbstractValue.Make(lcmt_dvrk_status()))

@@ -1,0 +1,109 @@
+"""Compares models identified from recordings of the first three joints of two PSMs with ordinary least squares.
+
+    python benchmarks/three_joint_recordings.py FOLDER [--json FILE]
+
+FOLDER contains psm1_1.csv to psm1_3.csv and psm2_1.csv, psm2_2.csv with columns t, q1..q3, qd1..qd3 and tau1..tau3, at
+200 Hz. The wrist is locked at zero. Each model is evaluated on each recording of the same arm that it was not
+identified from.
+
+Errors are |tau - tau_hat| / |tau| of each actuator. Both efforts are low-pass filtered with a zero-phase Butterworth
+filter (17 Hz, order 6), and 100 rows at each end are omitted. Rows:
+
+    identify       model of `dvrk-drake identify`, from one recording
+    least squares  ordinary least squares over the full regressor of the arm, viscous friction, smoothed Coulomb
+                   friction, offset, spring and rotor inertia of each joint, from one recording or from all others
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from timing import write_json
+
+import dvrk_drake as dvrk
+from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+
+RATE, CUT_OFF, ENDS = 200.0, 17.0, 100
+#: Width of the smoothed sign function in the Coulomb friction of the least squares [rad/s], [m/s].
+WIDTH = 0.1, 0.01
+ARMS = {"PSM1": ("psm1_1", "psm1_2", "psm1_3"), "PSM2": ("psm2_1", "psm2_2")}
+LOCKED = {"roll": 0.0, "wrist_pitch": 0.0, "wrist_yaw": 0.0, "jaw": 0.0}
+
+
+def relative_errors(recording: dvrk.Recording, tau_filtered: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the relative RMS errors (n,) of predicted efforts (m, n) that are already low-pass filtered [%]."""
+    tau = low_pass(recording.measured_effort(), RATE, CUT_OFF)[ENDS:-ENDS]
+    return 100 * np.sqrt(np.mean((tau - tau_filtered[ENDS:-ENDS]) ** 2, axis=0) / np.mean(tau**2, axis=0))
+
+
+def least_squares_columns(recording: dvrk.Recording, regressor: DynamicRegressor) -> NDArray[np.float64]:
+    """Returns the columns (m, n, p) of the least squares, low-pass filtered."""
+    q, v = recording.q, recording.qd
+    assert v is not None
+    vd = np.gradient(low_pass(v, RATE, CUT_OFF), 1 / RATE, axis=0)
+    Y = regressor.regressor(q, v, vd)
+    n = q.shape[1]
+    parts = np.zeros((len(q), n, n, 5))
+    sign = np.tanh(v / regressor.arm.per_joint(*WIDTH))
+    for j in range(n):
+        parts[:, j, j] = np.column_stack([v[:, j], sign[:, j], np.ones(len(q)), q[:, j], vd[:, j]])
+    columns = np.concatenate([Y, parts.reshape(len(q), n, -1)], axis=2)
+    return low_pass(columns.reshape(len(q), -1), RATE, CUT_OFF).reshape(columns.shape)
+
+
+def least_squares(columns: list[NDArray[np.float64]], efforts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Returns the parameters (p,) fitted to several recordings."""
+    A = np.concatenate([part[ENDS:-ENDS].reshape(-1, part.shape[2]) for part in columns])
+    b = np.concatenate([low_pass(tau, RATE, CUT_OFF)[ENDS:-ENDS].ravel() for tau in efforts])
+    size = np.linalg.norm(A, axis=0)
+    size[size == 0] = 1.0
+    return np.linalg.lstsq(A / size, b, rcond=1e-8)[0] / size
+
+
+def main() -> None:
+    """Prints one table per arm, and the mean errors."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
+    parser.add_argument("--json", help="file for the errors")
+    options = parser.parse_args()
+    arm = dvrk.load_arm("psm").with_locked_joints(LOCKED)
+    regressor, console, results = DynamicRegressor(arm), Console(highlight=False, width=120), []
+    for name, files in ARMS.items():
+        recordings = {file: dvrk.read_recording(options.folder / f"{file}.csv", arm) for file in files}
+        columns = {file: least_squares_columns(recording, regressor) for file, recording in recordings.items()}
+        efforts = {file: recording.measured_effort() for file, recording in recordings.items()}
+        models = {file: dvrk.identify(recording, arm).model for file, recording in recordings.items()}
+        table = Table("fitted to", "evaluated on", "method", *arm.joint_names, "mean", title=f"{name}: error [%]")
+        for target, recording in recordings.items():
+            others = [file for file in files if file != target]
+            for source in others:
+                rows = {
+                    "identify": dvrk.predict(models[source], recording).tau,
+                    "least squares": columns[target] @ least_squares([columns[source]], [efforts[source]]),
+                }
+                for method, predicted in rows.items():
+                    results.append((name, source, target, method, relative_errors(recording, predicted)))
+            if len(others) > 1:
+                x = least_squares([columns[file] for file in others], [efforts[file] for file in others])
+                errors = relative_errors(recording, columns[target] @ x)
+                results.append((name, "all others", target, "least squares", errors))
+        for arm_name, source, target, method, errors in results:
+            if arm_name == name:
+                table.add_row(source, target, method, *(f"{e:.1f}" for e in errors), f"{errors.mean():.1f}")
+        console.print(table)
+    for method in ("identify", "least squares"):
+        one = [errors for _, source, _, used, errors in results if used == method and source != "all others"]
+        console.print(f"mean over all pairs, {method}: {np.mean(one):.1f} %")
+    if options.json is not None:
+        keys = ("arm", "fitted_to", "evaluated_on", "method", "errors")
+        write_json(options.json, [dict(zip(keys, (*row[:4], row[4].tolist()), strict=True)) for row in results])
+
+
+if __name__ == "__main__":
+    main()

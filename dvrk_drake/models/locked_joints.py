@@ -1,0 +1,169 @@
+"""Locks joints of an arm: the other joints and their dynamics, for recordings of some of the joints."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm_schema import CoupledLimit, Gains
+from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.schema_fault import suggest_name
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm
+
+
+def lock_joints(arm: Arm, positions: Mapping[str, float]) -> Arm:
+    """Returns the arm without the joints in `positions`, see `Arm.with_locked_joints`."""
+    positions = {name: float(position) for name, position in positions.items()}
+    accepted = f"allowed: {', '.join(arm.joint_names)}"
+    for name, position in positions.items():
+        if name in arm.locked_joints:
+            raise ArmError(f"{arm.name}: joint {name} is already locked at {arm.locked_joints[name]:g}")
+        if name not in arm.joint_names:
+            raise ArmError(f'{arm.name} has no joint "{name}" to lock; {suggest_name(name, arm.joint_names)}{accepted}')
+        j = arm.joint_names.index(name)
+        lower, upper, unit = arm.position_lower[j], arm.position_upper[j], "m" if arm.prismatic[j] else "rad"
+        if not lower <= position <= upper:
+            raise ArmError(
+                f"{arm.name}: locked joint {name} = {position:g} is outside its limits; "
+                f"allowed: {lower:.4g}..{upper:.4g} {unit}"
+            )
+    if len(positions) == arm.num_joints:
+        raise ArmError(f"{arm.name}: all joints are locked; allowed: at least one joint of the recording is not locked")
+    return _locked(arm, tuple((name, positions[name]) for name in arm.joint_names if name in positions))
+
+
+def lock_hint(arm: Arm, num_recorded: int) -> str:
+    """Returns advice for a recording with only the first `num_recorded` joints of an arm, or "" if it does not apply.
+
+    The advice names the joints that are not recorded and the option that states their positions.
+    """
+    if not 0 < num_recorded < arm.num_joints:
+        return ""
+    home = np.clip(np.zeros(arm.num_joints), arm.position_lower, arm.position_upper)
+    names = arm.joint_names[num_recorded:]
+    stated = " ".join(f"{name}={x:g}" for name, x in zip(names, home[num_recorded:], strict=True))
+    return (
+        f"If {', '.join(names)} {'were' if len(names) > 1 else 'was'} held and not recorded, state the positions "
+        f"[rad, m], e.g. --locked {stated}"
+    )
+
+
+def locked_text(arm: Arm) -> str:
+    """Returns the locked joints and their positions [rad, m], such as "roll = 0, jaw = 0.5", or "" without any."""
+    return ", ".join(f"{name} = {x:g}" for name, x in arm.locked_joints.items())
+
+
+def locked_option(arm: Arm) -> str:
+    """Returns the option --locked for the arm, with a leading space, or "" if no joint is locked."""
+    stated = " ".join(f"{name}={x:g}" for name, x in arm.locked_joints.items())
+    return f" --locked {stated}" if stated else ""
+
+
+@cache
+def _locked(arm: Arm, positions: tuple[tuple[str, float], ...]) -> Arm:
+    """Returns the arm with locked joints. Calls with equal arguments return the same Arm object."""
+    if not positions:
+        return arm
+    stated = dict(positions)
+    is_free = np.array([name not in stated for name in arm.joint_names])
+    free, locked = np.flatnonzero(is_free), np.flatnonzero(~is_free)
+    names = [arm.joint_names[j] for j in free]
+    q_locked = np.array([stated[arm.joint_names[j]] for j in locked])
+    J, G = arm.transmission.matrix, arm.linkage.matrix
+    _refuse_coupled_motors(arm, J, is_free)
+    coordinates = {name: row[free] for name, row in arm.friction_coordinates.items() if np.any(row[free])}
+    reduced = {name for name in coordinates if np.any(arm.friction_coordinates[name][locked])}
+    kept = {f"{kind}.{name}" for kind in ("joint", "actuator") for name in names} | coordinates.keys()
+    settings = arm.identification
+    _refuse_position_effects(arm, reduced)
+    return dataclasses.replace(
+        arm,
+        joint_names=tuple(names),
+        position_lower=arm.position_lower[free],
+        position_upper=arm.position_upper[free],
+        effort_limits=arm.effort_limits[free],
+        prismatic=arm.prismatic[free],
+        coupled_limits=tuple(_coupled_limits(arm, names, stated)),
+        linkage=LinearMap(G[:, free], arm.linkage.offset + G[:, locked] @ q_locked),
+        transmission=LinearMap(J[np.ix_(free, free)], arm.transmission.offset[free]),
+        gains=Gains(*([getattr(arm.gains, key)[j] for j in free] for key in ("kp", "kd", "ki"))),
+        friction_coordinates=coordinates,
+        identification=dataclasses.replace(
+            settings,
+            acceleration_cut_off=[settings.acceleration_cut_off[j] for j in free],
+            effort_delay=[settings.effort_delay[j] for j in free],
+            known_effects={name: kinds for name, kinds in settings.known_effects.items() if name in kept},
+        ),
+        effects=_effects(arm.effects, kept, names),
+        locked_joints=arm.locked_joints | stated,
+    )
+
+
+def _refuse_coupled_motors(arm: Arm, J: NDArray[np.float64], is_free: NDArray[np.bool_]) -> None:
+    """Raises ArmError if one motor acts on a locked and on another joint.
+
+    The effort of such a motor would be a part of the efforts of the other joints, but it is not recorded.
+    """
+    coupled = np.argwhere((J != 0) & (is_free[:, None] != is_free[None, :]))
+    if len(coupled):
+        first, second = sorted(coupled[0].tolist())
+        names = arm.joint_names[first], arm.joint_names[second]
+        raise ArmError(
+            f"{arm.name}: {names[0]} and {names[1]} are coupled by the transmission; lock both of them or neither"
+        )
+
+
+def _refuse_position_effects(arm: Arm, reduced: Iterable[str]) -> None:
+    """Raises ArmError if an effect depends on a position that is a sum of a locked and another joint position.
+
+    Friction depends only on the velocity and the travel along a coordinate, so it is not affected by locked joints.
+    """
+    laws = {effect.coordinate for effect in (*arm.effects.cables, *arm.effects.springs)}
+    if found := sorted((laws | arm.identification.known_effects.keys()).intersection(reduced)):
+        raise ArmError(
+            f"{arm.name}: {found[0]} has position-dependent effects and contains locked and other joints; lock all of "
+            "these joints or none of them"
+        )
+
+
+def _coupled_limits(arm: Arm, free: list[str], stated: Mapping[str, float]) -> Iterable[CoupledLimit]:
+    """Yields the coupled limits of the joints that are not locked. The positions of locked joints change the bounds."""
+    for limit in arm.coupled_limits:
+        constant = sum(coefficient * stated.get(name, 0.0) for name, coefficient in limit.coefficients.items())
+        coefficients = {name: x for name, x in limit.coefficients.items() if name in free}
+        if any(coefficients.values()):
+            lower, upper = limit.lower - constant, limit.upper - constant
+            yield dataclasses.replace(limit, coefficients=coefficients, lower=lower, upper=upper)
+        elif not limit.lower <= constant <= limit.upper:
+            raise ArmError(
+                f"{arm.name}: the locked joints violate the limit {limit.name} = {constant:.4g}; "
+                f"allowed: {limit.lower:g}..{limit.upper:g}"
+            )
+
+
+def _effects(effects: ArmEffects, coordinates: Iterable[str], actuators: list[str]) -> ArmEffects:
+    """Returns the effects along `coordinates` and of `actuators`."""
+
+    def only(table: dict[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in table.items() if name in actuators}
+
+    encoder, effort = effects.encoder, effects.effort
+    return dataclasses.replace(
+        effects,
+        friction=[effect for effect in effects.friction if effect.coordinate in coordinates],
+        cables=[effect for effect in effects.cables if effect.coordinate in coordinates],
+        springs=[effect for effect in effects.springs if effect.coordinate in coordinates],
+        stretch=only(effects.stretch),
+        saturation=only(effects.saturation),
+        encoder=encoder and dataclasses.replace(encoder, resolution=only(encoder.resolution)),
+        effort=effort and dataclasses.replace(effort, **{key: only(value) for key, value in vars(effort).items()}),
+    )

@@ -1,0 +1,185 @@
+"""Arms with locked joints: identities with the full arm, and refusals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ArmError, ModelError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.systems.arm_station import ArmStation, station_ports
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+
+WRIST = {"roll": 0.4, "wrist_pitch": -0.7, "wrist_yaw": 0.3, "jaw": 0.5}
+CASES = [
+    ("psm", WRIST),
+    ("psm", {"insertion": 0.1}),
+    ("mtml", {"wrist_pitch": 0.6, "wrist_yaw": 0.2, "wrist_roll": -1.0}),
+    ("mtmr", {"shoulder_pitch": 0.1, "elbow_pitch": 0.2, "wrist_platform": 0.3}),
+]
+
+
+def both(name, locked, count=20):
+    """Returns the full arm, the arm with locked joints, and a motion of both arms."""
+    full = load_arm(name)
+    arm = full.with_locked_joints(locked)
+    free = [full.joint_names.index(joint) for joint in arm.joint_names]
+    motion = np.random.default_rng(0).normal(0, 0.5, (3, count, arm.num_joints))
+    whole = np.zeros((3, count, full.num_joints))
+    whole[:, :, free] = motion
+    for joint, position in locked.items():
+        whole[0, :, full.joint_names.index(joint)] = position
+    return full, arm, free, motion, whole
+
+
+@pytest.mark.parametrize(("name", "locked"), CASES)
+def test_maps_are_those_of_the_full_arm(name, locked):
+    full, arm, free, (q, v, _), (Q, V, _) = both(name, locked)
+    np.testing.assert_allclose(arm.linkage.position(q), full.linkage.position(Q), atol=1e-12)
+    np.testing.assert_allclose(arm.linkage.velocity(v), full.linkage.velocity(V), atol=1e-12)
+    np.testing.assert_allclose(arm.transmission.velocity(v), full.transmission.velocity(V)[:, free], atol=1e-12)
+    np.testing.assert_allclose(arm.effort_limits, full.effort_limits[free], atol=0)
+    np.testing.assert_allclose(arm.gains.kp, np.array(full.gains.kp)[free], atol=0)
+    np.testing.assert_allclose(arm.encoder_counts(), full.encoder_counts()[free], atol=1e-13)
+    np.testing.assert_allclose(arm.dry_friction(), full.dry_friction()[free], atol=1e-12)
+    for pose in arm.sample_poses(20, np.random.default_rng(1)):
+        whole = Q[0].copy()
+        whole[free] = pose
+        assert full.limit_violations(whole, 1e-9) == []
+
+
+@pytest.mark.parametrize(("name", "locked"), CASES)
+def test_dynamics_are_those_of_the_full_arm(name, locked):
+    full, arm, free, motion, whole = both(name, locked)
+    ours, reference = DynamicRegressor(arm), DynamicRegressor(full)
+    tau = ours.torque(*motion, ours.values)
+    np.testing.assert_allclose(tau, reference.torque(*whole, reference.values)[:, free], atol=1e-9)
+    np.testing.assert_allclose(ours.regressor(*motion) @ ours.values, tau, atol=1e-9)
+    base = derive_base_parameters(ours)
+    # The efforts depend on the parameters only through the base parameters.
+    other = ours.values + np.linalg.svd(base.combination)[2][-1]
+    np.testing.assert_allclose(ours.regressor(*motion) @ other, tau, atol=1e-7)
+    M = reference.mass_matrix(whole[0], reference.values)[:, free][:, :, free]
+    np.testing.assert_allclose(ours.mass_matrix(motion[0], ours.values), M, atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "locked"), CASES)
+def test_holding_torque_is_that_of_the_full_arm(name, locked):
+    full, arm, free, (q, *_), (Q, *_) = both(name, locked)
+    ours, reference = IdentifiedModel.from_arm(arm), IdentifiedModel.from_arm(full)
+    np.testing.assert_allclose(ours.holding_torque(q), reference.holding_torque(Q)[:, free], atol=1e-9)
+
+
+def test_plant_has_the_locked_positions():
+    full, arm, _, (q, *_), (Q, *_) = both("psm", WRIST, 1)
+    plant = make_arm_plant(full)
+    contexts = plant.CreateDefaultContext(), plant.CreateDefaultContext()
+    set_arm_positions(plant, contexts[0], arm, q[0])
+    set_arm_positions(plant, contexts[1], full, Q[0])
+    np.testing.assert_allclose(*(plant.GetPositions(context) for context in contexts), atol=1e-12)
+
+
+def test_equal_arguments_give_the_same_arm():
+    arm = load_arm("psm")
+    locked = arm.with_locked_joints(WRIST)
+    assert locked is arm.with_locked_joints(dict(reversed(WRIST.items())))
+    assert arm.with_locked_joints({}) is arm
+    assert locked.joint_names == ("yaw", "pitch", "insertion") and locked.locked_joints == WRIST
+    assert locked.with_gravity([0, 1, -9]).locked_joints == WRIST
+    twice = arm.with_locked_joints({"roll": 0.4}).with_locked_joints({k: WRIST[k] for k in list(WRIST)[1:]})
+    assert twice.joint_names == locked.joint_names and twice.locked_joints == WRIST
+
+
+def test_bounds_of_coupled_limits_include_locked_joints():
+    arm = load_arm("mtml").with_locked_joints({"outer_yaw": 0.1})
+    assert arm.coupled_limits == load_arm("mtml").coupled_limits
+    sample = load_arm("mtml").coupled_limits[0]
+    weighted = dataclasses.replace(sample, coefficients={"outer_yaw": 2.0, "shoulder_pitch": 1.0})
+    (limit,) = (
+        dataclasses.replace(load_arm("mtml"), coupled_limits=(weighted,))
+        .with_locked_joints({"outer_yaw": 0.1})
+        .coupled_limits
+    )
+    assert limit.coefficients == {"shoulder_pitch": 1.0}
+    assert limit.lower == pytest.approx(sample.lower - 0.2, abs=1e-12)
+    assert limit.upper == pytest.approx(sample.upper - 0.2, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "locked", "message"),
+    [
+        ("psm", {"rol": 0}, 'PSM has no joint "rol" to lock; did you mean "roll"\\? allowed: yaw, pitch'),
+        ("psm", {"roll": 9}, "locked joint roll = 9 is outside its limits; allowed: -4.538..4.538 rad"),
+        ("psm", {"insertion": float("nan")}, "insertion = nan is outside its limits; allowed: 0..0.24 m"),
+        ("psm", {"jaw": 0}, "wrist_yaw and jaw are coupled by the transmission; lock both of them or neither"),
+        ("mtml", {"wrist_platform": 0}, "elbow_pitch and wrist_platform are coupled by the transmission"),
+        ("psm", {**WRIST, "yaw": 0, "pitch": 0, "insertion": 0.1}, "all joints are locked; allowed: at least one"),
+        (
+            "mtml",
+            {"shoulder_pitch": 1.0, "elbow_pitch": 0.5, "wrist_platform": 0.0},
+            "the locked joints violate the limit parallelogram = 1.5; allowed: -0.33..0.68",
+        ),
+    ],
+)
+def test_refusals_state_what_is_accepted(name, locked, message):
+    with pytest.raises(ArmError, match=message):
+        load_arm(name).with_locked_joints(locked)
+
+
+def test_a_locked_joint_is_locked_once():
+    with pytest.raises(ArmError, match=r"joint roll is already locked at 0\.4"):
+        load_arm("psm").with_locked_joints(WRIST).with_locked_joints({"roll": 0.4})
+
+
+def test_position_effects_of_locked_and_other_joints_are_refused():
+    psm = load_arm("psm")
+    mixed = {"bend": np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0])}
+    with_friction = dataclasses.replace(psm, friction_coordinates=psm.friction_coordinates | mixed)
+    locked = with_friction.with_locked_joints(WRIST)
+    np.testing.assert_allclose(locked.friction_coordinates["bend"], [0.0, 1.0, 0.0], atol=0)
+    spring = dataclasses.replace(psm.effects, springs=[DriveEffect("bend", "spring", 1.0, 0.1)])
+    with pytest.raises(ArmError, match="bend has position-dependent effects"):
+        dataclasses.replace(with_friction, effects=spring).with_locked_joints(WRIST)
+
+
+def test_model_file_restores_the_locked_joints(tmp_path):
+    arm = load_arm("psm").with_locked_joints(WRIST)
+    for dynamics in (False, True):
+        model = IdentifiedModel.from_arm(arm, dynamics=dynamics)
+        model.save(tmp_path / "m.yaml")
+        again = IdentifiedModel.load(tmp_path / "m.yaml")
+        assert again.arm is arm and again == model
+    with pytest.raises(ModelError, match=r"valid only with locked joints \(roll = 0.4, .*\).*allowed: a model of the"):
+        IdentifiedModel.load(tmp_path / "m.yaml", load_arm("psm"))
+    assert IdentifiedModel.load(tmp_path / "m.yaml", arm).arm is arm
+    text = (tmp_path / "m.yaml").read_text()
+    (tmp_path / "bad.yaml").write_text(text.replace("roll: 0.4", "roll: 9.0"))
+    with pytest.raises(ModelError, match="locked joint roll = 9 is outside its limits"):
+        IdentifiedModel.load(tmp_path / "bad.yaml")
+
+
+def test_earlier_model_files_have_no_locked_joints(tmp_path):
+    IdentifiedModel.from_arm(load_arm("psm")).save(tmp_path / "m.yaml")
+    text = (tmp_path / "m.yaml").read_text()
+    assert "locked_joints: {}\n" in text
+    text = text.replace("locked_joints: {}\n", "")
+    for version in (2, 3, 4):
+        (tmp_path / "old.yaml").write_text(text.replace("model 5", f"model {version}"))
+        assert IdentifiedModel.load(tmp_path / "old.yaml").arm is load_arm("psm")
+    (tmp_path / "new.yaml").write_text(text)
+    with pytest.raises(ModelError, match="locked_joints is missing"):
+        IdentifiedModel.load(tmp_path / "new.yaml")
+
+
+def controller(arm):
+    return GravityPidController(IdentifiedModel.from_arm(arm))
+
+
+@pytest.mark.parametrize("create", [ArmStation, station_ports, controller])
+def test_stations_and_controllers_require_all_joints(create):
+    with pytest.raises(ArmError, match=r"PSM has locked joints \(roll = 0.4, .*\), but a .* requires all joints"):
+        create(load_arm("psm").with_locked_joints(WRIST))

@@ -1,0 +1,164 @@
+"""`dvrk-drake record --ros`: real processes over DDS on the loopback interface, and messages of a substitute domain."""
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from ros_publisher import DOMAIN_FILE, PERIOD, START, rows
+from waiting import TIMEOUT
+
+from dvrk_drake.errors import DvrkDrakeError, RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.processes import ros_recorder as module
+from dvrk_drake.processes.ros_recorder import RosRecorder
+from dvrk_drake.recordings.reading import read_recording
+
+ros = pytest.importorskip("dvrk_drake.processes.ros_topics", reason="needs cyclonedds (pip install dvrk-drake[ros])")
+
+PSM = load_arm("psm")
+JOINTS = list(PSM.joint_names)
+TOPIC, JAW = "/PSM1/measured_js", "/PSM1/jaw/measured_js"
+
+
+@pytest.fixture(params=["reliable", "best effort"])
+def publisher(request, monkeypatch):
+    """Starts a publisher in a domain of its own, and returns the number of the domain."""
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    domain = 1 + os.getpid() % (ros.MAX_DOMAIN - 1)
+    script = os.path.join(os.path.dirname(__file__), "../support/ros_publisher.py")
+    process = subprocess.Popen([sys.executable, script, str(domain), request.param], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout.readline() == "publishing\n"
+        yield domain
+    finally:
+        process.kill()
+        process.communicate(timeout=TIMEOUT)
+
+
+def test_recording_has_the_published_numbers(publisher, tmp_path):
+    path = tmp_path / "reach.mcap"
+    command = [sys.executable, "-m", "dvrk_drake.cli", "record", path, "--arm", "psm", "--ros", "--duration", "2"]
+    done = subprocess.run(
+        [*command, "--domain", str(publisher)], capture_output=True, text=True, timeout=TIMEOUT, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"recording PSM on ROS domain {publisher}" in done.stdout
+    assert "messages with header stamp 0, which marks invalid data: " in done.stdout + done.stderr
+    recording = read_recording(path, PSM)
+    assert len(recording) > 100
+    first = next(k for k in range(100_000) if np.array_equal(rows(k)[0, :6], recording.q[0, :6]))
+    numbers = first + np.rint(recording.t / (PERIOD / 1e9)).astype(int)
+    np.testing.assert_allclose(recording.t, (numbers - first) * PERIOD / 1e9, rtol=0, atol=1e-9)
+    published = np.array([rows(k) for k in numbers])
+    for block, name in enumerate(("q", "qd", "tau")):
+        recorded = getattr(recording, name)
+        np.testing.assert_array_equal(recorded[:, :6], published[:, block, :6])
+        # Within 50 ms of the ends, a message of the arm may have no message of its jaw.
+        np.testing.assert_array_equal(recorded[10:-10, 6], published[10:-10, block, 6])
+    # Nothing is lost on the loopback unless the computer is overloaded.
+    assert len(recording) >= 0.95 * (numbers[-1] - numbers[0] + 1)
+
+
+def test_messages_name_the_topics_that_exist(publisher, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "FIRST_STATUS", 2.0)
+    found = r"Topics with JointState messages: /dvrk/PSM1/jaw/measured_js, /dvrk/PSM1/measured_js\."
+    for arm, topic, problem in (("mtml", None, "has no topic /MTML/measured_js"), ("psm", "/PSM3", "topic /PSM3")):
+        recorder = RosRecorder(load_arm(arm), tmp_path / "a.mcap", topic, publisher)
+        with pytest.raises(RecordingError, match=rf"ROS domain {publisher}: .*{problem}\. {found}"):
+            recorder.run(1.0, lambda: False, lambda text: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def message(k, joints=slice(0, 6), names=JOINTS, stamp=None):
+    """Returns message k of `ros_publisher` and its time of publication."""
+    stamp = START + k * PERIOD if stamp is None else stamp
+    q, qd, tau = rows(k)[:, joints].tolist()
+    return ros.JointState(
+        ros.Header(ros.Time(*divmod(stamp, 10**9)), ""), list(names[joints]), q, qd, tau
+    ), START + k * PERIOD
+
+
+class SubstituteDomain:
+    """Delivers one message of each topic per call of `take`."""
+
+    name = "ROS domain 0"
+
+    def __init__(self, messages):
+        self._messages = messages
+
+    def joint_state_topics(self):
+        return dict.fromkeys(self._messages, True)
+
+    def subscribe(self, topic, *, reliable):
+        pending = iter(self._messages.get(topic, ()))
+        return SimpleNamespace(topic=topic, num_lost=3, take=lambda: [m for m in [next(pending, None)] if m])
+
+    def wait(self, seconds):
+        pass
+
+
+@pytest.fixture
+def record(tmp_path, monkeypatch):
+    """Records the messages of a substitute domain and returns the recorder and the status lines."""
+    monkeypatch.setattr(module, "_DISCOVERY", 0.0)
+    monkeypatch.setattr(module, "FIRST_STATUS", 0.5)
+
+    def run(messages, **options):
+        monkeypatch.setattr(module, "open_ros_domain", lambda domain: SubstituteDomain(messages))
+        recorder = RosRecorder(PSM, tmp_path / "a.mcap", **options)
+        lines = []
+        recorder.run(0.3, lambda: False, lambda text: lines.append(text()))
+        return recorder, lines
+
+    return run
+
+
+def test_invalid_messages_do_not_start_the_recording(record, tmp_path):
+    invalid = (ros.JointState(), START)
+    recorder, lines = record(
+        {TOPIC: [invalid, invalid, *map(message, range(9))], JAW: [message(k, slice(6, 7)) for k in range(-2, 9)]}
+    )
+    assert lines[0] == f"waiting for a valid message on {TOPIC}"
+    assert recorder.num_rows == 9
+    assert recorder.notes() == [
+        "messages lost by DDS: 6",
+        "messages with header stamp 0, which marks invalid data: 2",
+    ]
+    assert len(read_recording(tmp_path / "a.mcap", PSM)) == 9
+
+
+def test_missing_jaw_is_noted(record):
+    recorder, lines = record({TOPIC: [message(k) for k in range(9)]})
+    assert any(line.endswith(f"6 lost, no message on {JAW}") for line in lines)
+    assert recorder.notes()[1:] == [f"no message on {JAW}; commands of dvrk-drake need this topic"]
+
+
+@pytest.mark.parametrize(
+    ("messages", "options", "error"),
+    [
+        ({TOPIC: [message(0, names=["disc"] * 7)]}, {}, "has the joints disc, .*; PSM also needs yaw, pitch"),
+        ({TOPIC: [(ros.JointState(), 1)] * 4}, {}, "all 4 messages have header stamp 0 .* Home the arm first"),
+        ({TOPIC: []}, {}, f"no message within 0 s on {TOPIC} of ROS domain 0"),
+        ({TOPIC: [], "/PSM2/measured_js": []}, {}, "several topics fit PSM: /PSM1/measured_js, /PSM2/measured_js"),
+        ({TOPIC: []}, {"topic": "/MTML"}, r"has no JointState topic /MTML\. Topics .*: /PSM1/measured_js\."),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused(record, tmp_path, messages, options, error):
+    with pytest.raises(RecordingError, match=error):
+        record(messages, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_arguments_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(RecordingError, match=r"a\.csv: the file name must end in \.mcap"):
+        RosRecorder(PSM, tmp_path / "a.csv")
+    for domain in ("-1", "233", "x"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+        with pytest.raises(DvrkDrakeError, match=f"ROS domain {domain}: allowed: 0 to 232"):
+            ros.RosDomain()
+    monkeypatch.setitem(sys.modules, "dvrk_drake.processes.ros_topics", None)
+    with pytest.raises(DvrkDrakeError, match=r"needs cyclonedds: pip install dvrk-drake\[ros\]"):
+        RosRecorder(PSM, tmp_path / "a.mcap")
