@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command_output import refusal
 from repository import ROOT
+from unprivileged import public_folder, run_unprivileged
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.verdict import cross_validated_verdicts
@@ -110,6 +111,19 @@ def test_path_without_a_folder_gives_one_line(path, tmp_path, monkeypatch, capsy
     with pytest.raises(dvrk.DvrkDrakeError):
         dvrk.write_samples(path)
     assert os.listdir(tmp_path) == ["file"]
+
+
+def test_folder_without_write_permission_is_refused():
+    with public_folder() as folder:
+        folder.chmod(0o555)
+
+        def check():
+            for path in (folder, folder / "new"):
+                with pytest.raises(dvrk.DvrkDrakeError, match="the samples cannot be written: Permission denied"):
+                    dvrk.write_samples(path)
+
+        run_unprivileged(check)
+        assert not list(folder.iterdir())
 
 
 def test_failed_write_leaves_no_files(tmp_path, monkeypatch):
