@@ -119,6 +119,9 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
     elif isinstance(error, MissingArgumentError) and error.argument:
         suggestion = re.search(r"Did you mean .*", message)
         message = f"{error.argument.name} is required"
+        # These options accept all following words.
+        if not error.argument.name.startswith("-") and (long := sorted(options & {"--locked", "--arrays"})):
+            message += f", before {' and '.join(long)}"
         if suggestion:
             message += f". {suggestion[0]}"
         elif error.argument.name == renamed.get(""):
