@@ -33,6 +33,8 @@ from dvrk_drake.recordings.samples import SAMPLES, SAMPLES_FOLDER
 
 #: Seed of the masses, the poses, the motions and the noise, and number of poses.
 SEED, POSES = 18, 60
+#: Seed of each set of poses.
+POSE_SEEDS = {"mtm_poses": SEED, "mtm_other_poses": SEED + 1}
 #: Sampling rate of a motion [Hz], and its duration [s]. The motion begins earlier by LEAD_IN [s].
 RATE, DURATION, LEAD_IN = 100.0, 30.0, 2.0
 #: Period of a motion [s], and number of harmonics of the Fourier series of each joint.
@@ -48,10 +50,10 @@ RANGES = {
 DECIMALS = {"t": 3, "q": 6, "qd": 4, "tau": 5}
 
 
-def static_poses(truth: GroundTruth, name: str, progress: Callable[[float], object]) -> dvrk.Recording:
+def static_poses(truth: GroundTruth, name: str, seed: int, progress: Callable[[float], object]) -> dvrk.Recording:
     """Returns static poses as `dvrk-drake collect` records them: means of approaches from two opposite sides."""
     with ThreadPoolExecutor(1) as executor:
-        return collect(truth, name, POSES, SEED, executor, progress)
+        return collect(truth, name, POSES, seed, executor, progress)
 
 
 def motion(truth: GroundTruth, name: str, progress: Callable[[float], object]) -> dvrk.Recording:
@@ -114,9 +116,11 @@ def main() -> None:
     SAMPLES_FOLDER.mkdir(exist_ok=True)
     with TemporaryDirectory() as folder, Steps(*SAMPLES) as steps:
         for sample, arm in SAMPLES.items():
-            record = static_poses if sample.endswith("poses") else motion
-            truth = perturbed_ground_truth(arm, Path(folder), SEED)
-            recording = record(truth, arm, step_progress(steps, sample))
+            truth, progress = perturbed_ground_truth(arm, Path(folder), SEED), step_progress(steps, sample)
+            if sample in POSE_SEEDS:
+                recording = static_poses(truth, arm, POSE_SEEDS[sample], progress)
+            else:
+                recording = motion(truth, arm, progress)
             dvrk.write_recording(rounded(recording), SAMPLES_FOLDER / f"{sample}.csv")
 
 

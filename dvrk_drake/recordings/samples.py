@@ -16,13 +16,14 @@ from dvrk_drake.recordings.recording import write_recording
 #: Folder of the CSV files.
 SAMPLES_FOLDER = Path(__file__).resolve().parent.parent / "samples"
 #: Mapping from the name of a sample to its arm.
-SAMPLES = {"mtm_poses": "mtmr", "mtm_motion": "mtmr", "psm_motion": "psm"}
+SAMPLES = {"mtm_poses": "mtmr", "mtm_other_poses": "mtmr", "mtm_motion": "mtmr", "psm_motion": "psm"}
 
 
 def write_samples(folder: str | Path, *, overwrite: bool = False, progress: Progress | None = None) -> list[Path]:
     """Writes the sample recordings of simulated arms, each as a CSV and as an MCAP bag.
 
-    The samples are 60 static poses of an MTMR, a motion of the same MTMR (30 s), and a motion of a PSM (30 s).
+    The samples are two sets of 60 static poses of an MTMR, a motion of the same MTMR (30 s), and a motion of a PSM
+    (30 s).
 
     Args:
         folder: Folder to write to. It is created if it does not exist.
@@ -39,7 +40,7 @@ def write_samples(folder: str | Path, *, overwrite: bool = False, progress: Prog
         >>> import dvrk_drake as dvrk
         >>> files = dvrk.write_samples("samples")
         >>> [file.name for file in files if file.suffix == ".csv"]
-        ['mtm_poses.csv', 'mtm_motion.csv', 'psm_motion.csv']
+        ['mtm_poses.csv', 'mtm_other_poses.csv', 'mtm_motion.csv', 'psm_motion.csv']
         >>> dvrk.check(dvrk.read_recording("samples/mtm_poses.csv"), dvrk.load_arm("mtmr")).warnings
         ()
     """
