@@ -38,7 +38,8 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain
 from timing import measured_times, median_ratio, print_table, write_json
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
 from dvrk_drake.models.sdf_model import DRAKE, compose_sdf
 from dvrk_drake.systems.arm_station import ArmStation

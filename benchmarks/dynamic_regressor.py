@@ -21,7 +21,8 @@ from pinocchio_arm import build_pinocchio, regressor_loop
 from timing import measured_times, median_ratio, print_table, write_json
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 
 

@@ -18,7 +18,7 @@ from timing import measured_times, median_ratio, print_table, write_json
 
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 
 CALLS = 20_000

@@ -25,7 +25,7 @@ WORKER = """
 import sys, time
 sys.path.insert(0, "tests/support")
 from guard_bench import Bench, Command
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 arm = load_arm(sys.argv[1])
 try:

@@ -33,7 +33,7 @@ IDENTIFY_BASE = IDENTIFY
 DERIVE = """
 import sys, time
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import shared_plant
 arm = load_arm(sys.argv[1])
 shared_plant(arm)

@@ -17,7 +17,7 @@ from dvrk_drake.analysis.static.effect_selection import StaticProblem
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 
 TRUE_EFFECTS = {

@@ -22,7 +22,8 @@ from dvrk_drake.analysis.dynamic.estimates import parameter_covariance
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics

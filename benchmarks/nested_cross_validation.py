@@ -18,7 +18,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, r
 from dvrk_drake.analysis.dynamic.effect_selection import NUM_HELD_OUT_FOLDS, select_effects
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import FOLDS, period_of
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 
 

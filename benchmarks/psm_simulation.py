@@ -46,7 +46,8 @@ from pydrake.trajectories import PiecewisePolynomial
 from timing import measured_times, median_ratio, print_table, write_json
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 from dvrk_drake.models.sdf_model import DRAKE, compose_sdf

@@ -29,7 +29,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from faulty_arm import FAULTS, PERIOD, FaultyArm
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 #: Start time of the fault [s], at which all joints move, and seed of the motion and the noise.
 TRIALS = ((2.6, 0), (3.2, 1), (3.8, 0))

@@ -32,7 +32,8 @@ from timing import measured_times, print_table, write_json
 
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, Cable
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.systems.arm_station import ArmStation

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from dvrk_drake.experiments.scenario import Scenario, load_scenario
     from dvrk_drake.experiments.simulation import simulate
     from dvrk_drake.export.model_export import export_model
-    from dvrk_drake.models.arm import Arm, load_arm
+    from dvrk_drake.models.arm import Arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording, write_recording
     from dvrk_drake.recordings.samples import write_samples
@@ -44,7 +45,7 @@ _MODULES = {
     "check": "analysis.check.recording_check",
     "export_model": "export.model_export",
     "identify": "analysis.identification",
-    "load_arm": "models.arm",
+    "load_arm": "models.arm_files",
     "load_scenario": "experiments.scenario",
     "payload": "analysis.payload.payload",
     "predict": "analysis.validation",

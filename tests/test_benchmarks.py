@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from repository import ROOT
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 
 def load_script(name):

@@ -2,7 +2,8 @@
 
 import xml.etree.ElementTree as ElementTree
 
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 MASTERS = ("mtml", "mtmr")

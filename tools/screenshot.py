@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydrake.geometry import Meshcat, Role
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view import ZOOM, ArmView, framing, start_meshcat
 
 CHROMIUM_FLAGS = (

@@ -43,7 +43,7 @@ def record(
         topic: With --ros: JointState topic or its namespace. Default: measured_js of the arm.
         domain: With --ros: ROS domain. Default: $ROS_DOMAIN_ID, or else 0.
     """
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.recorder import Recorder
@@ -112,7 +112,7 @@ def collect(
 def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
     import numpy as np
 
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.recordings.pose_file import load_poses_if_any, save_poses
 
     if count < 1:
@@ -127,7 +127,7 @@ def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
 
 
 def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
@@ -161,7 +161,7 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
 def _visit(
     controlled: ControlledArm, poses_file: str, output_file: str, both_sides: bool, traverse_time: float
 ) -> None:
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.collector import CollectionSettings, Collector
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine

@@ -63,7 +63,7 @@ def arm(
         pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.
         meshcat: Show the arm in a web browser.
     """
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import live_view
     from dvrk_drake.processes.pace import make_realtime, settle_memory
@@ -165,7 +165,7 @@ def _gains(path: str, mode: Mode, arm: str) -> Gains:
         ControllerError: The mode uses no gains, or the gains are not valid for the arm.
     """
     from dvrk_drake.errors import ControllerError
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.arm_schema import load_gains
 
     if mode == "gravity":
@@ -192,7 +192,7 @@ def _friction_compensator(
     from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import ControllerError
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
 
     if mode != "gravity":
@@ -253,7 +253,7 @@ def ready_controller(
         ControllerError: No arm responds, or the arm cannot be controlled in its present state.
     """
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.processes.control import ArmLink, first_status, reset_fault
     from dvrk_drake.processes.lcm_network import open_lcm

@@ -30,7 +30,7 @@ def model(
     from dvrk_drake.dynamics.gravity_regressor import derive_gravity
     from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
     from dvrk_drake.export import gravity_sources
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.model import print_symbolic_model
     from dvrk_drake.reports.terminal_tables import make_console
@@ -74,7 +74,7 @@ def view(
     Args:
         live: Show the measured pose from the LCM messages of the arm, without sliders.
     """
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import show_status

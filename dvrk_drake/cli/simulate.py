@@ -44,7 +44,7 @@ def simulate(
         output: File to write: a CSV with t [s], and q, qd and tau of all joints [rad, m, N m, N], or an .mcap bag.
         meshcat: Show the simulation in a web browser, in real time.
     """
-    from dvrk_drake.models.arm import known_arms
+    from dvrk_drake.models.arm_files import known_arms
     from dvrk_drake.reports.simulation import print_simulation
     from dvrk_drake.reports.terminal_tables import make_console
 
@@ -160,7 +160,7 @@ def tune(
         output: File for the gains. With method both, the better gains are written.
     """
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.arm_schema import save_gains
     from dvrk_drake.reports.terminal_tables import make_console
     from dvrk_drake.reports.tuning import print_tuning
@@ -215,7 +215,7 @@ def transparency(
         output: CSV file for the results.
     """
     from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.reports.terminal_tables import make_console
     from dvrk_drake.reports.transparency import print_transparency, write_transparency
 

@@ -196,7 +196,7 @@ def until_stopped(meshcat: Meshcat, update: Callable[[], object] = lambda: None)
 
 def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
     """Returns the model of the file given with --model, or the nominal model of --arm."""
-    from dvrk_drake.models.arm import known_arms
+    from dvrk_drake.models.arm_files import known_arms
 
     if model in known_arms():
         raise ModelError(f"{model} is an arm, not a model; use --arm {model}")

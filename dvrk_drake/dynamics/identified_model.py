@@ -26,7 +26,8 @@ from dvrk_drake.dynamics.dynamic_section import (
 )
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.errors import ArmError, ModelError
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.files import atomic_write

@@ -18,7 +18,8 @@ from dvrk_drake.dynamics.inertial_parameters import (
 )
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import ModelError
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import shared_plant
 
 #: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to the pseudo-inertia in the SDF (see

@@ -28,7 +28,8 @@ from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.export.sdf import to_text, with_inertias
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.files import atomic_write

@@ -17,7 +17,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     unclipped_torque,
 )
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
-from dvrk_drake.models.arm import known_arms
+from dvrk_drake.models.arm_files import known_arms
 
 #: Factors (7,) that convert joint positions and torques of an arm to those of its mirror image. The wrists of MTML and
 #: MTMR are mirror images.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ModelError
-from dvrk_drake.models.arm import known_arms
+from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.files import atomic_write, read_json_input
 from dvrk_drake.models.schema_fault import number_fault, within
 

@@ -1,15 +1,11 @@
-"""Defines `Arm`: joints, limits, linkage and transmission of an arm. `load_arm` reads them from YAML and SDF files."""
+"""Defines `Arm`: joints, limits, linkage and transmission of an arm. `arm_files` loads arms from files."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,23 +15,17 @@ from dvrk_drake.models.arm_schema import (
     COUPLINGS,
     EFFORTS,
     GRAVITIES,
-    ArmDescription,
     CoupledLimit,
     Gains,
     IdentificationSettings,
-    Instrument,
     LoopClosure,
-    Mechanism,
 )
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.locked_joints import lock_joints, locked_text
-from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, suggest_name, within
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
-from dvrk_drake.models.typed_yaml import load_typed_yaml
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
 
-_ARMS = MODELS_FOLDER / "arms"
 #: Maximum norm of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0
 #: Position errors [rad, m] that define the maximum gains. A gain is too large if this error causes the maximum effort
@@ -44,8 +34,6 @@ _MIN_ERROR = (1e-4, 1e-5)
 #: Shares of the effort limit that define the minimum gains. A gain is too small if a position error as large as the
 #: range of the joint causes less than this share. For kd, the error arises within 1 s. For ki, the error lasts for 1 s.
 _MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
-
-Part = TypeVar("Part", Mechanism, Instrument)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +157,7 @@ class Arm:
             if not np.any(row):
                 yield f"friction_coordinates.{name}: all coefficients are 0; at least one must be nonzero"
         yield number_fault(self)
-        _checked_gravity(self.gravity)
+        checked_gravity(self.gravity)
         if len(self.coupled_limits) > 1 and not can_meet_coupled_limits(self):
             yield "coupled_limits: no pose within position_limits meets all coupled limits; widen the limits"
 
@@ -265,7 +253,7 @@ class Arm:
         Raises:
             ArmError: `gravity` does not have three elements, or its norm exceeds 30 m/s^2.
         """
-        return _mounted(self, tuple(_checked_gravity(gravity).tolist()))
+        return _mounted(self, tuple(checked_gravity(gravity).tolist()))
 
     def with_locked_joints(self, positions: Mapping[str, float]) -> Arm:
         """Returns the arm with locked joints, as with `pydrake.multibody.tree.Joint.Lock`.
@@ -317,237 +305,10 @@ def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], join
     return ""
 
 
-def known_arms() -> list[str]:
-    """Returns the names of the arms of this package, which `load_arm` accepts."""
-    return sorted(path.stem for path in _ARMS.glob("*.yaml"))
-
-
-def load_arm(name: str | Path) -> Arm:
-    """Loads an arm. Repeated calls return the same Arm object until the file changes.
-
-    Changes of the other files of the arm (mechanism, instrument, SDF) take effect only in a new process.
-
-    Args:
-        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive). For any other arm, the path or package
-            URL of its YAML file.
-
-    Raises:
-        ArmError: The arm does not exist, or its files are invalid or inconsistent.
-
-    Example:
-        >>> import dvrk_drake as dvrk
-        >>> arm = dvrk.load_arm("psm")
-        >>> on_its_side = arm.with_gravity([0, -9.81, 0])  # [m/s^2] in the base frame
-        >>> int(arm.prismatic.argmax()), arm.joint_names[2]
-        (2, 'insertion')
-    """
-    name = os.fspath(name)
-    if "\0" in name:
-        raise ArmError(f"{name!r} is not a valid file name")
-    if not name.endswith((".yaml", ".yml")):
-        return _load_arm(name.lower())
-    path = Path(os.path.realpath(local_path(name)))
-    # The name and the path of an arm of this package give the same Arm object.
-    if path.parent == _ARMS.resolve():
-        return _load_arm(path.stem)
-    with suppress(OSError):  # _load_arm reports a missing file
-        status = path.stat()
-        return _load_arm(str(path), (status.st_mtime_ns, status.st_size))
-    return _load_arm(str(path))
-
-
-@cache
-def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
-    """Loads an arm by name or absolute path. `state` (time of change, size) is the version of the YAML file."""
-    path = Path(name)
-    if not path.is_absolute():
-        if name not in known_arms():
-            near = suggest_name(name, known_arms())
-            raise ArmError(
-                f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}, or the path of a YAML file'
-            )
-        path = _ARMS / f"{name}.yaml"
-    description = load_typed_yaml(ArmDescription, path, ArmError, "an arm file")
-    mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
-    instrument = Instrument()
-    if description.instrument:
-        instrument = _load_part(Instrument, path, "instrument", description.instrument)
-    try:
-        arm = _build_arm(name, path, description, mechanism, instrument)
-        if path.parent.parent != MODELS_FOLDER:
-            from dvrk_drake.models.plant import check_plant  # circular import
-
-            check_plant(arm)
-    except ArmError as error:
-        raise error if str(error).startswith(str(path)) else ArmError(f"{path}: {error}") from error
-    return arm
-
-
-def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
-    what = f"{'an' if kind == 'instrument' else 'a'} {kind} file"
-    if name.endswith((".yaml", ".yml")):
-        if "\0" in name:
-            raise ArmError(f"{arm_path}: {kind} {name!r} is not a valid file name")
-        path = Path(os.path.realpath(arm_path.parent / name))
-        if not os.path.lexists(path):
-            raise ArmError(f"{arm_path}: {kind} {path} does not exist")
-        part = load_typed_yaml(schema, path, ArmError, what)
-        if part.sdf and not part.sdf.startswith(PACKAGE_URL):
-            part.sdf = str(path.parent / part.sdf)
-        return part
-    folder = MODELS_FOLDER / f"{kind}s"
-    known = sorted(path.stem for path in folder.glob("*.yaml"))
-    if name not in known:
-        raise ArmError(
-            f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {", ".join(known)}, or the path of a YAML file'
-        )
-    return load_typed_yaml(schema, folder / f"{name}.yaml", ArmError, what)
-
-
-def _build_arm(
-    source: str, path: Path, description: ArmDescription, mechanism: Mechanism, instrument: Instrument
-) -> Arm:
-    joints = [*mechanism.joints, *instrument.joints]
-    if not joints or len({*joints}) < len(joints):
-        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and all joint names must differ")
-    if not mechanism.sdf:
-        raise ArmError(f"{path}: the mechanism file has no sdf")
-    sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
-    mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
-    facts = read_sdf_facts(compose_sdf(sdf, mirrored))
-    position_limits = {**instrument.position_limits, **description.position_limits}
-    if set(joints) != set(position_limits):
-        raise ArmError(f"{path}: position_limits must have one entry for each of {', '.join(mechanism.joints)}")
-    if (separate := instrument.separate_joint) and separate not in instrument.joints:
-        raise ArmError(f'{path}: separate_joint is "{separate}"; allowed: {", ".join(instrument.joints)}')
-    if missing := set(joints) - set(facts.joint_names):
-        raise ArmError(f"{path}: the SDF has no joint {', '.join(sorted(missing))}")
-    limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
-    gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
-    G = np.zeros((len(facts.joint_names), len(joints)))
-    c = np.zeros(len(facts.joint_names))
-    for row, name in enumerate(facts.joint_names):
-        leader, multiplier, offset = facts.mimics.get(name, (name, 1.0, 0.0))
-        if leader not in joints:
-            raise ArmError(f"{path}: joint {name} of the SDF must be in the list joints, or mimic a joint of that list")
-        G[row, joints.index(leader)], c[row] = multiplier, offset
-    return Arm(
-        name=description.name,
-        source=source,
-        joint_names=tuple(joints),
-        tree_joint_names=facts.joint_names,
-        sdf=sdf,
-        mirrored_links=mirrored,
-        position_lower=limits[:, 0],
-        position_upper=limits[:, 1],
-        effort_limits=_effort_limits(path, joints, facts),
-        prismatic=np.array([j in facts.prismatic for j in joints]),
-        coupled_limits=_coupled_limits(path, description, mechanism),
-        linkage=LinearMap(G, c),
-        transmission=LinearMap(_transmission(path, joints, mechanism, instrument), np.zeros(len(joints))),
-        loop_closures=tuple(mechanism.loop_closures),
-        gravity=_checked_gravity(description.gravity),
-        gains=gains,
-        friction_coordinates={
-            name: _row(path, f"friction_coordinates.{name}", terms, joints)
-            for name, terms in instrument.friction_coordinates.items()
-        },
-        identification=_identification_settings(path, mechanism, instrument),
-        effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
-        separate_joint=instrument.separate_joint,
-    )
-
-
-def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:
-    """Returns the settings of mechanism and instrument. The default is a cut-off frequency of 20 Hz and no delay."""
-    both: dict[str, list[float]] = {}
-    for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
-        both[which] = []
-        for part in (mechanism, instrument):
-            values = getattr(part.motion, which)
-            if values and len(values) != len(part.joints):
-                raise ArmError(
-                    f"{path}: motion.{which} has {len(values)} numbers; allowed: {len(part.joints)}, one per joint"
-                )
-            both[which] += values or [default] * len(part.joints)
-    known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
-    return IdentificationSettings(
-        **{**vars(mechanism.motion), **both, "known_effects": known},
-        effort_cut_off=mechanism.effort_cut_off,
-        bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
-    )
-
-
-def _lower_and_upper(path: Path, key: str, limits: list[float]) -> list[float]:
-    if len(limits) != 2:
-        raise ArmError(f"{path}: {key} is {limits}; allowed: [lower, upper]")
-    return limits
-
-
-def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanism) -> tuple[CoupledLimit, ...]:
-    limits = {limit.name: limit for limit in mechanism.coupled_limits}
-    for limit in mechanism.coupled_limits:
-        _row(path, f"coupled_limits.{limit.name}", limit.coefficients, mechanism.joints)
-    for name, bounds in description.coupled_limits.items():
-        if name not in limits:
-            raise ArmError(f'{path}: unknown coupled limit "{name}"; known: {", ".join(limits) or "none"}')
-        lower, upper = _lower_and_upper(path, f"coupled_limits.{name}", bounds)
-        limits[name] = dataclasses.replace(limits[name], lower=lower, upper=upper)
-    return tuple(limits.values())
-
-
-def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmEffects:
-    try:
-        effects.check(joints)
-    except ArmError as error:
-        raise ArmError(f"{path}: effects.{error}") from error
-    return effects
-
-
-def _checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
+def checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
+    """Returns a gravity vector (3,) [m/s^2]. Raises ArmError if it has another shape, or its norm is too large."""
     vector = np.asarray(gravity, float)
     if vector.shape != (3,) or not np.linalg.norm(vector) <= MAX_GRAVITY:
         numbers = ", ".join(f"{x:g}" for x in vector.ravel())
         raise ArmError(f"gravity ({numbers}) must be a vector of three numbers with a norm up to {MAX_GRAVITY:g} m/s^2")
     return vector
-
-
-def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np.float64]:
-    if missing := [joint for joint in joints if joint not in facts.effort_limits]:
-        raise ArmError(f"{path}: joint {missing[0]} of the SDF needs a positive <axis><limit><effort> [N m, N]")
-    return np.array([facts.effort_limits[joint] for joint in joints])
-
-
-def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:
-    """Returns J of a = J q: the rows of the mechanism, and the inverse of the instrument's coupling for its joints."""
-    J: NDArray[np.float64] = np.eye(len(joints))
-    for joint, terms in instrument.joint_from_actuator.items():
-        J[_index(path, "joint_from_actuator", joint, joints)] = _row(
-            path, f"joint_from_actuator.{joint}", terms, joints
-        )
-    J = _inverted(path, "joint_from_actuator", J)
-    for actuator, terms in mechanism.transmission.items():
-        J[_index(path, "transmission", actuator, joints)] = _row(path, f"transmission.{actuator}", terms, joints)
-    _inverted(path, "transmission", J)
-    return J
-
-
-def _index(path: Path, key: str, joint: str, joints: list[str]) -> int:
-    if joint not in joints:
-        raise ArmError(f'{path}: {key}: unknown joint "{joint}"; allowed: {", ".join(joints)}')
-    return joints.index(joint)
-
-
-def _row(path: Path, key: str, terms: dict[str, float], joints: list[str]) -> NDArray[np.float64]:
-    row = np.zeros(len(joints))
-    for joint, coefficient in terms.items():
-        row[_index(path, key, joint, joints)] = coefficient
-    if not np.any(row):
-        raise ArmError(f"{path}: {key}: all coefficients are 0; at least one must be nonzero")
-    return row
-
-
-def _inverted(path: Path, key: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    if not np.linalg.cond(matrix) < 1e9:
-        raise ArmError(f"{path}: {key}: the matrix is singular, because its rows are linearly dependent")
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import write_recording

@@ -17,7 +17,8 @@ from pydrake.systems.analysis import SimulatorConfig
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.errors import ArmError, StationError
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure

@@ -10,7 +10,7 @@ from sticky_arm import PERIOD, StickyArm, near_poses
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.recordings.pose_file import load_poses, save_poses
 from dvrk_drake.recordings.reading import read_recording

@@ -6,7 +6,7 @@ import pytest
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, is_prismatic
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 T = np.arange(0, 4, 1e-3)
 X = 0.3 * np.sin(2 * np.pi * 0.7 * T) + 0.1 * np.sin(2 * np.pi * 1.9 * T)

@@ -9,7 +9,7 @@ import pytest
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 
 @pytest.fixture(scope="module", params=["mtml", "psm"])

@@ -12,7 +12,8 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.regressor_kernel import BLOCK
 from dvrk_drake.errors import ModelError
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
 
 MOUNTINGS = [(0.0, 0.0, -9.81), (1.3, -4.2, 8.5), (0.0, 0.0, 0.0)]

@@ -13,7 +13,7 @@ from dvrk_drake.dynamics.gravity_regressor import GRAVITY, derive_gravity
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 
 #: Base parameters in the order of the paper, section III.H.

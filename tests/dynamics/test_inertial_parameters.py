@@ -13,7 +13,7 @@ from dvrk_drake.dynamics.inertial_parameters import (
     parameters_from_pseudo_inertia,
 )
 from dvrk_drake.errors import ModelError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 
 

@@ -17,7 +17,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.export.sdf import write_sdf
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 
 

@@ -8,7 +8,7 @@ from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.dynamics.model_links import MIN_EIGENVALUE_RATIO, nearest_links
 from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 
 def other_base_values(arm, size):

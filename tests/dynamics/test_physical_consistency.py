@@ -17,7 +17,7 @@ from dvrk_drake.dynamics.physical_consistency import (
     log_det_curvature,
 )
 from dvrk_drake.errors import IdentificationError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 
 @pytest.fixture(scope="module", params=["mtmr", "psm"])

@@ -40,7 +40,7 @@ from dvrk_drake.experiments.reproduction.step_response import (
     paper_simulated_arm,
     simulate_paper_controller,
 )
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording

@@ -12,7 +12,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import handle_frame
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.experiments.transparency import Compensation, random_path, recorded_path, simulate_operator
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 
 ARM = load_arm("mtml")

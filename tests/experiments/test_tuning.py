@@ -43,7 +43,7 @@ from dvrk_drake.experiments.tuning.tuning import (
     tune_arm,
 )
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains, load_gains, save_gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffect
 from dvrk_drake.processes.arm_controller import ArmController

@@ -10,7 +10,7 @@ import pytest
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.physical_consistency import BoundingBox, bounding_boxes, box_margins, reached_bounds
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import BoundingShapes, BoxCorners
 
 

@@ -17,7 +17,7 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError, RecordingErr
 from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.study.study_file import load_study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import load_gains
 from dvrk_drake.models.files import MAX_TEXT
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf

@@ -20,7 +20,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
 )
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links
 from dvrk_drake.recordings.reading import read_recording

@@ -11,7 +11,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from repository import ROOT
 
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, package_map, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 

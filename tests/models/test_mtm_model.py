@@ -7,7 +7,7 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm import known_arms, load_arm
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
 
 PI = np.pi

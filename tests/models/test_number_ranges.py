@@ -20,7 +20,8 @@ from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioErr
 from dvrk_drake.experiments.scenario import Scenario, load_scenario
 from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import (
     ANGLES,
     EFFORTS,

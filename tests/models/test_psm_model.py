@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 
 PI = np.pi

@@ -7,7 +7,7 @@ from pydrake.common.yaml import yaml_load_typed
 
 from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.experiments.scenario import load_scenario
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.schema_fault import schema_fault
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_typed_yaml, parse_yaml, typed_content

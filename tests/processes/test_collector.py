@@ -8,7 +8,7 @@ from sticky_arm import PERIOD, Disk, GuardedArm, make_collector, make_quick, nea
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.recordings.reading import read_recording

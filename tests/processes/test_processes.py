@@ -13,7 +13,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import pace
 from dvrk_drake.processes.lcm_network import open_lcm
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason

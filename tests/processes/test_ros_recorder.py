@@ -11,7 +11,7 @@ from ros_publisher import DOMAIN_FILE, PERIOD, START, rows
 from waiting import TIMEOUT
 
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import ros_recorder as module
 from dvrk_drake.processes.ros_recorder import RosRecorder
 from dvrk_drake.recordings.reading import read_recording

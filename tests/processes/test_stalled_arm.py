@@ -6,7 +6,7 @@ from lcm_arm import POSES
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.simulated_arm import SimulatedArm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sticky_arm import random_poses
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.processes.teacher import CubicTrajectory, RestDetector
 

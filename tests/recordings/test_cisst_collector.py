@@ -7,7 +7,7 @@ import pytest
 from collector_files import joint_state, write_collection
 from public_files import assert_refused
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 
 JOINTS, ACTUATORS = "StateDataCollection-MTML-StateTable-2025-10-06-13", "StateDataCollection-io-MTMLRead-2025-10-06-13"

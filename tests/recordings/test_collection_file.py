@@ -9,7 +9,7 @@ import pytest
 from sticky_arm import random_poses
 
 from dvrk_drake.errors import CollectionError, RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.reading import read_recording
 

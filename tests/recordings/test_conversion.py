@@ -7,7 +7,7 @@ import pytest
 from public_files import NUMBERS, assert_refused, team_array, wpi_rows, write_mat, write_text, write_wpi
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.conversion import convert
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wpi
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 
 

@@ -17,7 +17,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, StatusStream
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording_stream import check_stream_output, open_recording_file

@@ -6,7 +6,7 @@ from sticky_arm import random_poses
 
 from dvrk_drake.cli import main
 from dvrk_drake.errors import CollectionError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import load_poses, save_poses
 
 ARMS = ("mtml", "psm")

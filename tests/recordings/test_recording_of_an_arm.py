@@ -9,7 +9,7 @@ import pytest
 from recordings import M_MTM, SIX, random_recording, write_text
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 

@@ -7,7 +7,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import detect_format, read_recording
 
 START = 1_700_000_000_000_000_000

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 ARMS = "psm", "mtmr"
 

@@ -3,7 +3,7 @@
 import lcm_controller  # noqa: F401
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import simulated_arm  # noqa: F401
 from dvrk_drake.processes.arm_controller import ArmController
 

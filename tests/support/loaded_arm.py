@@ -10,7 +10,7 @@ from motions import fourier_motion, recorded, true_dynamics
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import Recording
 

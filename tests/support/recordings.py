@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.recordings.recording import Recording
 

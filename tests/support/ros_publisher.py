@@ -25,7 +25,7 @@ def main(domain, reliable):
     from cyclonedds.pub import DataWriter
     from cyclonedds.topic import Topic
 
-    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.ros_topics import Header, JointState, RosDomain, Time, dds_topic, ros_qos
 
     joints = list(load_arm("psm").joint_names)

@@ -7,7 +7,8 @@ from functools import cache
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.recording import Recording
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.teleoperation import Teleoperation
 

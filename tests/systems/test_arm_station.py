@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import tree_selector
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController

@@ -12,7 +12,7 @@ from waiting import wait_until
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.live_view import show_status
 from dvrk_drake.systems.arm_view import ASPECT, HALF_HEIGHT, ArmView, framing, geometry_corners, start_meshcat
 

@@ -10,7 +10,7 @@ from pydrake.systems.primitives import LogVectorOutput
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.demo.demo import MTM_PLAN
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 

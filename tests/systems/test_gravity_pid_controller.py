@@ -10,7 +10,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController

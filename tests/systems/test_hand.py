@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError, StationError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.hand import Grip, Hand

@@ -11,7 +11,7 @@ from repository import ROOT
 
 from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.experiments.scenario import Scenario
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.station_config import ArmConfig, StationConfig, load_station_config, make_arm_station

@@ -12,7 +12,7 @@ from own_network import inside, outside, run_inside
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import load_poses
 from dvrk_drake.recordings.reading import read_recording
 

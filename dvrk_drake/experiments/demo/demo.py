@@ -20,7 +20,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
 from dvrk_drake.experiments.ground_truth import collect_static_poses, damped_station, perturbed_links, with_links
 from dvrk_drake.experiments.simulation import advance, recorded_in, sample_times, samples
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure

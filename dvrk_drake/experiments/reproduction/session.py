@@ -25,7 +25,8 @@ from dvrk_drake.experiments.reproduction.published import (
     with_zero_torque,
 )
 from dvrk_drake.experiments.transparency import Compensation, OperatorForces, random_path, simulate_operator
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording, write_recording
 

@@ -19,7 +19,8 @@ from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.simulation import samples
 from dvrk_drake.export.sdf import to_text, with_inertias
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.systems.arm_station import ArmStation

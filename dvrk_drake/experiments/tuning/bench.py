@@ -17,7 +17,8 @@ from pydrake.systems.primitives import LogVectorOutput
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, per_actuator
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config

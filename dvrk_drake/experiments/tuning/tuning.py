@@ -26,7 +26,8 @@ from dvrk_drake.experiments.tuning.bench import (
 )
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, design_arm
 from dvrk_drake.experiments.tuning.procedure import JointProcedure, tune_joint
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 
 #: Duration of a step test, and of its final part in which the joints should be at rest [s].

@@ -18,7 +18,7 @@ from dvrk_drake.experiments.reproduction.mechanisms import (
 )
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM, TABLE_1
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share

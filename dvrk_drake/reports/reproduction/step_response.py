@@ -22,7 +22,7 @@ from dvrk_drake.experiments.reproduction.step_response import (
     simulate_ours,
     simulate_paper_controller,
 )
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.reports.figures.style import save_figure
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 

@@ -9,7 +9,7 @@ from synthetic_motion import RATE, clean_motion
 
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 pytestmark = pytest.mark.slow
 

@@ -5,7 +5,7 @@ import pytest
 from check_findings import changed
 
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = pytest.mark.slow

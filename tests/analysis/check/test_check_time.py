@@ -8,7 +8,7 @@ from check_findings import ARMS, found
 from synthetic_motion import RATE, clean_motion
 
 from dvrk_drake.analysis.signals.true_time import true_time
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording

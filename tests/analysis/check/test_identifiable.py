@@ -8,7 +8,7 @@ import pytest
 
 from dvrk_drake.analysis.check.recording_check import check, check_recording
 from dvrk_drake.cli import main
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording

@@ -16,7 +16,7 @@ from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.cli import main
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes

@@ -10,7 +10,7 @@ from dvrk_drake.analysis.dynamic.columns import drive_effects, optional_effects
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 FOLDS, ROWS = 12, 1200
 

@@ -17,7 +17,8 @@ from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models import plant
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.reports.identification import print_identification

@@ -16,7 +16,7 @@ from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.recalibration import refit_friction
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording
 

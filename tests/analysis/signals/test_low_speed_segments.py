@@ -12,7 +12,7 @@ from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.conversion import convert
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording

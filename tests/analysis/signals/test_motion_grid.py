@@ -12,7 +12,7 @@ from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, default_settings,
 from dvrk_drake.analysis.signals.repetition import FOLDS, GAP, period_of, phase_folds
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 
 ARM = load_arm("mtml")

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.signals.static_segments import (
     stationary_runs,
 )
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 
 ARM = load_arm("psm")

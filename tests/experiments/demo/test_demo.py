@@ -10,7 +10,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.experiments.demo import demo
 from dvrk_drake.experiments.ground_truth import perturbed_links, pose_visit_trajectory
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.reports.demo import print_demo
 from dvrk_drake.reports.figures import demo as demo_figures

@@ -17,7 +17,7 @@ from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study import run_study
 from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
 from dvrk_drake.experiments.study.table import Quantiles, Share, StudyTable, summarise
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.figures.study import plot_study
 from dvrk_drake.reports.study import print_study

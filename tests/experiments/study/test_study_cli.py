@@ -7,7 +7,7 @@ from repository import ROOT
 
 from dvrk_drake.cli import main
 from dvrk_drake.experiments.study.study_file import load_study
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 STUDY = """
 scenario: psm

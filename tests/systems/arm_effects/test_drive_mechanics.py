@@ -5,7 +5,7 @@ import pytest
 from simulated_effects import ARMS, Run, middle, weightless
 
 from dvrk_drake.errors import StationError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect, FrictionEffect
 from dvrk_drake.systems.arm_station import ArmStation
 

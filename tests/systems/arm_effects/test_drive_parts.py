@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from simulated_effects import Run, middle, weightless
 
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, EffortEffect
 from dvrk_drake.systems.arm_effects.drive_force import EffortSensor, Motors, round_to_step
 from dvrk_drake.systems.arm_effects.drive_step import _measure_into, _move_anchors

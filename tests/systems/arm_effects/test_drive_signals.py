@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from simulated_effects import ARMS, STEP, Run, weightless
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, EffortEffect, EncoderEffect
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop

@@ -5,7 +5,7 @@ import pytest
 from simulated_effects import ARMS, STEP, Run, breakaway, middle, weightless
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, FrictionEffect
 from dvrk_drake.models.plant import tree_selector
 from dvrk_drake.systems.arm_effects.dry_friction import RELAXATION

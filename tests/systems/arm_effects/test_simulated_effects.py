@@ -10,7 +10,7 @@ from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError, ScenarioError, StationError
 from dvrk_drake.experiments.scenario import HandScenario, load_scenario
 from dvrk_drake.experiments.simulation import simulate
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, FrictionEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.arm_station import ArmStation

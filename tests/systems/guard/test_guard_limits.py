@@ -6,7 +6,7 @@ from guard_bench import ARM, LIMIT, Bench, N, Q
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 
 
 def test_efforts_are_clamped_and_limited_in_rate():

@@ -10,7 +10,7 @@ from repository import ROOT
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.systems.guard.settings import GuardSettings
 

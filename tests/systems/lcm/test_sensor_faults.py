@@ -12,7 +12,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 
 ELBOW, SHOULDER, ROLL = 2, 1, 6

@@ -7,7 +7,7 @@ from pydrake.lcm import DrakeLcm
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 
