@@ -196,4 +196,7 @@ def _named_arrays(texts: Sequence[str]) -> dict[str, str]:
     pairs = [text.partition("=") for text in texts]
     if wrong := [text for text, (name, sign, array) in zip(texts, pairs, strict=True) if not (name and sign and array)]:
         raise RecordingError(f"--arrays {wrong[0]}: allowed: NAME=ARRAY, e.g. q=position; names: q, qd, tau, t, poses")
+    names = [name for name, _, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise RecordingError(f"--arrays: {twice[0]} is given twice; give one array for each quantity")
     return {name: array for name, _, array in pairs}

@@ -185,18 +185,19 @@ def predict(
     In all other cases, the command predicts the holding efforts.
 
     Args:
-        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the coordinates of the recording.
+        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in joint coordinates, or in actuator coordinates if the recording has them.
     """
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "predicting") as steps:
-        prediction = dvrk.predict(*_model_and_recording(model, recording, file, steps), progress=steps)
+        loaded, read = _model_and_recording(model, recording, file, steps)
+        prediction = dvrk.predict(loaded, read, progress=steps)
     tau = prediction.tau
     write_csv(output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
     print_warnings(make_console(), prediction.warnings)
-    print_written(output, f"{len(tau)} rows")
+    print_written(output, f"{len(tau)} rows, {read.coordinates} coordinates")
 
 
 @app.command(group=IDENTIFY)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.errors import ArmError
+from dvrk_drake.errors import ArmError, RecordingError
 from dvrk_drake.models.arm_schema import CoupledLimit, Gains
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
@@ -18,6 +18,9 @@ from dvrk_drake.models.schema_fault import suggest_name
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
+
+#: Largest distance of a locked joint from its stated position in a recording [rad, m].
+MAX_LOCKED_ERROR = 0.02
 
 
 def lock_joints(arm: Arm, positions: Mapping[str, float]) -> Arm:
@@ -48,12 +51,18 @@ def lock_hint(arm: Arm, num_recorded: int) -> str:
     """
     if not 0 < num_recorded < arm.num_joints:
         return ""
+    J = arm.transmission.matrix
+    # One motor may move several joints, which must be locked together.
+    while num_recorded and (np.any(J[num_recorded:, :num_recorded]) or np.any(J[:num_recorded, num_recorded:])):
+        num_recorded -= 1
+    if not num_recorded:
+        return ""
     home = np.clip(np.zeros(arm.num_joints), arm.position_lower, arm.position_upper)
     names = arm.joint_names[num_recorded:]
     stated = " ".join(f"{name}={x:g}" for name, x in zip(names, home[num_recorded:], strict=True))
     return (
-        f"If {', '.join(names)} {'were' if len(names) > 1 else 'was'} held and not recorded, state the positions "
-        f"[rad, m], e.g. --locked {stated}"
+        f"If {', '.join(names)} {'were' if len(names) > 1 else 'was'} held, state the positions [rad, m], e.g. "
+        f"--locked {stated}"
     )
 
 
@@ -66,6 +75,28 @@ def locked_option(arm: Arm) -> str:
     """Returns the option --locked for the arm, with a leading space, or "" if no joint is locked."""
     stated = " ".join(f"{name}={x:g}" for name, x in arm.locked_joints.items())
     return f" --locked {stated}" if stated else ""
+
+
+def check_held(where: str, names: Sequence[str], q: NDArray[np.float64], arm: Arm) -> None:
+    """Checks that the recorded locked joints were held at their stated positions.
+
+    Args:
+        where: Source of the positions, for the message.
+        names: Names of the recorded joints.
+        q: Positions (m, k) of the recorded joints [rad, m].
+        arm: Arm with locked joints.
+
+    Raises:
+        RecordingError: A locked joint was more than `MAX_LOCKED_ERROR` from its stated position.
+    """
+    for joint, position in arm.locked_joints.items():
+        if joint in names:
+            measured = q[:, names.index(joint)]
+            if np.any(np.abs(measured - position) > MAX_LOCKED_ERROR):
+                raise RecordingError(
+                    f"{where}: --locked states {joint}={position:g}, but the recorded positions are "
+                    f"{measured.min():.4g}..{measured.max():.4g}; allowed: a deviation up to {MAX_LOCKED_ERROR:g} rad or m"
+                )
 
 
 @cache

@@ -28,7 +28,7 @@ class RosRecorder:
 
     Attributes:
         source: ROS domain, for messages.
-        num_rows: Number of recorded messages of the arm, without those of a joint with a topic of its own.
+        num_rows: Number of recorded valid messages of the arm, without those of a joint with a topic of its own.
     """
 
     def __init__(self, arm: Arm, path: str | Path, topic: str | None = None, domain: int | None = None) -> None:
@@ -125,8 +125,8 @@ class RosRecorder:
 
     def _record(self, subscription: Subscription, message: JointState, published: int) -> None:
         """Writes a message. The bag is created at the first valid message of the arm."""
+        is_valid = bool(message.header.stamp.sec or message.header.stamp.nanosec)
         if subscription is self._subscriptions[0]:
-            is_valid = bool(message.header.stamp.sec or message.header.stamp.nanosec)
             self._num_invalid += not is_valid
             if self._bag is None and is_valid:
                 self._check_joints(message)
@@ -137,7 +137,7 @@ class RosRecorder:
         self._bag.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, time.time_ns())
         self._silent.discard(subscription.topic)
         if subscription is self._subscriptions[0]:
-            self.num_rows += 1
+            self.num_rows += is_valid
             self._rate.add(time.monotonic())
 
     def _check_joints(self, message: JointState) -> None:

@@ -8,6 +8,7 @@ A ROS 2 topic `/<ARM>/measured_js` is the DDS topic `rt/<ARM>/measured_js`, and 
 # (mypy does not know the keyword `typename` of IdlStruct.)
 
 import os
+import time
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -117,7 +118,7 @@ class RosDomain:
             raise DvrkDrakeError(
                 f"{self.name} cannot be used: {error}. Check the network and CYCLONEDDS_URI"
             ) from error
-        self._waitset = WaitSet(self.participant)
+        self._waitset, self._has_subscriptions = WaitSet(self.participant), False
         self._reliable: dict[str, bool] = {}
 
     def joint_state_topics(self) -> dict[str, bool]:
@@ -136,11 +137,16 @@ class RosDomain:
         """Subscribes to a JointState topic. A best-effort publisher needs `reliable` False."""
         subscription = Subscription(self.participant, topic, reliable)
         self._waitset.attach(subscription.condition)
+        self._has_subscriptions = True
         return subscription
 
     def wait(self, seconds: float) -> None:
         """Waits until a message of a subscription arrives, at most `seconds`."""
-        self._waitset.wait(int(seconds * 1e9))
+        if self._has_subscriptions:
+            self._waitset.wait(int(seconds * 1e9))
+        else:
+            # Without a condition, the wait set returns at once.
+            time.sleep(seconds)
 
 
 class Subscription:

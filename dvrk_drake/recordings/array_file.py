@@ -65,8 +65,8 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     Arrays without times contain static poses, unless the options state a rate.
 
     `options.arrays` maps "q", "qd", "tau" and "t" to the names of the arrays. A member of a structure is named with
-    dots: "log.q". {"poses": NAME} names an array of 8 x 2 x N. Default: arrays with a recognised name, or else the only
-    array of 8 x 2 x N.
+    dots: "log.q". {"poses": NAME} names an array of 8 x 2 x N. Default of each quantity: the array with a recognised
+    name. If no array is named or recognised, the only array of 8 x 2 x N is read.
 
     Args:
         path: Path of the file or of the folder.
@@ -87,11 +87,13 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         content = read_bytes(file)
         digest.update(content)
         parts.append(_rows(file, _read_arrays(file, content), options.num_joints, names))
-    blocks = {
-        quantity: np.concatenate([part.blocks[quantity] for part in parts])
-        for quantity in parts[0].blocks
-        if all(quantity in part.blocks for part in parts)
-    }
+    for file, part in zip(files, parts, strict=True):
+        if (part.blocks.keys(), part.label) != (parts[0].blocks.keys(), parts[0].label):
+            raise RecordingError(
+                f"{file}: has {', '.join(part.blocks)}, but {files[0]} has {', '.join(parts[0].blocks)}; all files of a "
+                "folder must have the same arrays"
+            )
+    blocks = {quantity: np.concatenate([part.blocks[quantity] for part in parts]) for quantity in parts[0].blocks}
     label, preallocated = parts[0].label, parts[0].preallocated
     notes = [parts[0].note if len(files) == 1 else f"{len(files)} files; {parts[0].note} of each file"]
     if "t" in blocks and len(files) > 1:
@@ -102,6 +104,8 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         omitted, reason = np.flatnonzero(~valid) + 1, "NaN or infinite" + preallocated * ", or all zeros"
         notes.append(f"{len(omitted)} of {len(valid)} {label}s skipped ({reason}): {listed(omitted)}")
     rows = np.flatnonzero(valid)
+    if options.rate is not None and len(files) > 1:
+        raise RecordingError(f"{path}: --rate does not apply to a folder; read the motion of one file")
     t, time_notes = options.sampled_times(path, blocks["t"][rows] if "t" in blocks else None, rows)
     recording = Recording(
         blocks["q"][rows],
@@ -134,7 +138,12 @@ class _Rows(NamedTuple):
 
 
 def _collection(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.rglob("*") if file.suffix.lower() in _SUFFIXES and file.is_file())
+    return sorted(
+        file
+        for file in folder.rglob("*")
+        # macOS creates additional files whose names begin with a dot.
+        if file.suffix.lower() in _SUFFIXES and file.is_file() and not file.name.startswith(".")
+    )
 
 
 def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str]) -> _Rows:
@@ -144,7 +153,7 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
     for quantity, name in names.items():
         if name not in arrays:
             raise RecordingError(f"{path}: has no array {name} for {quantity}. Its arrays of real numbers: {found}.")
-    chosen = dict(names) or _recognised(path, arrays, n, found)
+    chosen = _chosen(path, arrays, n, names, found)
     if "poses" in chosen:
         if len(chosen) > 1:
             raise RecordingError(f"{path}: poses contains positions and efforts; do not name other arrays")
@@ -171,20 +180,24 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
     return _Rows(blocks, ", ".join(f"{quantity} from array {name}" for quantity, name in chosen.items()))
 
 
-def _recognised(path: Path, arrays: Mapping[str, NDArray], n: int, found: str) -> dict[str, str]:
-    """Returns a mapping from a quantity to the only array with a recognised name and a fitting shape."""
-    chosen = {}
+def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str], found: str) -> dict[str, str]:
+    """Returns a mapping from a quantity to its array: the named array, or the only one with a recognised name."""
+    chosen = dict(names)
+    if "poses" in names:
+        return chosen
     for quantity, known in _NAMES.items():
+        if quantity in names:
+            continue
         fitting = [
             name
             for name, array in arrays.items()
             if name.rpartition(".")[2].lower() in known
-            and (array.size == max(array.shape, default=0) if quantity == "t" else _is_joint_array(array, n))
+            and (array.size > 1 if quantity == "t" else _is_joint_array(array, n))
         ]
         if len(fitting) > 1:
             raise RecordingError(
-                f"{path}: several arrays may be {quantity}: {', '.join(fitting)}. Choose with --arrays q=NAME tau=NAME "
-                "(arrays= in Python)."
+                f"{path}: several arrays may be {quantity}: {', '.join(fitting)}. Choose one with --arrays "
+                f"{quantity}=NAME (arrays= in Python)."
             )
         if fitting:
             chosen[quantity] = fitting[0]
@@ -227,11 +240,10 @@ def _joint_rows(path: Path, name: str, array: NDArray, n: int) -> NDArray[np.flo
 
 
 def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
-    if n != _POSE_JOINTS or not _is_pose_array(array):
-        raise RecordingError(
-            f"{path}: {name} is {_shape(array)}; allowed for poses of 7 joints: 8 x 2 x N (joint; position, effort; "
-            f"pose), and the arm must have 7 joints, not {n}"
-        )
+    if n != _POSE_JOINTS:
+        raise RecordingError(f"{path}: an array of poses contains {_POSE_JOINTS} joints, but the arm has {n}")
+    if not _is_pose_array(array):
+        raise RecordingError(f"{path}: {name} is {_shape(array)}; allowed: 8 x 2 x N (joint; position, effort; pose)")
     if array.size == 0:
         raise RecordingError(f"{path}: array {name} has no poses")
     joints = np.asarray(array, float).reshape(_POSE_ROWS, 2, -1)[:_POSE_JOINTS]

@@ -18,9 +18,11 @@ import numpy as np
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input, read_input
+from dvrk_drake.models.locked_joints import check_held
 from dvrk_drake.recordings.csv_rows import CsvReader, read_numbers
 from dvrk_drake.recordings.file_options import FileCoordinates, FileOptions
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.ros_bag import MAX_LATE
 
 #: Lines of a description before the names of the columns.
 _HEAD = 7
@@ -72,14 +74,26 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
         extra = _member_columns(names, jaw, member) if jaw else []
         if len(columns) == len(joints) and bool(extra) == bool(jaw):
             blocks[block] = [[*columns, *extra][i] for i in order]
-    blocks |= {"t": [names.index(f"{signal}.Timestamp")], "valid": [names.index(f"{signal}.Valid")]}
+    for block, member in (("t", f"{signal}.Timestamp"), ("valid", f"{signal}.Valid")):
+        if member not in names:
+            raise RecordingError(f"{description}: has no column {member}; signals of type prmStateJoint have one")
+        blocks[block] = [names.index(member)]
+    held = {label: column for label, column in zip(labels, joints, strict=False) if label in arm.locked_joints}
+    blocks["held"] = list(held.values())
     with CsvReader(data, options.progress) as reader:
         found = read_numbers(reader, names, blocks, skip_invalid=options.skip_invalid, header_name=description.name)
         sha256 = reader.sha256()
     t = found.blocks["t"][:, 0]
     valid = found.blocks["valid"][:, 0] != 0
     latest = np.maximum.accumulate(np.where(valid, t, -np.inf))
-    new = valid & (t > np.concatenate([[-np.inf], latest[:-1]]))
+    before = np.concatenate([[-np.inf], latest[:-1]])
+    if np.any(early := valid & (t < before - MAX_LATE)):
+        row = int(np.argmax(early))
+        raise RecordingError(
+            f"{data}, line {found.lines[row]}: the time of {signal} is {before[row] - t[row]:g} s before that of an "
+            "earlier row. Cut the file where the clock was set."
+        )
+    new = valid & (t > before)
     notes = list(found.notes)
     for count, reason in (
         (np.sum(~valid), "marked invalid"),
@@ -89,6 +103,7 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
             notes.append(f"{count} rows of {signal} omitted: {reason}")
     if not np.any(new) or np.sum(valid & ~new) > np.sum(new):
         raise RecordingError(f"{data}: {signal} has {np.sum(new)} usable rows ({'; '.join(notes)})")
+    check_held(f"{data}: {signal}", list(held), found.blocks["held"][new], arm)
     recording = Recording(
         found.blocks["q"][new],
         found.blocks["tau"][new] if "tau" in blocks else None,

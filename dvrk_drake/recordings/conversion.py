@@ -33,7 +33,7 @@ def convert(
 
     Args:
         path: Path of the recording.
-        output: Path of the file to write: .mcap for a bag, anything else for a CSV. An existing file is replaced.
+        output: Path of the file to write: .csv, or .mcap for a bag. An existing file is replaced.
         arm: The data are written in the joint coordinates of this arm. If None, they are written in the coordinates of
             the recording. An MCAP bag, and reading a ROS bag or a file of the cisst collector, require the arm.
         coordinates, topic, arrays, rate, skip_invalid, progress: See `read_recording`.
@@ -42,9 +42,12 @@ def convert(
         Written recording. Its `source`, `lines` and `notes` refer to the original file.
 
     Raises:
-        RecordingError: See `read_recording`; additionally if the arm cannot reach the poses.
+        RecordingError: See `read_recording`; additionally if the arm cannot reach the poses, or `output` has another
+            suffix.
         DvrkDrakeError: The output cannot be written.
     """
+    if Path(output).suffix not in (".csv", ".mcap"):
+        raise RecordingError(f"{output}: the name of the output must end in .csv or .mcap (MCAP bag)")
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
         raise RecordingError(f"{output} is the input recording. Choose another output file.")
     recording = read_recording(
@@ -67,7 +70,7 @@ def convert(
 def _properties(recording: Recording) -> list[str]:
     """Returns notes on coordinates, times and repeated rows that the user must know for the next command."""
     notes = []
-    if recording.coordinates == "actuator":
+    if recording.coordinates == "actuator" and not any("wpi" in note for note in recording.notes):
         notes.append(
             "in actuator coordinates, but the CSV does not state this: pass --coordinates actuator to every command "
             "that reads the CSV, or convert with --arm"

@@ -211,7 +211,7 @@ def read_numbers(
         raise RecordingError(f"{path} has " + ("no row of finite numbers" if skipped else "a header but no rows"))
     kept, left_out = np.frombuffer(lines, np.int64), np.frombuffer(skipped, np.int64)
     return NumberRows(
-        {name: np.frombuffer(part).reshape(len(lines), -1) for name, part in values.items()},
+        {name: np.frombuffer(part).reshape(len(lines), len(blocks[name])) for name, part in values.items()},
         kept,
         np.searchsorted(np.union1d(kept, left_out), kept),
         (skipped_note(left_out, len(lines) + len(skipped)),) if skipped else (),

@@ -65,7 +65,8 @@ class FileOptions:
             return dataclasses.replace(recording, coordinates=coordinates)
         recording = dataclasses.replace(recording, coordinates="actuator")
         if self.arm is None:
-            return recording
+            note = "in the coordinates wpi; pass --coordinates wpi to every command that reads the converted file"
+            return dataclasses.replace(recording, notes=(*recording.notes, note))
         J = self.arm.transmission.matrix.copy()
         for joint in set(_WPI_DIRECT_JOINTS) & set(self.arm.joint_names):
             row = self.arm.joint_names.index(joint)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+import struct
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
-from dvrk_drake.models.locked_joints import lock_hint
+from dvrk_drake.models.locked_joints import check_held, lock_hint
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.recording import Recording
 
@@ -30,11 +31,15 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-_MAGIC = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0")
+#: Beginning of a file of each kind, and the suffix that the rosbags library requires.
+_MAGIC = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _METADATA = "metadata.yaml"
 
 #: Longest distance in time between a message of the arm and the messages of its jaw [s].
 MAX_JAW_GAP = 0.05
+#: Longest time by which a message may be earlier than the previous one [s]. Such messages are omitted. An earlier
+#: message means that the clock was set.
+MAX_LATE = 0.1
 #: Messages between two reports of progress.
 _REPORT = 4096
 
@@ -44,7 +49,7 @@ def is_ros_bag(path: Path) -> bool:
     if path.is_dir():
         return (path / _METADATA).is_file()
     with path.open("rb") as file:
-        return file.read(16).startswith(_MAGIC)
+        return file.read(16).startswith(tuple(_MAGIC))
 
 
 def read_ros_bag(path: Path, options: FileOptions) -> Recording:
@@ -66,7 +71,8 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
     """
     arm, skip_invalid, progress = options.required_arm(path), options.skip_invalid, options.progress
     reader = _Bag(path)
-    with reader:
+    # Numbers near the largest floating-point number overflow in sums.
+    with reader, np.errstate(over="ignore"):
         connections = reader.joint_state_topics()
         listed = {name: f"{name} ({connections[name].msgcount})" for name in connections}
         name = choose_topic(path, arm, options.topic, listed)
@@ -87,6 +93,7 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
         first, jaw_notes = _with_jaw(path, first, parts[1], arm.joint_names[-1])
         notes += jaw_notes
     order = _joint_order(path, name, first.names, arm)
+    check_held(f"{path}: {name}", first.names, first.q, arm)
     q, qd, tau = (None if part is None else part[:, order] for part in (first.q, first.qd, first.tau))
     assert q is not None
     t = 1e-9 * (first.stamps - first.stamps[0])
@@ -114,6 +121,12 @@ class _Bag:
         from rosbags.typesys import Stores, get_typestore
 
         self.path = path
+        if not path.is_dir():
+            with path.open("rb") as file:
+                start = file.read(16)
+            suffix = next(suffix for magic, suffix in _MAGIC.items() if start.startswith(magic))
+            if path.suffix != suffix:
+                raise RecordingError(f"{path}: this is a ROS bag whose name must end in {suffix}; rename the file")
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
         except Exception as error:
@@ -150,7 +163,9 @@ class _Bag:
             raise self._error(error) from error
 
     def _error(self, error: Exception) -> RecordingError:
-        text = " ".join(str(error).split()) or type(error).__name__
+        # Errors of these types have texts about the program instead of the bag.
+        is_internal = isinstance(error, (TypeError, KeyError, IndexError, AssertionError, AttributeError, struct.error))
+        text = "damaged" if is_internal else " ".join(str(error).split()) or "damaged"
         repair = {".bag": "rosbag reindex", ".mcap": "mcap recover"}.get(self.path.suffix, "ros2 bag reindex")
         return RecordingError(
             f"{self.path}: the bag cannot be read ({text}). It may be incomplete; `{repair}` can repair it."
@@ -171,9 +186,11 @@ class _Connections(NamedTuple):
 def fitting_topics(arm: Arm, topic: str | None, names: Iterable[str]) -> list[str]:
     """Returns the JointState topics that fit an arm or the topic or namespace `topic`, see `read_ros_bag`."""
     if topic is not None:
-        return [name for name in (topic, f"{topic.rstrip('/')}/measured_js") if name in names][:1]
+        topic = f"/{topic.strip('/')}"
+        return [name for name in (topic, f"{topic}/measured_js") if name in names][:1]
     pattern = re.compile(rf"(/.*)?/{re.escape(arm.name)}[0-9]*/measured_js")
-    return [name for name in names if pattern.fullmatch(name)]
+    # A dVRK cart publishes the joints of a setup joint arm on /SUJ/<ARM>/measured_js.
+    return [name for name in names if pattern.fullmatch(name) and "/SUJ/" not in name]
 
 
 def choose_topic(source: str | Path, arm: Arm, topic: str | None, topics: Mapping[str, str]) -> str:
@@ -209,7 +226,7 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
     stamps, messages = array("q"), array("q")
     blocks = {name: array("d") for name in ("position", "velocity", "effort")}
     present: list[tuple[str, array]] = []
-    unstamped, late, invalid, last, first_late = 0, 0, 0, 0, ""
+    unstamped, late, invalid, last = 0, 0, 0, 0
     topic = connections.topic
     for number, message in enumerate(bag.messages(connections), 1):
         if number % _REPORT == 0:
@@ -242,14 +259,23 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
             invalid += 1
             continue
         if stamp <= last:
+            if last - stamp > MAX_LATE * 1e9:
+                raise RecordingError(
+                    f"{bag.path}: the header stamp of message {number} of {topic} is {1e-9 * (last - stamp):g} s before "
+                    f"that of message {messages[-1]}. Cut the bag where the clock was set, or record again."
+                )
             late += 1
-            first_late = first_late or f"message {number} is {1e-9 * (last - stamp):g} s before the previous one"
             continue
         last = stamp
         stamps.append(stamp)
         messages.append(number)
         for (_, block), row in zip(present, rows, strict=True):
             block.frombytes(row.astype(float, copy=False).tobytes())
+    absent = [name for name in blocks if name not in dict(present)]
+    if stamps and (added := [name for name in absent if len(getattr(message, name))]):
+        raise RecordingError(
+            f"{bag.path}: message {messages[0]} of {topic} has no {added[0]}, but message {number} has. Cut the bag."
+        )
     notes = [
         f"{count} messages of {topic} omitted: {reason}"
         for count, reason in (
@@ -264,8 +290,8 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
         raise RecordingError(f"{bag.path}: {topic} has no usable message ({reasons})")
     if late > len(stamps):
         raise RecordingError(
-            f"{bag.path}: the header stamps of {topic} do not increase in {late} of {late + len(stamps)} messages: "
-            f"{first_late}. Cut the bag where the clock was set, or record again."
+            f"{bag.path}: the header stamps of {topic} do not increase in {late} of {late + len(stamps)} messages. "
+            "Record while the console publishes measured data."
         )
     q, qd, tau = (np.frombuffer(block).reshape(len(stamps), -1) if block else None for block in blocks.values())
     assert q is not None
@@ -310,6 +336,9 @@ def _with_jaw(path: Path, arm: _Topic, jaw: _Topic, joint: str) -> tuple[_Topic,
         values = np.interp(arm.stamps[kept] - jaw.stamps[0], jaw.stamps - jaw.stamps[0], column[:, 0])
         return np.column_stack([block[kept], values])
 
+    for block, of_arm, of_jaw in (("velocities", arm.qd, jaw.qd), ("efforts", arm.tau, jaw.tau)):
+        if of_arm is not None and of_jaw is None:
+            raise RecordingError(f"{path}: the topic of the jaw has no {block}, but the topic of the arm has")
     q = joined(arm.q, jaw.q)
     assert q is not None
     omitted = int(np.sum(~kept))
@@ -328,17 +357,12 @@ def _with_jaw(path: Path, arm: _Topic, jaw: _Topic, joint: str) -> tuple[_Topic,
 
 def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> list[int]:
     """Returns the column of each joint of the arm. Joints that are not in the arm are ignored."""
-    if recorded := [joint for joint in arm.locked_joints if joint in names]:
-        raise RecordingError(
-            f"{path}: {topic} contains {', '.join(recorded)}, but --locked states positions of these joints; allowed: "
-            "only joints that are not recorded"
-        )
     if missing := [joint for joint in arm.joint_names if joint not in names]:
         count = arm.num_joints - len(missing)
         hint = lock_hint(arm, count) if missing == list(arm.joint_names[count:]) else ""
         advice = f"Check --arm and --topic.{hint and f' {hint}'}"
         if missing == [arm.joint_names[-1]] == ["jaw"]:
-            advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well."
+            advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well. {hint}".rstrip()
         raise RecordingError(
             f"{path}: {topic} has the joints {', '.join(names)}; {arm.name} also needs {', '.join(missing)}. {advice}"
         )

@@ -167,7 +167,7 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
     recording = recording.in_actuator_coordinates(arm)
     clock = clock or true_time(recording)
     duration = float(clock.t[-1] - clock.t[0])
-    rate = (len(recording) - 1) / duration
+    rate = (len(recording) - 1) / duration if duration > 0 else 0.0
     if duration < MIN_DURATION or rate < MIN_RATE:
         raise RecordingError(
             f"{recording.source or 'recording'}: the motion lasts {duration:.1f} s at {rate:.0f} Hz. A dynamic model "
