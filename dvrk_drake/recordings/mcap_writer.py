@@ -264,7 +264,7 @@ def _stamps(recording: Recording, path: str | Path) -> list[int]:
     t = recording.t if recording.t is not None else _POSE_INTERVAL * np.arange(len(recording))
     elapsed = 1e9 * (t - t[0])
     if not np.all(elapsed < _LAST_STAMP - _FIRST_STAMP):  # also false for NaN
-        raise RecordingError(f"{path} was not written: times in a bag must be finite, at most {_LAST_STAMP / 1e9:g} s")
+        raise RecordingError(f"{path} was not written: allowed in a bag: finite times up to {_LAST_STAMP / 1e9:g} s")
     stamps = _FIRST_STAMP + np.rint(elapsed).astype(np.int64)
     if np.any(late := np.diff(stamps) <= 0):
         row = int(np.argmax(late)) + 1
