@@ -1,16 +1,15 @@
-"""Compares models identified from recordings of the first three joints of two PSMs with ordinary least squares.
+"""Compares `identify` with ordinary least squares on recordings of the first three joints of two PSMs.
 
     python benchmarks/three_joint_recordings.py FOLDER [--json FILE]
 
 FOLDER contains psm1_1.csv to psm1_3.csv and psm2_1.csv, psm2_2.csv with columns t, q1..q3, qd1..qd3 and tau1..tau3, at
-200 Hz. The wrist is locked at zero. Each model is evaluated on each recording of the same arm that it was not
-identified from.
+200 Hz. All other joints are locked at zero. Each model is evaluated on the other recordings of the same arm.
 
 Errors are |tau - tau_hat| / |tau| of each actuator. Both efforts are low-pass filtered with a zero-phase Butterworth
-filter (17 Hz, order 6), and 100 rows at each end are omitted. Rows:
+filter (17 Hz, order 6), and 100 rows at each end are omitted. Methods:
 
     identify       model of `dvrk-drake identify`, from one recording
-    least squares  ordinary least squares over the full regressor of the arm, viscous friction, smoothed Coulomb
+    least squares  ordinary least squares over the full regressor of the arm with viscous friction, smoothed Coulomb
                    friction, offset, spring and rotor inertia of each joint, from one recording or from all others
 """
 
@@ -30,20 +29,25 @@ from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 
 RATE, CUT_OFF, ENDS = 200.0, 17.0, 100
-#: Width of the smoothed sign function in the Coulomb friction of the least squares [rad/s], [m/s].
+#: Velocity scale of the smoothed sign function tanh(v / WIDTH) in the Coulomb friction [rad/s], [m/s].
 WIDTH = 0.1, 0.01
 ARMS = {"PSM1": ("psm1_1", "psm1_2", "psm1_3"), "PSM2": ("psm2_1", "psm2_2")}
 LOCKED = {"roll": 0.0, "wrist_pitch": 0.0, "wrist_yaw": 0.0, "jaw": 0.0}
 
 
 def relative_errors(recording: dvrk.Recording, tau_filtered: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the relative RMS errors (n,) of predicted efforts (m, n) that are already low-pass filtered [%]."""
+    """Returns the relative RMS errors (n,) [%].
+
+    Args:
+        recording: Recording with the measured efforts.
+        tau_filtered: Predicted efforts (m, n) [N m, N], already low-pass filtered.
+    """
     tau = low_pass(recording.measured_effort(), RATE, CUT_OFF)[ENDS:-ENDS]
     return 100 * np.sqrt(np.mean((tau - tau_filtered[ENDS:-ENDS]) ** 2, axis=0) / np.mean(tau**2, axis=0))
 
 
 def least_squares_columns(recording: dvrk.Recording, regressor: DynamicRegressor) -> NDArray[np.float64]:
-    """Returns the columns (m, n, p) of the least squares, low-pass filtered."""
+    """Returns the low-pass filtered regressor (m, n, p) of the least squares."""
     q, v = recording.q, recording.qd
     assert v is not None
     vd = np.gradient(low_pass(v, RATE, CUT_OFF), 1 / RATE, axis=0)
@@ -58,7 +62,12 @@ def least_squares_columns(recording: dvrk.Recording, regressor: DynamicRegressor
 
 
 def least_squares(columns: list[NDArray[np.float64]], efforts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Returns the parameters (p,) fitted to several recordings."""
+    """Returns the parameters (p,) fitted to several recordings.
+
+    Args:
+        columns: Regressor (m, n, p) of each recording, see `least_squares_columns`.
+        efforts: Measured efforts (m, n) [N m, N] of each recording.
+    """
     A = np.concatenate([part[ENDS:-ENDS].reshape(-1, part.shape[2]) for part in columns])
     b = np.concatenate([low_pass(tau, RATE, CUT_OFF)[ENDS:-ENDS].ravel() for tau in efforts])
     size = np.linalg.norm(A, axis=0)

@@ -1,4 +1,4 @@
-"""Identifies a right master arm from a recording, like `dvrk-drake identify`.
+"""Identifies a right master arm from a recording, as `dvrk-drake identify` does.
 
 dvrk-drake samples samples
 python real_recording.py samples/mtm_poses.csv [MODEL.yaml]

@@ -3,8 +3,8 @@
 python tools/make_samples.py
 
 The simulated arms have the friction, cables, stops, encoders, motors and delays of their arm files, except that the MTM
-has no wrist spring (see `perturbed_ground_truth`). The masses of their links differ from the SDF by up to 20 %, so an
-identified model is more accurate than the nominal model. Repeated runs on the same computer with the same packages give
+has no wrist spring (see `perturbed_ground_truth`). The masses of their links differ from the SDF by up to 20 %, so the
+nominal model is wrong. Repeated runs on the same computer with the same packages give
 the same files.
 """
 
@@ -31,17 +31,17 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import step_progress
 from dvrk_drake.recordings.samples import SAMPLES, SAMPLES_FOLDER
 
-#: Seed of the masses, the poses, the motions and the noise, and number of poses.
+#: Seed of the masses, poses, motions and noise. Number of poses.
 SEED, POSES = 18, 60
 #: Seed of each set of poses.
 POSE_SEEDS = {"mtm_poses": SEED, "mtm_other_poses": SEED + 1}
-#: Sampling rate of a motion [Hz], and its duration [s]. The motion begins earlier by LEAD_IN [s].
+#: Sampling rate [Hz] and duration [s] of a recorded motion. The simulation begins LEAD_IN [s] before the recording.
 RATE, DURATION, LEAD_IN = 100.0, 30.0, 2.0
 #: Period of a motion [s], and number of harmonics of the Fourier series of each joint.
 PERIOD, HARMONICS = 10.0, 5
 #: Smallest distance from a limit, as a share of the range of the limit.
 MARGIN = 0.02
-#: Middle and half of the range of each joint in the motion [rad, m].
+#: Middle of the range and half of the range of each joint in the motion [rad, m].
 RANGES = {
     "mtmr": ((-0.2, 0.40, -0.20, 0.5, 0.7, 0.0, 0.0), (0.75, 0.42, 0.38, 1.3, 1.5, 0.6, 1.8)),
     "psm": ((0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.3), (1.0, 0.7, 0.09, 1.6, 0.9, 0.9, 0.6)),
@@ -51,7 +51,7 @@ DECIMALS = {"t": 3, "q": 6, "qd": 4, "tau": 5}
 
 
 def static_poses(truth: GroundTruth, name: str, seed: int, progress: Callable[[float], object]) -> dvrk.Recording:
-    """Returns static poses as `dvrk-drake collect` records them: means of approaches from two opposite sides."""
+    """Returns static poses as `dvrk-drake collect` records them: means over two approach directions."""
     with ThreadPoolExecutor(1) as executor:
         return collect(truth, name, POSES, seed, executor, progress)
 
@@ -83,7 +83,7 @@ def motion(truth: GroundTruth, name: str, progress: Callable[[float], object]) -
 
 
 def desired_motion(arm: Arm) -> PiecewisePolynomial:
-    """Returns a periodic motion, a random Fourier series per joint, within the limits of the arm."""
+    """Returns a periodic motion within the limits of the arm: one random Fourier series per joint."""
     middle, half_range = RANGES[arm.name.lower()]
     generator = np.random.default_rng(SEED)
     t = sample_times(LEAD_IN + DURATION + 1.0, 0.01)

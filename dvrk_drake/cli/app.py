@@ -92,7 +92,7 @@ Locked = Annotated[
         metavar="NAME=POSITION ..",
         consume_multiple=True,
         help="Joints that were held and are not in the recording, with their positions [rad; m if prismatic], e.g. "
-        "roll=0 jaw=0. The recording contains the other joints as q1, q2, ...",
+        "roll=0. In a CSV, q1, q2, ... are the other joints.",
     ),
 ]
 Overwrite = Annotated[
@@ -144,27 +144,38 @@ _FILE = Group("Options for the file (docs/recordings.md)", sort_key=2)
 @Parameter(name="*", group=_FILE)
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
-    """Options for facts that a recording does not state, shared by the commands that read recordings."""
+    """Options for facts that the file of a recording may not state, for all commands that read recordings."""
 
     coordinates: Annotated[
         Literal["joint", "actuator", "wpi"] | None,
-        Parameter(help="Coordinates of q, qd and tau. Default: those that the file states, or else joint."),
+        Parameter(
+            help="Coordinates of q, qd and tau. wpi: actuator, except for the roll of a PSM. Default: as stated by "
+            "the file, wpi for a CSV with 21 columns and no header, or else joint."
+        ),
     ] = None
     topic: Annotated[
         str | None,
-        Parameter(metavar="TOPIC", help="ROS bag: JointState topic or its namespace. Default: measured_js of the arm."),
+        Parameter(
+            metavar="TOPIC",
+            help="ROS bag: JointState topic or its namespace. Collector: signal. Default: measured_js of the arm.",
+        ),
     ] = None
     arrays: Annotated[
         list[str] | None,
         Parameter(
             metavar="NAME=ARRAY ..",
             consume_multiple=True,
-            help="MATLAB file: names of the arrays, e.g. q=log.position tau=log.effort. Default: recognised names.",
+            help="MATLAB file, NumPy archive: names of arrays, e.g. q=log.position tau=log.effort. Default: recognised "
+            "names.",
         ),
     ] = None
     rate: Annotated[
         float | None,
-        Parameter(metavar="HZ", help="Sampling rate of a motion without times. Default: static poses."),
+        Parameter(
+            metavar="HZ",
+            help="Sampling rate of a motion without times. Default: 200 for a CSV with 21 columns and no header; other "
+            "files without times contain static poses.",
+        ),
     ] = None
     skip_invalid: Annotated[
         bool, Parameter(show_default=False, help="Omit rows with an empty cell, NaN or an infinite value.")

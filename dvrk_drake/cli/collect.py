@@ -37,7 +37,7 @@ def record(
     The file contains only complete rows, even after Ctrl-C or an error.
 
     Args:
-        file: New file: .mcap for a bag that opens in ROS 2 and Foxglove, .csv for a CSV, .log for an LCM log.
+        file: New file: .mcap for a bag for ROS 2 tools and Foxglove, .csv for a CSV, .log for an LCM log.
         duration: Duration [s], counted from the first message. Default: until Ctrl-C.
         ros: Record the JointState messages of a dVRK over ROS 2 instead of LCM, to an .mcap bag.
         topic: With --ros: JointState topic or its namespace. Default: measured_js of the arm.
@@ -52,7 +52,7 @@ def record(
     from dvrk_drake.recordings.recording_stream import check_stream_output
 
     if ros and (lcm_url or key):
-        raise RecordingError("--lcm-url and --key do not apply to --ros")
+        raise RecordingError("--lcm-url and --key cannot be used with --ros")
     if not ros and (topic is not None or domain is not None):
         raise RecordingError("--topic and --domain require --ros")
     recorded = load_arm(arm)

@@ -185,7 +185,7 @@ def predict(
     In all other cases, the command predicts the holding efforts.
 
     Args:
-        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in joint coordinates, or in actuator coordinates if the recording has them.
+        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the printed coordinates.
     """
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console

@@ -44,7 +44,7 @@ RENAMED = {
     "convert": {
         "": "--output",
         "--variable": "--arrays poses=NAME",
-        "--input-format": "--coordinates wpi for wpi-csv files, and not needed for other formats",
+        "--input-format": "--coordinates wpi for wpi-csv files, and not necessary for other formats",
     },
     "record": {"--output": "FILE, the first argument"},
     "key": {"": "--output"},

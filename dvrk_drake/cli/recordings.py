@@ -104,7 +104,7 @@ def convert(
 
     Args:
         output: File to write: .csv, or .mcap for ROS 2 tools and Foxglove.
-        arm: Convert to joint coordinates of this arm. Required to read or write a bag.
+        arm: Convert to joint coordinates of this arm. Required for bags and for files of the cisst collector.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording
 

@@ -233,8 +233,8 @@ def _preference_order(parameters: Sequence[StandardParameter], locked: Collectio
 
     The order is: first moments of numbered links from tip to base, first moments of the linkage, masses from base to
     tip. With this order, masses are combined with the first moments of preceding links. Only masses that a prismatic
-    joint lifts form a separate base parameter, such as "(m3+...+m7)". The links behind a locked joint are combined
-    with the link that carries them, so they come last.
+    joint lifts form a separate base parameter, such as "(m3+...+m7)". The parameters of links behind a locked joint
+    are combined with those of the link that carries them, so they come last.
     """
 
     def key(index: int) -> tuple:

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 #: Format of the files that `IdentifiedModel.save` writes.
 FORMAT = "dvrk_drake identified model 5"
-#: Formats of earlier versions that can be read. In formats 2 to 4, there are no locked joints. In format 2, `arm` is a
+#: Formats of earlier versions that can be read. Formats 2 to 4 have no locked joints. In format 2, `arm` is a
 #: name or an absolute path.
 _EARLIER_FORMATS = tuple(f"dvrk_drake identified model {version}" for version in (4, 3, 2))
 #: Allowed range of measured positions, which may be beyond the limits of a joint.

@@ -60,10 +60,11 @@ class KinematicCompensation:
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
         error: Largest differences (3,) between the torques of file and model on yaw, pitch and insertion [N m, N m, N].
-            They are computed within the joint limits for a straight instrument (all instrument joints at zero), or for
-            the locked joints of the model's arm.
+            They are computed within the joint limits, with a straight instrument (all instrument joints at zero) or
+            with the instrument joints at their locked positions.
         wrist: Largest changes (3,) of the model's torques on these joints due to the positions of the instrument
-            joints [N m, N m, N]. The file does not represent these changes. Not meaningful if these joints are locked.
+            joints [N m, N m, N]. The file does not represent these changes. Not meaningful if the instrument joints are
+            locked.
     """
 
     alpha: NDArray[np.float64]
@@ -99,7 +100,7 @@ class KinematicCompensation:
 def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> KinematicCompensation:
     """Converts the gravity torque of yaw, pitch and insertion to the controller's chain, for a straight instrument.
 
-    If the instrument joints of the model are locked, the chain represents the instrument at their positions.
+    If the instrument joints of the model are locked, the chain represents the instrument at the locked positions.
 
     Args:
         model: Model of a PSM.

@@ -65,8 +65,7 @@ class Arm:
         identification: Settings for recordings of the arm, and bounds of the mass distribution of the links.
         effects: Friction, cable and sensor effects of the real arm. A simulation includes only those that are named in
             `simulated_effects`.
-        separate_joint: Name of the joint that the dVRK publishes on ROS topics of its own, e.g. "jaw"; "" if there is
-            none.
+        separate_joint: Name of the joint that the dVRK publishes on separate ROS topics, e.g. "jaw", or "".
         locked_joints: Positions of the joints that are locked [rad, m], see `with_locked_joints`. They are not among
             the n independent joints.
 
@@ -258,15 +257,15 @@ class Arm:
     def with_locked_joints(self, positions: Mapping[str, float]) -> Arm:
         """Returns the arm with locked joints, as with `pydrake.multibody.tree.Joint.Lock`.
 
-        The returned arm has only the other joints. Its dynamics are those of these joints while the locked joints are
-        at rest at the given positions. Use it for recordings of some of the joints.
+        The returned arm has only the other joints. Its dynamics are valid while the locked joints are at rest at the
+        given positions. Use it for recordings of only some of the joints.
 
         Args:
             positions: Mapping from the name of each locked joint to its position [rad, m].
 
         Raises:
-            ArmError: A joint is unknown, a position violates the limits, all joints are locked, or a motor moves a
-                locked joint together with another joint.
+            ArmError: A joint is unknown or already locked, a position violates a limit, all joints are locked, or a
+                motor or a position-dependent effect acts on a locked joint and on another joint.
 
         Example:
             >>> import dvrk_drake as dvrk
@@ -280,7 +279,7 @@ class Arm:
         """Raises ArmError if the arm has locked joints.
 
         Args:
-            use: What requires all joints, for the message, e.g. "a controller".
+            use: User of the arm that requires all joints, for the message, e.g. "a controller".
         """
         if self.locked_joints:
             raise ArmError(

@@ -152,7 +152,7 @@ class Instrument:
     `joint_from_actuator` is the disc coupling as defined by the dVRK: joint position = sum of coefficient * actuator
     position. `friction_coordinates` are additional coordinates along which friction acts, besides joints and actuators.
     Each name is mapped to the joint coefficients of its coordinate: coordinate = sum of coefficient * joint position.
-    `separate_joint` is the joint that the dVRK publishes on topics of its own, `/<ARM>/<joint>/...`, if there is one.
+    `separate_joint` is the joint that the dVRK publishes on separate topics `/<ARM>/<joint>/...`, or "".
     """
 
     sdf: str = ""

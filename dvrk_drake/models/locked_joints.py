@@ -1,4 +1,4 @@
-"""Locks joints of an arm: the other joints and their dynamics, for recordings of some of the joints."""
+"""Makes arms with locked joints, for recordings of only some of the joints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_LOCKED_ERROR = 0.02
 
 
 def lock_joints(arm: Arm, positions: Mapping[str, float]) -> Arm:
-    """Returns the arm without the joints in `positions`, see `Arm.with_locked_joints`."""
+    """Returns the arm with locked joints. For arguments and errors, see `Arm.with_locked_joints`."""
     positions = {name: float(position) for name, position in positions.items()}
     accepted = f"allowed: {', '.join(arm.joint_names)}"
     for name, position in positions.items():
@@ -40,14 +40,15 @@ def lock_joints(arm: Arm, positions: Mapping[str, float]) -> Arm:
                 f"allowed: {lower:.4g}..{upper:.4g} {unit}"
             )
     if len(positions) == arm.num_joints:
-        raise ArmError(f"{arm.name}: all joints are locked; allowed: at least one joint of the recording is not locked")
+        raise ArmError(f"{arm.name}: all joints are locked; allowed: at least one joint that is not locked")
     return _locked(arm, tuple((name, positions[name]) for name in arm.joint_names if name in positions))
 
 
 def lock_hint(arm: Arm, num_recorded: int) -> str:
-    """Returns advice for a recording with only the first `num_recorded` joints of an arm, or "" if it does not apply.
+    """Returns advice for a recording that contains only the first `num_recorded` joints of an arm.
 
-    The advice names the joints that are not recorded and the option that states their positions.
+    The advice names the joints that are not recorded, and the option that states their positions. It is "" if all
+    joints are recorded, or none.
     """
     if not 0 < num_recorded < arm.num_joints:
         return ""
@@ -67,7 +68,7 @@ def lock_hint(arm: Arm, num_recorded: int) -> str:
 
 
 def locked_text(arm: Arm) -> str:
-    """Returns the locked joints and their positions [rad, m], such as "roll = 0, jaw = 0.5", or "" without any."""
+    """Returns the locked joints and their positions [rad, m], e.g. "roll = 0, jaw = 0.5", or "" if there are none."""
     return ", ".join(f"{name} = {x:g}" for name, x in arm.locked_joints.items())
 
 
@@ -95,7 +96,7 @@ def check_held(where: str, names: Sequence[str], q: NDArray[np.float64], arm: Ar
             if np.any(np.abs(measured - position) > MAX_LOCKED_ERROR):
                 raise RecordingError(
                     f"{where}: --locked states {joint}={position:g}, but the recorded positions are "
-                    f"{measured.min():.4g}..{measured.max():.4g}; allowed: a deviation up to {MAX_LOCKED_ERROR:g} rad or m"
+                    f"{measured.min():.4g}..{measured.max():.4g}; allowed deviation: {MAX_LOCKED_ERROR:g} rad or m"
                 )
 
 
@@ -140,34 +141,34 @@ def _locked(arm: Arm, positions: tuple[tuple[str, float], ...]) -> Arm:
 
 
 def _refuse_coupled_motors(arm: Arm, J: NDArray[np.float64], is_free: NDArray[np.bool_]) -> None:
-    """Raises ArmError if one motor acts on a locked and on another joint.
+    """Raises ArmError if a motor acts on a locked joint and on a joint that is not locked.
 
-    The effort of such a motor would be a part of the efforts of the other joints, but it is not recorded.
+    The joint that is not locked would then need the effort of a motor that was not recorded.
     """
     coupled = np.argwhere((J != 0) & (is_free[:, None] != is_free[None, :]))
     if len(coupled):
-        first, second = sorted(coupled[0].tolist())
-        names = arm.joint_names[first], arm.joint_names[second]
-        raise ArmError(
-            f"{arm.name}: {names[0]} and {names[1]} are coupled by the transmission; lock both of them or neither"
-        )
+        group = {int(coupled[0][0])}
+        while len(grown := {int(j) for i in group for j in np.flatnonzero(J[i] + J[:, i])} | group) > len(group):
+            group = grown
+        names = ", ".join(arm.joint_names[j] for j in sorted(group))
+        raise ArmError(f"{arm.name}: {names} are coupled by the transmission; lock all of these joints or none")
 
 
 def _refuse_position_effects(arm: Arm, reduced: Iterable[str]) -> None:
-    """Raises ArmError if an effect depends on a position that is a sum of a locked and another joint position.
+    """Raises ArmError if an effect depends on a sum of the positions of a locked joint and of another joint.
 
     Friction depends only on the velocity and the travel along a coordinate, so it is not affected by locked joints.
     """
     laws = {effect.coordinate for effect in (*arm.effects.cables, *arm.effects.springs)}
     if found := sorted((laws | arm.identification.known_effects.keys()).intersection(reduced)):
         raise ArmError(
-            f"{arm.name}: {found[0]} has position-dependent effects and contains locked and other joints; lock all of "
-            "these joints or none of them"
+            f"{arm.name}: {found[0]} has position-dependent effects and depends on locked and on other joints; lock "
+            "all of these joints or none of them"
         )
 
 
 def _coupled_limits(arm: Arm, free: list[str], stated: Mapping[str, float]) -> Iterable[CoupledLimit]:
-    """Yields the coupled limits of the joints that are not locked. The positions of locked joints change the bounds."""
+    """Yields the coupled limits of the joints that are not locked. Their bounds include the locked positions."""
     for limit in arm.coupled_limits:
         constant = sum(coefficient * stated.get(name, 0.0) for name, coefficient in limit.coefficients.items())
         coefficients = {name: x for name, x in limit.coefficients.items() if name in free}
@@ -182,7 +183,7 @@ def _coupled_limits(arm: Arm, free: list[str], stated: Mapping[str, float]) -> I
 
 
 def _effects(effects: ArmEffects, coordinates: Iterable[str], actuators: list[str]) -> ArmEffects:
-    """Returns the effects along `coordinates` and of `actuators`."""
+    """Returns only the effects along `coordinates` and those of `actuators`."""
 
     def only(table: dict[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in table.items() if name in actuators}

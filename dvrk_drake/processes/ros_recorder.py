@@ -1,4 +1,4 @@
-"""Process that records the joint states of one arm from ROS 2 to a bag, started by `dvrk-drake record --ros`."""
+"""Records the joint states of one arm from ROS 2 to a bag, for `dvrk-drake record --ros`."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
 
 #: Longest wait for a message between two checks for a stop [s].
 _POLL = 0.1
-#: Time after the discovery of the first fitting topic in which other fitting topics are discovered [s].
+#: Time to wait for other fitting topics after the first one was discovered [s].
 _DISCOVERY = 1.0
 
 
 class RosRecorder:
-    """Writes the JointState messages of one arm to a new bag in real time, as they were published.
+    """Writes the unmodified JointState messages of one arm to a new bag while they arrive.
 
     Attributes:
-        source: ROS domain, for messages.
-        num_rows: Number of recorded valid messages of the arm, without those of a joint with a topic of its own.
+        source: Name of the ROS domain, for messages.
+        num_rows: Number of recorded valid messages of the arm, without those on a separate topic, e.g. of the jaw.
     """
 
     def __init__(self, arm: Arm, path: str | Path, topic: str | None = None, domain: int | None = None) -> None:
         """Creates a recorder. The file is created when the topic of the arm is found.
 
         Args:
-            arm: Arm whose joint states are recorded. Its `separate_joint` is recorded from a topic of its own.
+            arm: Arm whose joint states are recorded. Its `separate_joint` is recorded from a separate topic.
             path: Path of the new bag, *.mcap.
             topic: JointState topic or its namespace. Default: the only topic `/<ARM>/measured_js`, in any namespace,
                 where ARM is the name of the arm, optionally followed by a number.
@@ -98,7 +98,7 @@ class RosRecorder:
         return ", ".join([*parts, *(f"no message on {topic}" for topic in sorted(self._silent))])
 
     def notes(self) -> list[str]:
-        """Returns one line for lost messages, for invalid messages, and for each topic without messages."""
+        """Returns one line each for lost messages, invalid messages, and topics without messages."""
         counts = {
             "messages lost by DDS": self._num_lost(),
             "messages with header stamp 0, which marks invalid data": self._num_invalid,
@@ -107,7 +107,7 @@ class RosRecorder:
         return [*(f"{text}: {count}" for text, count in counts.items() if count), *silent]
 
     def _subscribe(self, stopped: Callable[[], bool]) -> None:
-        """Waits for the topic of the arm, and subscribes to it and to the topic of a separate joint."""
+        """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one."""
         start, found = time.monotonic(), None
         topics: dict[str, bool] = {}
         while not stopped():
@@ -169,5 +169,5 @@ def open_ros_domain(domain: int | None = None) -> RosDomain:
     try:
         from dvrk_drake.processes.ros_topics import RosDomain
     except ModuleNotFoundError as error:
-        raise DvrkDrakeError("ROS 2 needs cyclonedds: pip install dvrk-drake[ros]") from error
+        raise DvrkDrakeError("ROS 2 needs the package cyclonedds: pip install cyclonedds") from error
     return RosDomain(domain)

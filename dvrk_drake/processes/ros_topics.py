@@ -1,11 +1,12 @@
-"""JointState topics of ROS 2 over DDS, with Cyclone DDS and without an installation of ROS.
+"""Receives JointState topics of ROS 2 with Cyclone DDS, without an installation of ROS.
 
-A ROS 2 topic `/<ARM>/measured_js` is the DDS topic `rt/<ARM>/measured_js`, and its type `sensor_msgs/msg/JointState` is
-`sensor_msgs::msg::dds_::JointState_` (https://design.ros2.org/articles/topic_and_service_names.html).
+DDS (Data Distribution Service) is the middleware of ROS 2. The ROS 2 topic `/<ARM>/measured_js` is the DDS topic
+`rt/<ARM>/measured_js`. Its type `sensor_msgs/msg/JointState` is the DDS type `sensor_msgs::msg::dds_::JointState_`
+(https://design.ros2.org/articles/topic_and_service_names.html).
 """
 
 # mypy: disable-error-code=call-arg
-# (mypy does not know the keyword `typename` of IdlStruct.)
+# mypy does not find the keyword `typename` of IdlStruct.
 
 import os
 import time
@@ -91,10 +92,10 @@ def ros_qos(depth: int, *, reliable: bool = True) -> Qos:
 
 
 class RosDomain:
-    """Participant of a ROS 2 domain.
+    """DDS participant of a ROS 2 domain.
 
     Attributes:
-        name: Text for messages, e.g. "ROS domain 0".
+        name: Name of the domain, for messages, e.g. "ROS domain 0".
         participant: DDS participant, which publishers and subscriptions need.
     """
 
@@ -122,7 +123,7 @@ class RosDomain:
         self._reliable: dict[str, bool] = {}
 
     def joint_state_topics(self) -> dict[str, bool]:
-        """Returns the JointState topics discovered so far, and whether all publishers of each one are reliable."""
+        """Returns a mapping from each JointState topic discovered so far to whether all its publishers are reliable."""
         for endpoint in self._publications.take(1000):
             topic = getattr(endpoint, "topic_name", "")
             if not topic.startswith(f"{_PREFIX}/") or endpoint.type_name != _JOINT_STATE:
@@ -134,7 +135,7 @@ class RosDomain:
         return dict(sorted(self._reliable.items()))
 
     def subscribe(self, topic: str, *, reliable: bool = True) -> "Subscription":
-        """Subscribes to a JointState topic. A best-effort publisher needs `reliable` False."""
+        """Subscribes to a JointState topic. Use `reliable=False` if a publisher is best-effort."""
         subscription = Subscription(self.participant, topic, reliable)
         self._waitset.attach(subscription.condition)
         self._has_subscriptions = True

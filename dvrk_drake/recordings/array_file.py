@@ -2,8 +2,8 @@
 
 The arrays q, qd, tau and t are named by the user or recognised by their names. Two public layouts are recognised:
 
-- static poses of WPI (https://github.com/WPI-AIM/dvrk_gravity_comp): one array of 8 x 2 x N, i.e. joint (the eighth is
-  the gripper), quantity (position, effort) and pose;
+- static poses of WPI (https://github.com/WPI-AIM/dvrk_gravity_comp): one array of 8 x 2 x N. Its dimensions are joint
+  (the eighth is the gripper), quantity (position, effort) and pose;
 - the gravity collection of JHU and CUHK (https://github.com/jhu-dvrk/dvrk-gravity-compensation): a folder of files with
   `current_position` and `desired_effort`, each joint x pose x sample.
 """
@@ -41,7 +41,7 @@ _NAMES = {
 }
 #: Quantities that the user can name.
 QUANTITIES = tuple(_NAMES)
-#: Joints and gripper of an array of static poses.
+#: First dimension of an array of static poses (joints and gripper), and number of joints.
 _POSE_ROWS, _POSE_JOINTS = 8, 7
 #: Maximum number of arrays listed in a message.
 _LISTED = 12
@@ -61,8 +61,8 @@ def is_array_file(path: Path) -> bool:
 def read_array_file(path: Path, options: FileOptions) -> Recording:
     """Reads a recording from a MATLAB file, a NumPy archive, or all such files of a folder and its subfolders.
 
-    An array is m x n, n x m or n x poses x samples for an arm with n joints. Each sample is one row of the recording.
-    Arrays without times contain static poses, unless the options state a rate.
+    An array is m x n, n x m or n x poses x samples, for m rows and n joints. Each sample is one row of the recording.
+    Arrays without times contain static poses, unless `options.rate` is given.
 
     `options.arrays` maps "q", "qd", "tau" and "t" to the names of the arrays. A member of a structure is named with
     dots: "log.q". {"poses": NAME} names an array of 8 x 2 x N. Default of each quantity: the array with a recognised
@@ -70,17 +70,17 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
 
     Args:
         path: Path of the file or of the folder.
-        options: Arm (default: 7 joints), coordinates (default: "joint"), arrays, rate and `skip_invalid`, which also
-            omits poses that contain only zeros.
+        options: Arm (default: 7 joints), coordinates (default: "joint"), arrays, rate and `skip_invalid`. In an array
+            of 8 x 2 x N, a pose of only zeros is also invalid.
 
     Raises:
-        RecordingError: A file is damaged, an array is missing or has another shape, several arrays are candidates, a
-            row is invalid, or a rate is given for arrays with times.
+        RecordingError: A file is damaged, an array is missing or has a wrong shape, several arrays of a quantity are
+            recognised, a row is invalid, or a rate is given for arrays with times.
     """
     files = _collection(path) if path.is_dir() else [path]
     names = dict(options.arrays or {})
     if unknown := set(names) - {*QUANTITIES, "poses"}:
-        raise RecordingError(f"unknown array {', '.join(sorted(unknown))}; allowed: {', '.join(QUANTITIES)}, poses")
+        raise RecordingError(f"unknown quantity {', '.join(sorted(unknown))}; allowed: {', '.join(QUANTITIES)}, poses")
     digest, parts = hashlib.sha256(), []
     for number, file in enumerate(files):
         options.progress(number / len(files))
@@ -90,15 +90,15 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     for file, part in zip(files, parts, strict=True):
         if (part.blocks.keys(), part.label) != (parts[0].blocks.keys(), parts[0].label):
             raise RecordingError(
-                f"{file}: has {', '.join(part.blocks)}, but {files[0]} has {', '.join(parts[0].blocks)}; all files of a "
-                "folder must have the same arrays"
+                f"{file}: has {', '.join(part.blocks)}, but {files[0]} has {', '.join(parts[0].blocks)}; all files of "
+                "a folder must have the same arrays"
             )
     blocks = {quantity: np.concatenate([part.blocks[quantity] for part in parts]) for quantity in parts[0].blocks}
     label, preallocated = parts[0].label, parts[0].preallocated
     notes = [parts[0].note if len(files) == 1 else f"{len(files)} files; {parts[0].note} of each file"]
     if "t" in blocks and len(files) > 1:
         del blocks["t"]
-        notes.append("times are not used, because each file has its own")
+        notes.append("times are not used, because each file has its own times")
     valid = _valid_rows(path, blocks, label, preallocated, options.skip_invalid)
     if not np.all(valid):
         omitted, reason = np.flatnonzero(~valid) + 1, "NaN or infinite" + preallocated * ", or all zeros"
@@ -126,9 +126,9 @@ class _Rows(NamedTuple):
 
     Attributes:
         blocks: Mapping from a quantity to its rows.
-        note: Source of the blocks.
+        note: Names of the arrays of the blocks.
         label: Name of a row, for messages.
-        preallocated: Whether a row of zeros was allocated, but not recorded.
+        preallocated: True if a row that contains only zeros is not a measurement.
     """
 
     blocks: dict[str, NDArray[np.float64]]
@@ -152,7 +152,7 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
     found = ", ".join(shapes[:_LISTED]) + (", ..." if len(shapes) > _LISTED else "") or "none"
     for quantity, name in names.items():
         if name not in arrays:
-            raise RecordingError(f"{path}: has no array {name} for {quantity}. Its arrays of real numbers: {found}.")
+            raise RecordingError(f"{path}: has no array {name} for {quantity}. Arrays of real numbers: {found}.")
     chosen = _chosen(path, arrays, n, names, found)
     if "poses" in chosen:
         if len(chosen) > 1:
@@ -161,7 +161,7 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
     if "q" not in chosen:
         raise RecordingError(
             f"{path}: no array for q. Name the arrays with --arrays q=NAME tau=NAME (arrays= in Python). "
-            f"Its arrays of real numbers: {found}."
+            f"Arrays of real numbers: {found}."
         )
     blocks = {
         quantity: _joint_rows(path, name, arrays[name], n) for quantity, name in chosen.items() if quantity != "t"
@@ -181,7 +181,8 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
 
 
 def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str], found: str) -> dict[str, str]:
-    """Returns a mapping from a quantity to its array: the named array, or the only one with a recognised name."""
+    """Returns a mapping from a quantity to its array: the named array, or the only one with a
+    recognised name and a fitting shape."""
     chosen = dict(names)
     if "poses" in names:
         return chosen
@@ -213,7 +214,7 @@ def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[st
         return {"poses": poses[0]}
     raise RecordingError(
         f"{path}: no array of {n} joints has a recognised name. Name the arrays with --arrays q=NAME tau=NAME (arrays= "
-        f"in Python). Its arrays of real numbers: {found}."
+        f"in Python). Arrays of real numbers: {found}."
     )
 
 
@@ -254,7 +255,7 @@ def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
 def _valid_rows(
     path: Path, blocks: Mapping[str, NDArray], label: str, preallocated: bool, skip_invalid: bool
 ) -> NDArray[np.bool_]:
-    """Returns which rows (m,) contain only finite numbers, and not only zeros if the arrays were preallocated."""
+    """Returns a mask (m,) of the rows that contain only finite numbers and, if preallocated, not only zeros."""
     if len(blocks["q"]) == 0:
         raise RecordingError(f"{path}: the arrays have no rows")
     table = np.column_stack([block.reshape(len(blocks["q"]), -1) for block in blocks.values()])
@@ -322,7 +323,7 @@ def _read_hdf5(content: bytes) -> dict[str, object]:
     found: dict[str, object] = {}
 
     def visit(name: str, item: object) -> None:
-        # Names that begin with # contain MATLAB's references.
+        # MATLAB stores references under names that begin with #.
         if isinstance(item, h5py.Dataset) and not name.startswith("#") and "MATLAB_empty" not in item.attrs:
             is_text = item.attrs.get("MATLAB_class", b"double") in (b"char", b"cell", b"logical")
             if not is_text:

@@ -1,6 +1,6 @@
-"""Reads the joint states in a CSV of the cisst state collector, whose columns are listed in a `.desc` file.
+"""Reads joint states from a CSV of the cisst collector. A `.desc` file lists the columns of the CSV.
 
-`mtsCollectorState` of cisstMultiTask (https://github.com/jhu-cisst/cisst) writes both files. The description contains
+The class `mtsCollectorState` of cisst (https://github.com/jhu-cisst/cisst) writes both files. The description contains
 the path of the CSV, the date, the format, the delimiter, three numbers of fields, and one line per column, e.g.
 "Data: measured_js.Position[0]:{d}". Each signal of type `prmStateJoint` has a time stamp [s], a flag that marks valid
 data, and the names, positions, velocities and efforts of its joints (rad, m, N m, N).
@@ -41,16 +41,18 @@ def is_collector_file(path: Path) -> bool:
 
 
 def read_collector(path: Path, options: FileOptions) -> Recording:
-    """Reads the measured joint states of an arm. Rows of invalid data and rows that repeat a time are omitted.
+    """Reads the measured joint states of an arm.
+
+    Rows of invalid data, and rows that are not later than the previous one, are omitted and noted.
 
     Joints are assigned by their names. Actuators, and joints without names, are assigned by their order. The jaw of a
     PSM is read from the signal "jaw/measured_js".
 
     Args:
         path: Path of the CSV or of its description. Both must be in the same folder.
-        options: Arm (required), coordinates, topic and `skip_invalid`. Default coordinates are actuator coordinates for
-            the signal "measured_js" of an input/output table, whose name ends in "Read", and joint coordinates for all
-            others. The topic is the name of the signal, e.g. "kin/measured_js". Default: the only signal of the arm.
+        options: Arm (required), coordinates, topic and `skip_invalid`. The default coordinates are "actuator" for the
+            signal "measured_js" of a table whose name ends in "Read", and "joint" for all other signals. The topic is
+            the name of the signal, e.g. "kin/measured_js". Default: the only signal of the arm.
 
     Raises:
         RecordingError: A file is missing, the description is damaged, no signal or several signals fit, or the signal
@@ -159,7 +161,7 @@ def _member_columns(names: list[str], signal: str, member: str) -> list[int]:
 
 
 def _joint_labels(path: Path, columns: list[int]) -> list[str]:
-    """Returns the names of the joints in the first row."""
+    """Reads the joint names from the first row of the CSV."""
     with open_input(path, RecordingError) as file:
         line = file.readline().decode(errors="replace")
     cells = next(csv.reader([line]), [])
@@ -169,7 +171,10 @@ def _joint_labels(path: Path, columns: list[int]) -> list[str]:
 def _order(
     path: Path, signal: str, labels: list[str], count: int, arm: Arm, *, has_jaw: bool, is_actuator: bool
 ) -> list[int]:
-    """Returns the column of each joint of the arm among the `count` columns of the signal, followed by the jaw."""
+    """Returns the index (n,) of each joint of the arm in the signal.
+
+    The signal has `count` joints. If `has_jaw` is True, the next index is that of the jaw.
+    """
     if has_jaw:
         labels, count = [*labels, arm.joint_names[-1]], count + 1
     if set(arm.joint_names) <= set(labels):

@@ -35,15 +35,15 @@ def convert(
         path: Path of the recording.
         output: Path of the file to write: .csv, or .mcap for a bag. An existing file is replaced.
         arm: The data are written in the joint coordinates of this arm. If None, they are written in the coordinates of
-            the recording. An MCAP bag, and reading a ROS bag or a file of the cisst collector, require the arm.
+            the recording. Required to write a bag, and to read a bag or a file of the cisst collector.
         coordinates, topic, arrays, rate, skip_invalid, progress: See `read_recording`.
 
     Returns:
         Written recording. Its `source`, `lines` and `notes` refer to the original file.
 
     Raises:
-        RecordingError: See `read_recording`; additionally if the arm cannot reach the poses, or `output` has another
-            suffix.
+        RecordingError: See `read_recording` and `write_recording`; additionally if `output` is the input recording
+            or has another suffix, or the arm cannot reach the poses.
         DvrkDrakeError: The output cannot be written.
     """
     if Path(output).suffix not in (".csv", ".mcap"):
@@ -68,7 +68,7 @@ def convert(
 
 
 def _properties(recording: Recording) -> list[str]:
-    """Returns notes on coordinates, times and repeated rows that the user must know for the next command."""
+    """Returns notes on coordinates, times and repeated rows, which affect the next command."""
     notes = []
     if recording.coordinates == "actuator" and not any("wpi" in note for note in recording.notes):
         notes.append(
@@ -76,7 +76,7 @@ def _properties(recording: Recording) -> list[str]:
             "that reads the CSV, or convert with --arm"
         )
     if recording.t is None:
-        notes.append("without times, read as static poses; --rate HZ adds times to a motion")
+        notes.append("without times, read as static poses; for a motion, give its sampling rate with --rate HZ")
         return notes
     steps = np.diff(recording.t)
     interval = f", median interval {1e3 * np.median(steps):.4g} ms" if len(steps) else ""

@@ -2,10 +2,11 @@
 
 Layouts without a header, for an arm with n joints:
 
-- 3n columns: positions, velocities and efforts. For n = 7, this is the layout of
-  https://github.com/WPI-AIM/dvrk_dynamics_identification, whose rows were sampled at 200 Hz.
+- 3n columns: positions, velocities and efforts. For n = 7, this is the layout of the motions of WPI
+  (https://github.com/WPI-AIM/dvrk_dynamics_identification), which were sampled at 200 Hz.
 - 2n columns: positions and efforts of static poses. The script `dvrk_ecm_psm_gc_collect.py` of the dVRK
-  (https://github.com/jhu-dvrk/dvrk_python) writes such files for the first three joints of a PSM or an ECM.
+  (https://github.com/jhu-dvrk/dvrk_python) writes such files for the first three joints of a PSM or of an
+  endoscope camera manipulator (ECM).
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ _WPI_JOINTS = 7
 def read_csv(path: Path, options: FileOptions) -> Recording:
     """Reads a recording from a CSV.
 
-    Default coordinates are "wpi" for 21 columns without a header, and "joint" for all other files. The default rate of
-    21 columns without a header is `WPI_RATE`. All other files without times contain static poses.
+    For 21 columns without a header, the default coordinates are "wpi" and the default rate is `WPI_RATE`. For all other
+    files, the default coordinates are "joint". Without times and rate, they contain static poses.
 
     Args:
         path: Path of the file.

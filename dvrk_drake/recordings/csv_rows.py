@@ -25,7 +25,7 @@ from dvrk_drake.models.files import open_input, read_input
 _BLOCK, _MAX_LINE = 1 << 20, 1 << 20
 #: Maximum size of a file whose rows are kept as text [bytes].
 _MAX_ROWS = 64_000_000
-#: Maximum number of rows of numbers, i.e. 15 min at 1 kHz. For so many rows, `check` needs 1.5 GB of memory.
+#: Maximum number of rows of numbers, i.e. 15 min at 1 kHz. With this number of rows, `check` needs 1.5 GB of memory.
 MAX_COUNT = 900_000
 
 
@@ -318,5 +318,5 @@ class GrowingFile:
             )
 
     def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Closes the file, which is complete already: `progress` is not called."""
+        """Closes the file. `progress` is not called, because the file is already complete."""
         self._file.close()

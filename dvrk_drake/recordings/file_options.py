@@ -1,4 +1,4 @@
-"""Facts about a recording that its file may not state: arm, coordinates, names of the data and sampling rate."""
+"""Options for facts that the file of a recording may not state: arm, coordinates, names and sampling rate."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.recordings.recording import Recording
 
-#: Coordinates of a file. "wpi": those of the recordings of WPI, i.e. of the actuators, except for the roll of a PSM,
-#: which is recorded at the joint (Wang et al. 2019, table of the PSM).
+#: Coordinates of q, qd and tau in a file. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint
+#: coordinates (motions of WPI; Wang et al. 2019, table of the PSM).
 FileCoordinates = Literal["joint", "actuator", "wpi"]
 #: Number of joints of a file that is read without an arm.
 _DEFAULT_JOINTS = 7
+#: Joints in joint coordinates in a file with "wpi" coordinates.
 _WPI_DIRECT_JOINTS = ("roll",)
 
 
@@ -55,10 +56,14 @@ class FileOptions:
         return self.arm
 
     def with_coordinates(self, recording: Recording, default: FileCoordinates = "joint") -> Recording:
-        """Returns a recording of a file with the coordinates of these options, or else with the default coordinates.
+        """Returns a recording with the coordinates of these options.
 
-        "wpi" data are converted to joint coordinates of the arm. Without an arm, they stay unchanged, and the result
-        states actuator coordinates, which is wrong for the roll of a PSM.
+        Data in "wpi" coordinates are converted to joint coordinates of the arm. Without an arm, they are not changed,
+        and the result states actuator coordinates, which is wrong for the roll of a PSM.
+
+        Args:
+            recording: Data of the file. Its attribute `coordinates` is not used.
+            default: Coordinates of the data if these options have none.
         """
         coordinates = self.coordinates or default
         if coordinates != "wpi":

@@ -1,6 +1,6 @@
-"""Writes the joint states of an arm to an MCAP bag that ROS 2 tools and Foxglove open, at once or during a recording.
+"""Writes joint states of an arm to an MCAP bag for ROS 2 tools and Foxglove.
 
-The bag has the topics of a dVRK with `sensor_msgs/JointState` messages, as `ros_bag` reads them. The format is
+The bag contains `sensor_msgs/JointState` messages on the topics of a dVRK. `read_ros_bag` reads it. The format is
 described at https://mcap.dev/spec and https://mcap.dev/spec/registry (profile ros2).
 """
 
@@ -35,7 +35,13 @@ _REPORT = 4096
 
 
 class JointStateTopic(NamedTuple):
-    """Topic of some joints of an arm: its name, the names of the joints, and their columns in vectors of the arm."""
+    """Topic with the states of some joints of an arm.
+
+    Attributes:
+        name: Name of the topic.
+        joint_names: Names of the joints.
+        columns: Index of each joint among the joints of the arm.
+    """
 
     name: str
     joint_names: tuple[str, ...]
@@ -46,28 +52,28 @@ def joint_state_topics(arm: Arm, namespace: str | None = None) -> tuple[JointSta
     """Returns the topics on which a dVRK publishes the measured joint states of an arm.
 
     Args:
-        arm: Arm whose joints are published. Its `separate_joint`, e.g. the jaw, has a topic of its own.
+        arm: Arm whose joints are published. Its `separate_joint`, e.g. the jaw, has a separate topic.
         namespace: Namespace of the topics. Default: `/<ARM>`, where ARM is the name of the arm.
     """
     namespace = f"/{arm.name}" if namespace is None else namespace
     topics = []
-    for below, own in (("", False), (f"/{arm.separate_joint}", True)):
-        columns = [i for i, joint in enumerate(arm.joint_names) if (joint == arm.separate_joint) == own]
+    for suffix, is_separate in (("", False), (f"/{arm.separate_joint}", True)):
+        columns = [i for i, joint in enumerate(arm.joint_names) if (joint == arm.separate_joint) == is_separate]
         if columns:
             joints = tuple(arm.joint_names[i] for i in columns)
-            topics.append(JointStateTopic(f"{namespace}{below}/measured_js", joints, columns))
+            topics.append(JointStateTopic(f"{namespace}{suffix}/measured_js", joints, columns))
     return tuple(topics)
 
 
 class McapWriter:
-    """Writes JointState messages in the CDR encoding to an MCAP stream."""
+    """Writes JointState messages to an MCAP stream, in the encoding of ROS 2 (CDR, Common Data Representation)."""
 
     def __init__(self, stream: Any, topics: Iterable[str], *, chunked: bool = True) -> None:
         """Begins a bag.
 
         Args:
-            stream: Binary stream, or object with its methods write and tell.
-            topics: Names of the topics of the bag.
+            stream: Binary stream, or an object with the methods `write` and `tell`.
+            topics: Names of the topics.
             chunked: Whether to compress and index the messages in chunks. If False, each message is written at once.
         """
         # These imports take 0.2 s, and most commands write no bag.
@@ -100,7 +106,8 @@ class McapWriter:
         Args:
             topic: Topic of the message.
             stamp: Header stamp, and time of publication [ns].
-            q, qd, tau: Positions, velocities and efforts (n,) of all joints of the arm. None: not in the message.
+            q, qd, tau: Positions, velocities and efforts (n,) of all joints of the arm. None: the message does not
+                contain the quantity.
             log_time: Time of arrival [ns]. Default: `stamp`.
 
         Raises:
@@ -123,7 +130,7 @@ class McapWriter:
         self.write_encoded(topic.name, data, stamp, stamp if log_time is None else log_time)
 
     def write_encoded(self, topic: str, data: bytes, publish_time: int, log_time: int) -> None:
-        """Writes a message in the CDR encoding with its times of publication and of arrival [ns]."""
+        """Writes a message that is already encoded (CDR), with its times of publication and arrival [ns]."""
         sequence = self._counts[topic]
         self._counts[topic] += 1
         self._writer.add_message(self._channels[topic], log_time, data, publish_time, sequence)
@@ -134,7 +141,7 @@ class McapWriter:
 
 
 class GrowingMcap(McapWriter):
-    """Bag of a running recording. After each message, the file contains it.
+    """Bag of a running recording. Each message is written to the file immediately.
 
     If the process is terminated, the end of the bag is missing. `mcap recover` then restores all complete messages.
     """
@@ -149,10 +156,10 @@ class GrowingMcap(McapWriter):
         super().__init__(_Records(self._file), topics, chunked=False)
 
     def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Ends the bag, and groups its messages in compressed chunks with an index, which takes 10 us per message.
+        """Ends the bag, compresses its messages in chunks, and adds an index. This takes 10 us per message.
 
         Args:
-            progress: Callback that receives the completed share 0..1.
+            progress: Callback that receives the completed fraction (0 to 1).
 
         Raises:
             RecordingError: The end or the index cannot be written. The file contains all complete messages.
@@ -168,7 +175,7 @@ class GrowingMcap(McapWriter):
 
 
 class _Records:
-    """Stream of a `Writer` that appends each record to a file by one write."""
+    """Stream for a `Writer`. Each record is appended to a file by one write."""
 
     def __init__(self, file: GrowingFile) -> None:
         self._file, self._size = file, 0
@@ -185,13 +192,13 @@ class _Records:
 def _new_writer(stream: Any, *, chunked: bool = True) -> Any:
     from mcap.writer import IndexType, Writer
 
-    # The library would write pointers to the empty indexes of attachments and metadata, which the format does not have.
+    # By default, the library writes pointers to indexes of attachments and metadata, although the bag has neither.
     indexes = IndexType.CHUNK | IndexType.MESSAGE if chunked else IndexType.NONE
     return Writer(stream, use_chunking=chunked, index_types=indexes)
 
 
 def _pack(path: str | Path, progress: Callable[[float], object]) -> None:
-    """Replaces a bag without chunks by one with compressed chunks and an index, atomically."""
+    """Replaces a bag without chunks by a bag with compressed chunks and an index, atomically."""
     from mcap.records import Channel, Header, Message, Schema
     from mcap.stream_reader import StreamReader
 
@@ -221,8 +228,8 @@ def _pack(path: str | Path, progress: Callable[[float], object]) -> None:
 def write_mcap(recording: Recording, path: str | Path, arm: Arm) -> None:
     """Writes a recording as an MCAP bag, atomically and with full precision, in joint coordinates of the arm.
 
-    The first row has the header stamp 1 s, and the following rows keep their distance in time. Rows without times are
-    1 s apart, so that the recording remains a recording of static poses. The log times are the header stamps.
+    The header stamp of the first row is 1 s. The intervals between the rows are those of the recording. Static poses
+    without times are 1 s apart, so they are not read as a motion. The log times are the header stamps.
 
     Args:
         recording: Recording to write.
@@ -257,7 +264,7 @@ def _stamps(recording: Recording, path: str | Path) -> list[int]:
     t = recording.t if recording.t is not None else _POSE_INTERVAL * np.arange(len(recording))
     elapsed = 1e9 * (t - t[0])
     if not np.all(elapsed < _LAST_STAMP - _FIRST_STAMP):  # also false for NaN
-        raise RecordingError(f"{path} was not written: a bag holds finite times up to {_LAST_STAMP / 1e9:g} s")
+        raise RecordingError(f"{path} was not written: allowed in a bag: finite times up to {_LAST_STAMP / 1e9:g} s")
     stamps = _FIRST_STAMP + np.rint(elapsed).astype(np.int64)
     if np.any(late := np.diff(stamps) <= 0):
         row = int(np.argmax(late)) + 1

@@ -1,4 +1,4 @@
-"""Reads recordings of all supported formats. Each format has one reader; `FORMATS` lists them."""
+"""Reads recordings of all supported formats. `FORMATS` lists the formats with their readers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Format:
 
     Attributes:
         name: Name of the format with its article.
-        matches: Function that returns whether an existing path has this format, according to its content and name.
+        matches: Function that returns whether an existing file or folder has this format, from its content and name.
         read: Function that reads the file.
         options: Names of the options that apply to this format, besides `arm`, `skip_invalid` and `progress`.
     """
@@ -41,7 +41,7 @@ class Format:
     options: frozenset[str]
 
 
-#: Formats in the order in which they are tried. A file with none of them is a CSV.
+#: Formats in the order in which they are tried. A file of no other format is a CSV.
 FORMATS = (
     Format("an LCM log", is_lcm_log, read_status_log, frozenset()),
     Format("a ROS bag", is_ros_bag, read_ros_bag, frozenset({"topic"})),
@@ -69,20 +69,21 @@ def read_recording(
 ) -> Recording:
     """Reads a recording: CSV, ROS bag, MATLAB file, NumPy archive, cisst collector or LCM log.
 
-    The content of the file selects the format. docs/recordings.md describes the formats, and what each of them states
-    about units, coordinates and time.
+    The content of the file selects the format. docs/recordings.md describes the formats with their units, coordinates
+    and times.
 
     Args:
         path: Path of the file. A ROS 2 bag and a collection of MATLAB files may also be folders.
         arm: Arm that defines the number and the names of the joints. From a bag or a log, only the measurements of this
-            arm are read. It is required for a bag and for the cisst collector. If None, other files must have 7 joints,
-            and a log must have statuses of only one arm.
+            arm are read. Required for a bag and for the cisst collector. If None, other files must have 7 joints, and a
+            log must have statuses of only one arm.
         coordinates: Coordinates of q, qd and tau in a file that does not state them: "joint", "actuator", or "wpi" for
             the motions of WPI, which are in actuator coordinates except for the roll of a PSM. Default: the coordinates
-            that the file states, or else "joint".
-        topic: Topic of a bag, or its namespace, see `read_ros_bag`; signal of the cisst collector.
+            that the file states, "wpi" for a CSV with 21 columns and no header, or else "joint".
+        topic: Topic of a bag or its namespace, see `read_ros_bag`. For the cisst collector: name of the signal.
         arrays: Mapping from "q", "qd", "tau" and "t" to the names of arrays, see `read_array_file`.
-        rate: Sampling rate [Hz] of a motion in a file without times.
+        rate: Sampling rate [Hz] of a motion in a file without times. Default: 200 Hz for a CSV with 21 columns and no
+            header; all other files without times contain static poses.
         skip_invalid: Whether to omit rows and messages that contain an empty cell, a NaN or an infinity, and to list
             them in `notes`. If False, a file with such rows is refused.
         progress: Callback that receives the name of the step ("reading") and the completed fraction (0 to 1).
@@ -145,8 +146,8 @@ def detect_format(path: Path) -> Format:
     found = next((known for known in FORMATS if known.matches(path)), None)
     if found is None:
         raise RecordingError(
-            f"{path} is a folder without a recording; allowed: ROS 2 bag with metadata.yaml, MATLAB files (.mat). A bag "
-            "without metadata.yaml is read by the name of its .mcap or .db3 file."
+            f"{path} is a folder without a recording; allowed: ROS 2 bag (with metadata.yaml), MATLAB files (.mat), NumPy "
+            "archives (.npz). To read a bag without metadata.yaml, give the path of its .mcap or .db3 file."
         )
     if found is FORMATS[-1] and b"\0" in head:
         raise RecordingError(

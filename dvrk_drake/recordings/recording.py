@@ -1,6 +1,6 @@
 """Defines `Recording`: positions and efforts of a motion or of static poses.
 
-`read_recording` in `reading.py` reads recordings of all formats.
+`read_recording` (module `reading`) reads recordings of all formats.
 """
 
 from __future__ import annotations
@@ -139,8 +139,8 @@ class Recording:
         """
         if self.tau is None:
             raise RecordingError(
-                f"{self.source or 'recording'} has no efforts; needs columns tau1..tau{self.q.shape[1]}, an array tau, or "
-                "efforts in the messages"
+                f"{self.source or 'recording'} has no efforts; needs columns tau1..tau{self.q.shape[1]}, an array tau, "
+                "or efforts in the messages"
             )
         return self.tau
 
@@ -246,12 +246,13 @@ def column_names(prefix: str, num_joints: int) -> list[str]:
 
 
 def write_recording(recording: Recording, path: str | Path, arm: Arm | None = None) -> None:
-    """Writes a CSV, or an MCAP bag for ROS 2 and Foxglove, for `read_recording`, atomically and with full precision.
+    """Writes a recording as a CSV, or as an MCAP bag for ROS 2 tools and Foxglove, atomically and with full precision.
 
     Args:
-        recording: Recording to write. A CSV does not state the coordinates. A bag is in joint coordinates.
+        recording: Recording to write. A CSV keeps its coordinates, but does not state them. A bag is in joint
+            coordinates and has other times, see `write_mcap`.
         path: Path of the file: .mcap for a bag, anything else for a CSV. An existing file is replaced.
-        arm: Arm whose joints are named in a bag; not needed for a CSV. See `write_mcap` for the times in a bag.
+        arm: Arm of the recording. Required for a bag, which contains the joint names.
 
     Raises:
         RecordingError: The recording cannot be written as a bag, see `write_mcap`, or `arm` is missing.
@@ -267,7 +268,9 @@ def write_recording(recording: Recording, path: str | Path, arm: Arm | None = No
         from dvrk_drake.recordings.mcap_writer import write_mcap
 
         if arm is None:
-            raise RecordingError(f"{path}: an MCAP bag needs the arm whose joints it names: --arm (arm= in Python)")
+            raise RecordingError(
+                f"{path}: an MCAP bag contains joint names, so the arm is required: --arm (arm= in Python)"
+            )
         write_mcap(recording, path, arm)
         return
     columns, header = [], []

@@ -45,7 +45,7 @@ class RecordingFile(Protocol):
         """
 
     def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Completes and closes the file. `progress` receives the completed share 0..1."""
+        """Completes and closes the file. `progress` receives the completed fraction (0 to 1)."""
 
 
 def check_stream_output(path: str | Path, accepted: tuple[str, ...] = (".csv", ".mcap", LCM_LOG)) -> None:
@@ -76,7 +76,7 @@ def check_stream_output(path: str | Path, accepted: tuple[str, ...] = (".csv", "
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:
     """Creates the file at `path`.
 
-    A .csv and an .mcap bag contain the statuses that `stream` accepts. A .log contains all messages.
+    A CSV and a bag contain the statuses that `stream` accepts. An LCM log contains all messages.
 
     Raises:
         RecordingError: See `check_stream_output`; additionally if the file cannot be written.

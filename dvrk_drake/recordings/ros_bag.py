@@ -56,8 +56,8 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
     """Reads the measured joint states of an arm from a bag, in joint coordinates.
 
     Messages with a header stamp of 0, and messages that are not later than the previous one, are omitted and noted.
-    The joints may be in any order. If the messages lack the last joint, the jaw, it is read from the topic of the jaw
-    and interpolated linearly at the times of the arm.
+    The joints may be in any order. If the messages do not contain the last joint, the jaw, it is read from the topic
+    of the jaw and interpolated linearly at the times of the arm.
 
     Args:
         path: Path of a `.bag`, `.db3` or `.mcap` file, or of the folder of a ROS 2 bag.
@@ -78,14 +78,14 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
         name = choose_topic(path, arm, options.topic, listed)
         jaw = name.rpartition("/")[0] + "/jaw/measured_js"
         has_jaw = jaw in connections
-        share = connections[name].msgcount + (connections[jaw].msgcount if has_jaw else 0)
-        parts = [_read_topic(reader, connections[name], skip_invalid, lambda done: progress(done / max(share, 1)))]
+        total = connections[name].msgcount + (connections[jaw].msgcount if has_jaw else 0)
+        parts = [_read_topic(reader, connections[name], skip_invalid, lambda done: progress(done / max(total, 1)))]
         first = parts[0]
         missing = [joint for joint in arm.joint_names if joint not in first.names]
         if missing == list(arm.joint_names[-1:]) and has_jaw:
             before = connections[name].msgcount
             parts.append(
-                _read_topic(reader, connections[jaw], skip_invalid, lambda done: progress((before + done) / share))
+                _read_topic(reader, connections[jaw], skip_invalid, lambda done: progress((before + done) / total))
             )
     progress(1.0)
     notes = [note for part in parts for note in part.notes]
@@ -113,7 +113,7 @@ class _Topic(NamedTuple):
 
 
 class _Bag:
-    """Bag that is open for reading. Errors of the rosbags library become one line."""
+    """Bag that is open for reading. Raises the errors of the rosbags library as RecordingError."""
 
     def __init__(self, path: Path) -> None:
         # The import takes 0.2 s, and most commands read no bag.
@@ -173,7 +173,7 @@ class _Bag:
 
 
 class _Connections(NamedTuple):
-    """Connections of one topic; several publishers, or several runs of one, make several connections."""
+    """Connections of one topic. Each publisher, and each run of a publisher, has its own connection."""
 
     topic: str
     connections: tuple[Connection, ...]
@@ -184,7 +184,13 @@ class _Connections(NamedTuple):
 
 
 def fitting_topics(arm: Arm, topic: str | None, names: Iterable[str]) -> list[str]:
-    """Returns the JointState topics that fit an arm or the topic or namespace `topic`, see `read_ros_bag`."""
+    """Returns the JointState topics that fit, see `read_ros_bag`.
+
+    Args:
+        arm: Arm whose joints are read. Used only if `topic` is None.
+        topic: Topic or its namespace, or None.
+        names: Names of the available topics.
+    """
     if topic is not None:
         topic = f"/{topic.strip('/')}"
         return [name for name in (topic, f"{topic}/measured_js") if name in names][:1]
@@ -200,7 +206,7 @@ def choose_topic(source: str | Path, arm: Arm, topic: str | None, topics: Mappin
         source: Bag or network with the topics, for messages.
         arm: Arm whose joints are read.
         topic: Topic or its namespace. None: the topic of the arm.
-        topics: Text for messages for each topic.
+        topics: Mapping from the name of each topic to its description, for messages.
 
     Raises:
         RecordingError: No topic fits, or several topics.
@@ -261,8 +267,8 @@ def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progre
         if stamp <= last:
             if last - stamp > MAX_LATE * 1e9:
                 raise RecordingError(
-                    f"{bag.path}: the header stamp of message {number} of {topic} is {1e-9 * (last - stamp):g} s before "
-                    f"that of message {messages[-1]}. Cut the bag where the clock was set, or record again."
+                    f"{bag.path}: the header stamp of message {number} of {topic} is {1e-9 * (last - stamp):g} s "
+                    f"before that of message {messages[-1]}. Cut the bag where the clock was set, or record again."
                 )
             late += 1
             continue

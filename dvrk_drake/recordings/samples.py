@@ -1,4 +1,4 @@
-"""Sample recordings of simulated arms, which are part of the package. `tools/make_samples.py` makes them."""
+"""Writes the sample recordings of the package. `tools/make_samples.py` makes them with simulated arms."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def write_samples(folder: str | Path, *, overwrite: bool = False, progress: Prog
     Args:
         folder: Folder to write to. It is created if it does not exist.
         overwrite: Whether to write to a folder that is not empty, and replace files in it.
-        progress: Function called with the name of the step ("writing") and its finished share, 0..1.
+        progress: Callback that receives the name of the step ("writing") and the completed fraction (0 to 1).
 
     Returns:
         Paths of the files.
 
     Raises:
-        DvrkDrakeError: The folder is not empty and `overwrite` is False, or it cannot be written. No file is written.
+        DvrkDrakeError: The folder is not empty and `overwrite` is False, or a file cannot be written.
 
     Example:
         >>> import dvrk_drake as dvrk

@@ -82,7 +82,7 @@ def print_identification(
 
 
 def _print_locked_joints(console: Console, arm: Arm) -> None:
-    """Prints which joints are not in the recording, and for which of their positions the model is valid."""
+    """Prints the locked joints, and the positions for which the model is valid."""
     if arm.locked_joints:
         console.print(
             f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {locked_text(arm)} "

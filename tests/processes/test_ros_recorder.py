@@ -16,7 +16,7 @@ from dvrk_drake.processes import ros_recorder as module
 from dvrk_drake.processes.ros_recorder import RosRecorder
 from dvrk_drake.recordings.reading import read_recording
 
-ros = pytest.importorskip("dvrk_drake.processes.ros_topics", reason="needs cyclonedds (pip install dvrk-drake[ros])")
+ros = pytest.importorskip("dvrk_drake.processes.ros_topics", reason="needs cyclonedds")
 
 PSM = load_arm("psm")
 JOINTS = list(PSM.joint_names)
@@ -160,5 +160,5 @@ def test_wrong_arguments_are_refused(tmp_path, monkeypatch):
         with pytest.raises(DvrkDrakeError, match=f"ROS domain {domain}: allowed: 0 to 232"):
             ros.RosDomain()
     monkeypatch.setitem(sys.modules, "dvrk_drake.processes.ros_topics", None)
-    with pytest.raises(DvrkDrakeError, match=r"needs cyclonedds: pip install dvrk-drake\[ros\]"):
+    with pytest.raises(DvrkDrakeError, match=r"needs the package cyclonedds: pip install cyclonedds"):
         RosRecorder(PSM, tmp_path / "a.mcap")

@@ -88,13 +88,17 @@ def test_a_folder_of_the_gravity_collection_is_one_recording(tmp_path):
         ({"q": np.zeros((9, 6))}, None, "no array of 7 joints"),
         ({"q": np.zeros((9, 7)), "position": np.zeros((9, 7))}, None, "several arrays may be q: q, position"),
         ({"q": np.zeros((9, 7)), "tau": np.zeros((8, 7))}, None, "tau has 8 rows, but q has 9"),
-        ({"A": np.zeros((9, 7))}, {"q": "C"}, r"has no array C for q\. Its arrays of real numbers: A \(9 x 7\)"),
+        ({"A": np.zeros((9, 7))}, {"q": "C"}, r"has no array C for q\. Arrays of real numbers: A \(9 x 7\)"),
         ({"A": np.zeros((9, 5))}, {"q": "A"}, "A is 9 x 5; allowed for 7 joints: m x 7"),
         ({"A": np.zeros((9, 7))}, {"tau": "A"}, "no array for q"),
         ({"A": np.zeros((9, 7)), "B": np.eye(9)}, {"q": "A", "t": "B"}, "B is 9 x 9; allowed for t: a vector"),
-        ({"A": np.zeros((9, 7))}, {"position": "A"}, "unknown array position; allowed: q, qd, tau, t, poses"),
+        (
+            {"A": np.zeros((9, 7))},
+            {"position": "A"},
+            "unknown quantity position; allowed: q, qd, tau, t, poses",
+        ),
         ({"A": team_array(), "q": np.zeros((5, 7))}, {"poses": "A", "q": "q"}, "poses contains positions and efforts"),
-        ({"name": "text"}, None, "Its arrays of real numbers: none"),
+        ({"name": "text"}, None, "Arrays of real numbers: none"),
         ({"q": np.zeros((0, 7))}, None, "the arrays have no rows"),
     ],
 )
@@ -166,7 +170,7 @@ def test_other_shapes_are_no_poses(tmp_path, wrong):
 
 @pytest.mark.parametrize("wrong", ["text", 1j * team_array()])
 def test_other_types_are_no_arrays(tmp_path, wrong):
-    assert_refused("Its arrays of real numbers: none", read_recording, write_mat(tmp_path, a=wrong))
+    assert_refused("Arrays of real numbers: none", read_recording, write_mat(tmp_path, a=wrong))
 
 
 def test_empty_poses_are_refused(tmp_path):

@@ -27,7 +27,7 @@ def test_converted_poses_are_exact(tmp_path):
     assert (again.t, again.qd) == (None, None)
     assert list(recording.notes) == [
         "static poses from array saved; its eighth row (gripper) is ignored",
-        "without times, read as static poses; --rate HZ adds times to a motion",
+        "without times, read as static poses; for a motion, give its sampling rate with --rate HZ",
     ]
 
 

@@ -140,7 +140,7 @@ def test_what_a_bag_cannot_hold_is_refused(tmp_path, change, message):
 
 
 def test_bag_needs_an_arm(tmp_path):
-    with pytest.raises(RecordingError, match=r"x\.mcap: an MCAP bag needs the arm .*: --arm"):
+    with pytest.raises(RecordingError, match=r"x\.mcap: an MCAP bag contains joint names, .*: --arm"):
         write_recording(Recording(q=np.zeros((3, 7))), tmp_path / "x.mcap")
     assert list(tmp_path.iterdir()) == []
 

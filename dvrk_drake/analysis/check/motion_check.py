@@ -25,7 +25,7 @@ from dvrk_drake.analysis.signals.true_time import (
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
 
-#: Smallest share of repeated rows for a warning. A smaller share hardly changes a model and is a note.
+#: Largest share of repeated rows that is reported as a note, because it hardly changes a model. Above it: warning.
 MIN_REPEATED = 0.005
 #: Smallest difference of two shares of rows for a warning that a signal (q, qd or tau) comes from a slower topic: the
 #: share of rows that repeat this signal, and the share of rows that repeat all signals.
@@ -125,7 +125,7 @@ def repeated_row_findings(actuators: Recording) -> list[Finding]:
         )
         advice = "Usual causes: the recorder read faster than the arm published, or messages were lost."
         if actuators.has_increasing_times and distinct_rows(actuators).stalled:
-            advice = "The time stalled: positions and velocities agree only without the intervals of these rows."
+            advice = "Positions and velocities agree only if the intervals of these rows are removed from the times."
         advice += " Repeated rows are not used. Record each message once, with its time stamp."
         severity: Severity = "warning" if all_signals > MIN_REPEATED else "note"
         findings.append(Finding(severity, "repeated rows", "rows", what, advice, size=all_signals))

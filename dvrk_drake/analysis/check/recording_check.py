@@ -204,7 +204,7 @@ def _time(recording: Recording, kind: str) -> list[Finding]:
         severity: Severity = "refusal" if kind == "motion" else "warning"
         advice = "Sort the rows by time, and use the times of one clock [s]."
         if np.all(repeated_rows(recording)[decreasing + 1]):
-            advice = "These rows repeat the previous row and its time. Remove them."
+            advice = "These rows repeat the previous row and its time. Remove these rows."
         return [Finding(severity, "time goes back", "t", what, advice, size=float(count))]
     if recording.qd is None or len(t) < MIN_ROWS:
         return []

@@ -95,15 +95,15 @@ MIN_INTERVAL = 0.02
 _ITERATIONS = 8
 
 
-#: A row repeats the previous row only while the arm moves: while the speed of a joint exceeds this share of its RMS
-#: speed. Without qd, the speed is the displacement over this number of rows, before or after the row.
+#: The arm moves while the speed of at least one joint exceeds MOVING_SHARE of its RMS speed. Without qd, the speed is
+#: the displacement over SPEED_ROWS rows: the smaller one of those before and after the row.
 MOVING_SHARE, SPEED_ROWS = 0.05, 10
-#: Smallest displacement over these rows, as a multiple of the smallest step of the position (encoder count).
+#: Smallest displacement of a moving joint over SPEED_ROWS rows, in steps of the position (encoder counts).
 MIN_STEPS = 3.0
 #: Number of rows between two positions whose difference is compared with the integral of qd.
 BLOCK = 20
-#: Time stalls if it increases too fast by at least the first number with the intervals of repeated rows, and if the
-#: error without these intervals is at most the second number times as large.
+#: The motion stalls at repeated rows (`DistinctRows.stalled`) if `time_factor` exceeds 1 by more than MIN_STALL with
+#: the intervals of these rows, and if its error without these intervals is less than STALL_RATIO times as large.
 MIN_STALL, STALL_RATIO = 0.02, 0.5
 
 
@@ -112,8 +112,8 @@ class DistinctRows(NamedTuple):
 
     Attributes:
         rows: Indices (k,) of the rows.
-        t: Recorded times (k,) of the rows, without the intervals of repeated rows if `stalled` [s].
-        stalled: True if the recorded times continue at repeated rows although the motion does not.
+        t: Recorded times (k,) of the rows [s]. If `stalled`, the intervals of repeated rows are removed.
+        stalled: True if the motion stalls at repeated rows while the recorded times continue.
     """
 
     rows: NDArray[np.int_]
@@ -212,8 +212,8 @@ def distinct_rows(recording: Recording) -> DistinctRows:
     """Returns the rows that do not repeat the previous row, with their recorded times.
 
     Rows are repeated if the recorder reads faster than the arm publishes. The times of the other rows are then correct.
-    In other recordings, rows are repeated while the time of the arm stalls, but the recorded times continue. The motion
-    then has jumps of the time. Both cases are distinguished by the integral of qd (`time_factor`).
+    In some recordings, however, the motion stalls at repeated rows while the recorded times continue. The intervals of
+    these rows are then removed from the times. The integral of qd distinguishes the two cases (`time_factor`).
 
     Raises:
         RecordingError: The recording has no times, or they do not increase.
@@ -233,13 +233,13 @@ def distinct_rows(recording: Recording) -> DistinctRows:
 
 
 def time_factor(t: NDArray[np.float64], q: NDArray[np.float64], qd: NDArray[np.float64]) -> float | None:
-    """Returns the ratio of recorded to true time, or None if the ratio is not identifiable.
+    """Returns the ratio of recorded to true time from the integral of qd, or None if it is not identifiable.
 
     At least two joints must move, and the ratios of most of these joints must agree within 10 %.
 
     Args:
         t: Recorded times (m,) [s].
-        q, qd: Positions [rad, m] and velocities (m, n).
+        q, qd: Positions (m, n) [rad, m] and velocities (m, n) [rad/s, m/s].
     """
     # Differences over several rows reduce the effects of jitter and repeated rows.
     integrals = np.diff(
