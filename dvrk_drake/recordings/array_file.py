@@ -90,8 +90,7 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     for file, part in zip(files, parts, strict=True):
         if (part.blocks.keys(), part.label) != (parts[0].blocks.keys(), parts[0].label):
             raise RecordingError(
-                f"{file}: has {', '.join(part.blocks)}, but {files[0]} has {', '.join(parts[0].blocks)}; all files of "
-                "a folder must have the same arrays"
+                f"{file}: {part.note}; {files[0]}: {parts[0].note}. All files of a folder must have the same arrays."
             )
     blocks = {quantity: np.concatenate([part.blocks[quantity] for part in parts]) for quantity in parts[0].blocks}
     label, preallocated = parts[0].label, parts[0].preallocated

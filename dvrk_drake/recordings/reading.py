@@ -141,13 +141,13 @@ def detect_format(path: Path) -> Format:
                 head = file.read(_HEAD)
             except OSError as error:
                 raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-        if not head.strip():
+        if not head.strip() and path.suffix != ".csv":
             raise RecordingError(f"{path} is empty")
     found = next((known for known in FORMATS if known.matches(path)), None)
     if found is None:
         raise RecordingError(
-            f"{path} is a folder without a recording; allowed: ROS 2 bag (with metadata.yaml), MATLAB files (.mat), NumPy "
-            "archives (.npz). To read a bag without metadata.yaml, give the path of its .mcap or .db3 file."
+            f"{path} is a folder without a recording; allowed: ROS 2 bag (with metadata.yaml), MATLAB files (.mat), "
+            "NumPy archives (.npz). To read a bag without metadata.yaml, give the path of its .mcap or .db3 file."
         )
     if found is FORMATS[-1] and b"\0" in head:
         raise RecordingError(

@@ -119,6 +119,8 @@ class Recording:
         The text is empty if all joints are at rest, or if the speed is unknown. The speed is computed from qd, or from
         q and t if samples are less than 0.1 s apart. At longer intervals the speed between poses is unknown.
         """
+        if not len(self):
+            return ""
         if self.qd is not None:
             qd = self.qd
         elif self.t is not None and len(self) > 1 and self.has_increasing_times and np.median(np.diff(self.t)) < 0.1:

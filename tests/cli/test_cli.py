@@ -409,7 +409,7 @@ def test_convert(tmp_path, capsys):
     values = generator.uniform(-0.2, 0.2, (30, 21))
     np.savetxt(tmp_path / "wpi.csv", values, delimiter=",", fmt="%.17g")
     assert main(["convert", str(tmp_path / "wpi.csv"), "--output", str(tmp_path / "ours.csv")]) == 0
-    assert "--coordinates actuator" in capsys.readouterr().out
+    assert "--coordinates wpi" in capsys.readouterr().out
     ours = read_recording(tmp_path / "ours.csv", coordinates="actuator")
     np.testing.assert_array_equal(ours.q, values[:, :7])
     np.testing.assert_array_equal(ours.tau, values[:, 14:])

@@ -115,8 +115,12 @@ def test_bounds_of_coupled_limits_include_locked_joints():
         ("psm", {"rol": 0}, 'PSM has no joint "rol" to lock; did you mean "roll"\\? allowed: yaw, pitch'),
         ("psm", {"roll": 9}, "locked joint roll = 9 is outside its limits; allowed: -4.538..4.538 rad"),
         ("psm", {"insertion": float("nan")}, "insertion = nan is outside its limits; allowed: 0..0.24 m"),
-        ("psm", {"jaw": 0}, "wrist_yaw and jaw are coupled by the transmission; lock both of them or neither"),
-        ("mtml", {"wrist_platform": 0}, "elbow_pitch and wrist_platform are coupled by the transmission"),
+        (
+            "psm",
+            {"jaw": 0},
+            "wrist_pitch, wrist_yaw, jaw are coupled by the transmission; lock all of these joints or none",
+        ),
+        ("mtml", {"wrist_platform": 0}, "shoulder_pitch, elbow_pitch, wrist_platform are coupled by the transmission"),
         ("psm", {**WRIST, "yaw": 0, "pitch": 0, "insertion": 0.1}, "all joints are locked; allowed: at least one"),
         (
             "mtml",

@@ -90,7 +90,7 @@ def test_a_folder_of_the_gravity_collection_is_one_recording(tmp_path):
         ({"q": np.zeros((9, 7)), "tau": np.zeros((8, 7))}, None, "tau has 8 rows, but q has 9"),
         ({"A": np.zeros((9, 7))}, {"q": "C"}, r"has no array C for q\. Arrays of real numbers: A \(9 x 7\)"),
         ({"A": np.zeros((9, 5))}, {"q": "A"}, "A is 9 x 5; allowed for 7 joints: m x 7"),
-        ({"A": np.zeros((9, 7))}, {"tau": "A"}, "no array for q"),
+        ({"A": np.zeros((9, 7))}, {"tau": "A"}, "no array of 7 joints has a recognised name"),
         ({"A": np.zeros((9, 7)), "B": np.eye(9)}, {"q": "A", "t": "B"}, "B is 9 x 9; allowed for t: a vector"),
         (
             {"A": np.zeros((9, 7))},
@@ -104,6 +104,35 @@ def test_a_folder_of_the_gravity_collection_is_one_recording(tmp_path):
 )
 def test_ambiguous_and_unsuitable_arrays_are_refused(tmp_path, arrays, names, text):
     assert_refused(text, read_recording, write_arrays(tmp_path, "v5", arrays), arrays=names)
+
+
+def test_named_arrays_and_recognised_arrays_are_combined(tmp_path):
+    q, qd, tau = blocks()
+    t = 0.01 * np.arange(20.0)
+    path = write_arrays(tmp_path, "npz", {"q": q, "position": 2 * q, "qd": qd, "tau": tau, "t": t})
+    assert_refused("several arrays may be q: q, position. Choose one with --arrays q=NAME", read_recording, path)
+    read = read_recording(path, arrays={"q": "position"})
+    np.testing.assert_array_equal(read.q, 2 * q)
+    np.testing.assert_array_equal(read.tau, tau)
+    np.testing.assert_array_equal(read.t, t)
+    path = write_arrays(tmp_path, "npz", {"q": q, "tau": tau, "t": np.column_stack([t, t])})
+    assert_refused("t is 20 x 2; allowed for t: a vector", read_recording, path)
+
+
+def test_files_of_a_folder_have_the_same_arrays(tmp_path):
+    q, _, tau = blocks()
+    for name, arrays in (("a", {"q": q, "tau": tau}), ("b", {"q": q})):
+        (tmp_path / name).mkdir()
+        write_arrays(tmp_path / name, "v5", arrays)
+    (tmp_path / "b" / "._arrays.mat").write_bytes(b"of macOS")
+    assert_refused(
+        r"b/arrays\.mat: q from array q; .*a/arrays\.mat: q from array q, tau from array tau. All files",
+        read_recording,
+        tmp_path,
+    )
+    write_arrays(tmp_path / "b", "v5", {"q": q, "tau": tau})
+    assert len(read_recording(tmp_path)) == 40
+    assert_refused("--rate does not apply to a folder", read_recording, tmp_path, rate=100.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -165,7 +194,7 @@ def test_several_arrays_of_poses_require_a_choice(tmp_path):
 def test_other_shapes_are_no_poses(tmp_path, wrong):
     path = write_mat(tmp_path, a=wrong)
     assert_refused("no array of 7 joints has a recognised name", read_recording, path)
-    assert_refused("a is .*; allowed for poses of 7 joints: 8 x 2 x N", read_recording, path, arrays={"poses": "a"})
+    assert_refused("a is .*; allowed: 8 x 2 x N", read_recording, path, arrays={"poses": "a"})
 
 
 @pytest.mark.parametrize("wrong", ["text", 1j * team_array()])

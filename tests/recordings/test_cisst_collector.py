@@ -111,3 +111,15 @@ def test_faults_are_refused(mtm, psm, tmp_path):
     assert_refused("not a complete description", read_recording, path, mtm)
     path.with_suffix(".desc").unlink()
     assert_refused(r"need their description StateDataCollection.*\.desc", read_recording, path, mtm)
+
+
+def test_a_clock_that_was_set_and_missing_columns_are_refused(mtm, tmp_path):
+    q, qd, tau = blocks(6, 7)
+    t = times(6)
+    t[4:] -= 2.0
+    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, t, q, qd, tau))
+    assert_refused(r", line 5: the time of measured_js is 1\.99\d* s before", read_recording, path, mtm)
+    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, times(6), q, qd, tau))
+    description = path.with_suffix(".desc")
+    description.write_text(description.read_text().replace("measured_js.Valid:", "measured_js.Other:"))
+    assert_refused(r"has no column measured_js\.Valid", read_recording, path, mtm)

@@ -39,7 +39,7 @@ def test_converted_motion_is_exact_and_its_properties_are_noted(tmp_path):
     assert_equal(again, recording)
     np.testing.assert_array_equal(np.hstack([again.q, again.qd, again.tau]), rows)
     assert recording.notes[1] == "50 samples; the file has no times, so t = row / 100 Hz"
-    assert "pass --coordinates actuator" in recording.notes[2]
+    assert "pass --coordinates wpi" in recording.notes[2]
     assert recording.notes[3] == "t from 0 to 0.49 s, median interval 10 ms"
     assert recording.notes[4].startswith("2 of 50 rows repeat the previous row")
 
@@ -87,3 +87,10 @@ def test_poses_that_the_arm_cannot_reach_are_refused(tmp_path):
         arm=load_arm("mtml"),
     )
     assert not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.parametrize("name", ["out.bag", "out.mat", "out", "out.MCAP"])
+def test_other_outputs_are_refused(tmp_path, name):
+    path = write_wpi(tmp_path, wpi_rows())
+    assert_refused(r"must end in \.csv or \.mcap", convert, path, tmp_path / name)
+    assert not (tmp_path / name).exists()

@@ -23,6 +23,7 @@ def test_21_columns_are_motions_of_wpi_at_200_hz(tmp_path):
     assert recording.notes == (
         "no header: columns read as q1..q7, qd1..qd7, tau1..tau7",
         "4 samples; the file has no times, so t = row / 200 Hz",
+        "in the coordinates wpi; pass --coordinates wpi to every command that reads the converted file",
     )
     np.testing.assert_array_equal(read_recording(path, rate=10).t, [0, 0.1, 0.2, 0.3])
 

@@ -6,6 +6,7 @@ from bags import KINDS, joint_states, write_bag
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
+from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import detect_format, read_recording
@@ -90,19 +91,26 @@ def test_names_the_missing_topic_of_the_jaw(psm, tmp_path):
         read_recording(path, psm)
 
 
-def test_locked_joints_are_not_in_the_bag(psm, tmp_path):
-    locked = psm.with_locked_joints(dict.fromkeys(psm.joint_names[3:], 0.0))
+def test_locked_joints_are_absent_or_held(psm, tmp_path):
+    locked = psm.with_locked_joints({"roll": 0, "wrist_pitch": 0, "wrist_yaw": 0, "jaw": 0})
     q, qd, tau = blocks(5, 3)
     path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": joint_states(stamps(5), psm.joint_names[:3], q, qd, tau)})
     np.testing.assert_array_equal(read_recording(path, locked).q, q)
     with pytest.raises(RecordingError, match="--locked roll=0 wrist_pitch=0 wrist_yaw=0 jaw=0"):
         read_recording(path, psm)
-    (tmp_path / "whole").mkdir()
-    q, qd, tau = blocks(5, 7)
-    rows = joint_states(stamps(5), psm.joint_names, q, qd, tau)
-    path = write_bag(tmp_path / "whole", "mcap", {"/PSM1/measured_js": rows})
-    with pytest.raises(RecordingError, match="contains roll, wrist_pitch, wrist_yaw, jaw, but --locked states"):
-        read_recording(path, locked)
+    q, qd, tau = blocks(5, 6)
+    for name, wrist in (("held", 0.01), ("moved", 0.1)):
+        q[:, 3:] = wrist * np.sin(np.arange(15).reshape(5, 3))
+        (tmp_path / name).mkdir()
+        rows = joint_states(stamps(5), psm.joint_names[:6], q, qd, tau)
+        path = write_bag(tmp_path / name, "mcap", {"/PSM1/measured_js": rows})
+        if name == "held":
+            np.testing.assert_array_equal(read_recording(path, locked).tau, tau[:, :3])
+            with pytest.raises(RecordingError, match="--locked wrist_pitch=0 wrist_yaw=0 jaw=0"):
+                read_recording(path, psm)
+        else:
+            with pytest.raises(RecordingError, match=r"--locked states .*=0, but the recorded positions are"):
+                read_recording(path, locked)
 
 
 def test_reads_the_named_arm_of_several(psm, tmp_path):
@@ -158,7 +166,7 @@ def damaged(mtm):
     yield {topic: joint_states(stamps(10), [names[0]] * 7, q)}, "names a joint twice"
     yield (
         {topic: joint_states(still, names, q, qd, tau)},
-        "do not increase in 9 of 10 messages: message 2 is 0 s before",
+        "do not increase in 9 of 10 messages",
     )
     yield {topic: joint_states(np.zeros(10), names, q, qd, tau)}, "no usable message.*header stamp 0"
     yield {topic: []}, "no messages"
@@ -210,3 +218,57 @@ def test_refuses_truncated_and_damaged_bags_with_one_line(mtm, tmp_path, kind):
             assert "\n" not in str(error)
         else:
             assert states.q.shape[1] == 7
+
+
+@pytest.mark.parametrize("jump", [-5.0, -100.0, 3600.0])
+def test_refuses_a_clock_that_was_set(mtm, tmp_path, jump):
+    """A jump forward in one message makes the next message earlier."""
+    q, qd, tau = blocks(10, 7)
+    times = stamps(10)
+    times[6 : 7 if jump > 0 else 10] += round(1e9 * jump)
+    path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(times, mtm.joint_names, q, qd, tau)})
+    late = 8 if jump > 0 else 7
+    with pytest.raises(
+        RecordingError, match=f"message {late} of /MTML/measured_js is .* s before that of message {late - 1}"
+    ):
+        read_recording(path, mtm)
+
+
+def test_ignores_setup_joints_and_missing_slashes(psm, tmp_path):
+    q, qd, tau = blocks(5, 7)
+    rows = joint_states(stamps(5), psm.joint_names, q, qd, tau)
+    setup = joint_states(stamps(5), [f"setup_{i}" for i in range(4)], q[:, :4])
+    path = write_bag(tmp_path, "mcap", {"/SUJ/PSM1/measured_js": setup, "/PSM1/measured_js": rows})
+    for topic in (None, "PSM1", "PSM1/measured_js", "/PSM1/"):
+        np.testing.assert_array_equal(read_recording(path, psm, topic=topic).q, q)
+
+
+def test_refuses_efforts_of_some_messages_or_joints(psm, mtm, tmp_path):
+    q, qd, tau = blocks(5, 7)
+    rows = joint_states(stamps(5), mtm.joint_names, q, qd, tau)
+    rows[0] = (*rows[0][:4], np.empty(0))
+    path = write_bag(tmp_path, "ros1", {"/MTML/measured_js": rows})
+    with pytest.raises(RecordingError, match="message 1 of /MTML/measured_js has no effort, but message 5 has"):
+        read_recording(path, mtm)
+    arm = joint_states(stamps(5), psm.joint_names[:6], q[:, :6], qd[:, :6], tau[:, :6])
+    jaw = joint_states(stamps(5), ["jaw"], q[:, 6:], qd[:, 6:])
+    path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": arm, "/PSM1/jaw/measured_js": jaw})
+    with pytest.raises(RecordingError, match="topic of the jaw has no efforts, but the topic of the arm has"):
+        read_recording(path, psm)
+
+
+@pytest.mark.parametrize("kind, suffix", [("ros1", ".bag"), ("mcap", ".mcap")])
+def test_names_the_suffix_of_a_renamed_bag(mtm, tmp_path, kind, suffix):
+    q, qd, tau = blocks(5, 7)
+    rows = joint_states(stamps(5), mtm.joint_names, q, qd, tau)
+    path = write_bag(tmp_path, kind, {"/MTML/measured_js": rows}).rename(tmp_path / "motion.dat")
+    with pytest.raises(RecordingError, match=rf"whose name must end in \{suffix}; rename the file"):
+        read_recording(path, mtm)
+
+
+def test_a_bag_with_one_message_is_checked(mtm, tmp_path):
+    q, qd, tau = blocks(1, 7)
+    path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(stamps(1), mtm.joint_names, q, qd, tau)})
+    report = check_recording(read_recording(path, mtm), mtm)
+    assert (report.kind, report.rows) == ("poses", 1)
+    assert any(finding.kind == "few poses" or finding.severity == "refusal" for finding in report.findings)

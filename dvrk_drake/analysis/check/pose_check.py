@@ -33,7 +33,7 @@ def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
         what = f"the recording has {distinct} distinct pose{'s' * (distinct != 1)}, but identify requires {MIN_POSES}"
         advice = "Record 40 or more poses that cover the range of the arm."
         findings.append(Finding("warning", "few poses", "rows", what, advice, size=float(distinct)))
-    if recording.t is None and len(joints) >= MIN_ROWS:
+    if recording.t is None and recording.qd is None and len(joints) >= MIN_ROWS:
         steps, spans = np.abs(np.diff(joints.q, axis=0)), np.ptp(joints.q, axis=0)
         largest = float(np.max(steps / np.maximum(spans, 1e-9)))
         if largest < MAX_MOTION_STEP:

@@ -130,6 +130,14 @@ def test_warns_of_few_poses():
     assert found(replace(poses(load_arm("mtml"), 5)), "mtml")["few poses"][0].size == 5
 
 
+def test_warns_of_a_motion_without_times():
+    motion = clean_motion("psm")
+    rows = replace(motion, t=None, qd=None)
+    assert [finding.kind for finding in check_recording(rows, load_arm("psm")).warnings].count("no times") == 1
+    apart = replace(rows, q=rows.q[::30], tau=rows.measured_effort()[::30], lines=None)
+    assert all(finding.kind != "no times" for finding in check_recording(apart, load_arm("psm")).findings)
+
+
 def test_refuses_another_number_of_joints():
     assert found(Recording(np.zeros((5, 6)), np.zeros((5, 6))))["unusable"][0].severity == "refusal"
 
