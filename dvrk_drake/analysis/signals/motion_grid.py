@@ -174,8 +174,8 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
         row = int(clock.rows[int(np.argmax(intervals))]) if len(intervals) else 0
         longest = f", with {gap:.1f} s without rows after {recording.where(row)}" if gap > 0.5 * duration > 0 else ""
         raise RecordingError(
-            f"{recording.source or 'recording'}: the motion lasts {duration:.1f} s at {rate:.0f} Hz{longest}. A dynamic "
-            f"model requires at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
+            f"{recording.source or 'recording'}: the motion lasts {duration:.1f} s at {rate:.0f} Hz{longest}. A "
+            f"dynamic model requires at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         )
     t = _even_times(clock, GRID_RATE)
     raw = resample(clock.t, recording.q[clock.rows], t)
