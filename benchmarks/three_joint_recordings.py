@@ -2,8 +2,9 @@
 
     python benchmarks/three_joint_recordings.py FOLDER [--json FILE]
 
-FOLDER contains psm1_1.csv to psm1_3.csv and psm2_1.csv, psm2_2.csv with columns t, q1..q3, qd1..qd3 and tau1..tau3, at
-200 Hz. All other joints are locked at zero. Each model is evaluated on the other recordings of the same arm.
+FOLDER contains psm1_1.csv to psm1_3.csv and psm2_1.csv, psm2_2.csv, i.e. motions of two PSMs from
+https://github.com/radiang/dvrk_parameter_identification (2018) with columns t, q1..q3, qd1..qd3 and tau1..tau3, at 200
+Hz. All other joints are locked at zero. Each model is evaluated on the other recordings of the same arm.
 
 Errors are |tau - tau_hat| / |tau| of each actuator. Both efforts are low-pass filtered with a zero-phase Butterworth
 filter (17 Hz, order 6), and 100 rows at each end are omitted. Methods:

@@ -133,9 +133,9 @@ def _build_arm(
     facts = read_sdf_facts(compose_sdf(sdf, mirrored))
     position_limits = {**instrument.position_limits, **description.position_limits}
     if set(joints) != set(position_limits):
-        raise ArmError(f"{path}: position_limits must have one entry for each of {', '.join(mechanism.joints)}")
+        raise ArmError(f"{path}: position_limits must have one entry for each of {', '.join(joints)}")
     if (separate := instrument.separate_joint) and separate not in instrument.joints:
-        raise ArmError(f'{path}: separate_joint is "{separate}"; allowed: {", ".join(instrument.joints)}')
+        raise ArmError(f'{path}: separate_joint is "{separate}"; allowed: {", ".join(instrument.joints) or "none"}')
     if missing := set(joints) - set(facts.joint_names):
         raise ArmError(f"{path}: the SDF has no joint {', '.join(sorted(missing))}")
     limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
