@@ -213,7 +213,7 @@ def test_derivation_is_faster_than_a_reference_expansion():
     """Compares processor times in one new process, so that the ratio does not depend on the machine."""
     code = (
         "import time, sympy\n"
-        "from dvrk_drake.models.arm import load_arm\n"
+        "from dvrk_drake.models.arm_files import load_arm\n"
         "from dvrk_drake.dynamics.gravity_regressor import derive_gravity\n"
         "arm = load_arm('mtml')\n"
         "t = time.process_time(); derive_gravity(arm); print(time.process_time() - t)\n"
