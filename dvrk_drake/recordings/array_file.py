@@ -146,7 +146,7 @@ def _collection(folder: Path) -> list[Path]:
 
 
 def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str]) -> _Rows:
-    """Returns the rows of the named arrays, or of the recognised arrays if none is named."""
+    """Returns the rows of the named and the recognised arrays."""
     shapes = [f"{name} ({_shape(array)})" for name, array in arrays.items()]
     found = ", ".join(shapes[:_LISTED]) + (", ..." if len(shapes) > _LISTED else "") or "none"
     for quantity, name in names.items():
@@ -157,11 +157,6 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
         if len(chosen) > 1:
             raise RecordingError(f"{path}: poses contains positions and efforts; do not name other arrays")
         return _poses(path, chosen["poses"], arrays[chosen["poses"]], n)
-    if "q" not in chosen:
-        raise RecordingError(
-            f"{path}: no array for q. Name the arrays with --arrays q=NAME tau=NAME (arrays= in Python). "
-            f"Arrays of real numbers: {found}."
-        )
     blocks = {
         quantity: _joint_rows(path, name, arrays[name], n) for quantity, name in chosen.items() if quantity != "t"
     }
@@ -180,8 +175,7 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
 
 
 def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str], found: str) -> dict[str, str]:
-    """Returns a mapping from a quantity to its array: the named array, or the only one with a
-    recognised name and a fitting shape."""
+    """Returns the name of the array of each quantity: the named one, or the only one with a recognised name."""
     chosen = dict(names)
     if "poses" in names:
         return chosen
@@ -203,7 +197,7 @@ def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[st
             chosen[quantity] = fitting[0]
     if "q" in chosen:
         return chosen
-    poses = [name for name, array in arrays.items() if _is_pose_array(array)] if n == _POSE_JOINTS else []
+    poses = [] if names or n != _POSE_JOINTS else [name for name, array in arrays.items() if _is_pose_array(array)]
     if len(poses) > 1:
         raise RecordingError(
             f"{path}: several arrays have the shape 8 x 2 x N of static poses: {', '.join(poses)}. Choose one with "

@@ -30,8 +30,8 @@ _FIELD = re.compile(r"(?:Data|Time): (.*)")
 _SIGNAL = re.compile(r"(?P<signal>.*measured_js)\.Position\[0\](:\{.*\})?")
 #: Members of prmStateJoint, and the corresponding blocks of a recording.
 _MEMBERS = {"q": "Position", "qd": "Velocity", "tau": "Effort"}
-#: Signals with the state of one additional joint.
-_JAW, _GRIPPER = "jaw/measured_js", "gripper/measured_js"
+#: Signals of a jaw or a gripper. They do not contain the other joints of the arm.
+_PARTS = ("jaw/measured_js", "gripper/measured_js")
 _ORIGIN = re.compile(r"StateDataCollection-(?P<component>.+)-(?P<table>[^-]+)-\d{4}-")
 
 
@@ -62,10 +62,11 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
     description, data = path.with_suffix(".desc"), path.with_suffix(".csv")
     origin, fields = _read_description(description)
     names = [re.sub(r":\{.*\}$", "", field) for field in fields]
+    separate = f"{arm.separate_joint}/measured_js"
     signal = _choose_signal(description, fields, options.topic)
     joints = _member_columns(names, signal, "Position")
     labels = _joint_labels(data, _member_columns(names, signal, "Name"))
-    jaw = _JAW if signal != _JAW and len(joints) == arm.num_joints - 1 and f"{_JAW}.Position[0]" in names else ""
+    jaw = separate if len(joints) == arm.num_joints - 1 and f"{separate}.Position[0]" in names else ""
     stated = _stated_coordinates(origin, signal)
     order = _order(
         *(description, signal, labels, len(joints), arm), has_jaw=bool(jaw), is_actuator=stated == "actuator"
@@ -143,7 +144,7 @@ def _choose_signal(path: Path, fields: list[str], topic: str | None) -> str:
         if topic in signals:
             return topic
         raise RecordingError(f"{path}: has no signal {topic}. {has}")
-    fitting = [signal for signal in signals if not signal.endswith((_JAW, _GRIPPER))]
+    fitting = [signal for signal in signals if not signal.endswith(_PARTS)]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
@@ -176,19 +177,21 @@ def _order(
     The signal has `count` joints. If `has_jaw` is True, the next index is that of the jaw.
     """
     if has_jaw:
-        labels, count = [*labels, arm.joint_names[-1]], count + 1
+        labels, count = [*labels, arm.separate_joint], count + 1
     if set(arm.joint_names) <= set(labels):
         return [labels.index(name) for name in arm.joint_names]
+    if set(arm.joint_names) - set(labels) == {arm.separate_joint}:
+        raise RecordingError(
+            f"{path}: {signal} has no {arm.separate_joint}. Collect {arm.separate_joint}/measured_js as well."
+        )
     if labels and all(label.isidentifier() for label in labels) and not is_actuator:
         raise RecordingError(
             f"{path}: {signal} has the joints {', '.join(labels)}, but {arm.name} has {', '.join(arm.joint_names)}. "
             "Check --arm and --topic."
         )
     if count != arm.num_joints:
-        jaw = f" Collect {_JAW} as well." if count == arm.num_joints - 1 else ""
         raise RecordingError(
-            f"{path}: {signal} has {count} joints, but {arm.name} has {arm.num_joints}: "
-            f"{', '.join(arm.joint_names)}.{jaw}"
+            f"{path}: {signal} has {count} joints, but {arm.name} has {arm.num_joints}: {', '.join(arm.joint_names)}"
         )
     return list(range(count))
 

@@ -56,8 +56,8 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
     """Reads the measured joint states of an arm from a bag, in joint coordinates.
 
     Messages with a header stamp of 0, and messages that are not later than the previous one, are omitted and noted.
-    The joints may be in any order. If the messages do not contain the last joint, the jaw, it is read from the topic
-    of the jaw and interpolated linearly at the times of the arm.
+    The joints may be in any order. If the messages do not contain `Arm.separate_joint`, the jaw, it is read from the
+    topic of the jaw and interpolated linearly at the times of the arm.
 
     Args:
         path: Path of a `.bag`, `.db3` or `.mcap` file, or of the folder of a ROS 2 bag.
@@ -76,13 +76,13 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
         connections = reader.joint_state_topics()
         listed = {name: f"{name} ({connections[name].msgcount})" for name in connections}
         name = choose_topic(path, arm, options.topic, listed)
-        jaw = name.rpartition("/")[0] + "/jaw/measured_js"
+        jaw = f"{name.rpartition('/')[0]}/{arm.separate_joint}/measured_js"
         has_jaw = jaw in connections
         total = connections[name].msgcount + (connections[jaw].msgcount if has_jaw else 0)
         parts = [_read_topic(reader, connections[name], skip_invalid, lambda done: progress(done / max(total, 1)))]
         first = parts[0]
         missing = [joint for joint in arm.joint_names if joint not in first.names]
-        if missing == list(arm.joint_names[-1:]) and has_jaw:
+        if missing == [arm.separate_joint] and has_jaw:
             before = connections[name].msgcount
             parts.append(
                 _read_topic(reader, connections[jaw], skip_invalid, lambda done: progress((before + done) / total))
@@ -90,7 +90,7 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
     progress(1.0)
     notes = [note for part in parts for note in part.notes]
     if len(parts) == 2:
-        first, jaw_notes = _with_jaw(path, first, parts[1], arm.joint_names[-1])
+        first, jaw_notes = _with_jaw(path, first, parts[1], arm.separate_joint)
         notes += jaw_notes
     order = _joint_order(path, name, first.names, arm)
     check_held(f"{path}: {name}", first.names, first.q, arm)
@@ -367,8 +367,9 @@ def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> li
         count = arm.num_joints - len(missing)
         hint = lock_hint(arm, count) if missing == list(arm.joint_names[count:]) else ""
         advice = f"Check --arm and --topic.{hint and f' {hint}'}"
-        if missing == [arm.joint_names[-1]] == ["jaw"]:
-            advice = f"Record {topic.rpartition('/')[0]}/jaw/measured_js as well. {hint}".rstrip()
+        if missing == [arm.separate_joint]:
+            separate = f"{topic.rpartition('/')[0]}/{arm.separate_joint}/measured_js"
+            advice = f"Record {separate} as well. {hint}".rstrip()
         raise RecordingError(
             f"{path}: {topic} has the joints {', '.join(names)}; {arm.name} also needs {', '.join(missing)}. {advice}"
         )

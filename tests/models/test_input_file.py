@@ -24,7 +24,6 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.recordings import csv_rows
-from dvrk_drake.recordings.conversion import convert
 from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import write_recording
@@ -42,9 +41,10 @@ READERS = {
     "gc.json": GravityCompensationFile.load,
     "recording.csv": lambda path: read_recording(path, ARM),
     "collection.csv": lambda path: CollectionFile(path, ARM, both_sides=True),
-    "team.mat": lambda path: convert(path, f"{path}.out"),
-    "wpi.csv": lambda path: convert(path, f"{path}.out"),
-    "status.log": lambda path: convert(path, f"{path}.out"),
+    "team.mat": read_recording,
+    "wpi.csv": read_recording,
+    "status.log": read_recording,
+    "poses.mcap": lambda path: read_recording(path, ARM),
     "arm.sdf": lambda path: compose_sdf([path]),
 }
 #: Functions that create something other than a regular file at a path.

@@ -115,6 +115,8 @@ def test_named_arrays_and_recognised_arrays_are_combined(tmp_path):
     np.testing.assert_array_equal(read.q, 2 * q)
     np.testing.assert_array_equal(read.tau, tau)
     np.testing.assert_array_equal(read.t, t)
+    path = write_arrays(tmp_path, "npz", {"saved": team_array(), "current": tau})
+    assert_refused("no array of 7 joints has a recognised name", read_recording, path, arrays={"tau": "current"})
     path = write_arrays(tmp_path, "npz", {"q": q, "tau": tau, "t": np.column_stack([t, t])})
     assert_refused("t is 20 x 2; allowed for t: a vector", read_recording, path)
 
