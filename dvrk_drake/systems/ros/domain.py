@@ -102,6 +102,7 @@ class RosDomain:
     Attributes:
         name: Name of the domain, for messages, e.g. "ROS domain 0".
         participant: DDS participant.
+        num_changes: Number of times that publishers of the domain appeared or ended.
     """
 
     def __init__(self, domain: int | None = None) -> None:
@@ -116,10 +117,13 @@ class RosDomain:
         text = os.environ.get("ROS_DOMAIN_ID", "") or "0" if domain is None else str(domain)
         if not text.isdecimal() or int(text) > MAX_DOMAIN:
             raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
-        self.name = f"ROS domain {text}"
+        self.name, self.num_changes = f"ROS domain {text}", 0
+        self._listener = Listener(on_data_available=self._count_change)
         try:
             self.participant = _participant(int(text))
-            self._publications = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
+            self._publications = BuiltinDataReader(
+                self.participant, BuiltinTopicDcpsPublication, listener=self._listener
+            )
             self._subscriptions = BuiltinDataReader(self.participant, BuiltinTopicDcpsSubscription)
         except DDSException as error:
             raise DvrkDrakeError(f"{self.name} cannot be used: {error}. Check the network and {_CONFIG}") from error
@@ -221,6 +225,10 @@ class RosDomain:
         # Cyclone DDS calls this function in a thread of its own. A full pipe already wakes up the reader.
         with contextlib.suppress(BlockingIOError):
             os.write(self._wake, b"\0")
+
+    def _count_change(self, reader: DataReader) -> None:
+        # Cyclone DDS calls this function in a thread of its own.
+        self.num_changes += 1
 
     def _endpoints(self, reader: BuiltinDataReader) -> list[Endpoint]:
         found = []
