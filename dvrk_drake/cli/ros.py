@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, app
-from dvrk_drake.cli.support import interrupt_ends_process, mounted, quiet_drake
+from dvrk_drake.cli.support import interrupt_ends_process, mounted, print_warning, quiet_drake
 
 
 @app.command(group=HARDWARE)
@@ -44,7 +43,7 @@ def bridge(
     def ready() -> None:
         if realtime:
             for warning in make_realtime():
-                print(f"dvrk-drake: warning: {warning}", file=sys.stderr, flush=True)
+                print_warning(warning)
         settle_memory()
 
     quiet_drake()
@@ -77,8 +76,8 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     on another computer.
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.deadman import Deadman
     from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.systems.ros.deadman import Deadman
     from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
     ros = open_ros_domain(domain)

@@ -6,7 +6,7 @@ This file has no postponed annotations, because yaml_load_typed reads the types 
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import cast, get_args
+from typing import Optional, cast, get_args
 
 import yaml
 from pydrake.common.yaml import yaml_load_typed
@@ -27,6 +27,7 @@ from dvrk_drake.models.typed_yaml import load_yaml
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, plant_config_fault
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 
 
 @dataclass
@@ -100,12 +101,14 @@ class StationConfig(ArmConfig):
     Attributes:
         plant: Configuration of the simulated plant. The default is `arm_plant_config()`.
         simulator: Configuration of the simulator. The caller applies it with `ApplySimulatorConfig`.
-        driver: Configuration of the hardware driver. Its paths are relative to the station file.
+        driver: Configuration of the hardware driver over LCM. Its paths are relative to the station file.
+        ros_driver: Configuration of the hardware driver over ROS 2, which then replaces `driver`. None: LCM is used.
     """
 
     plant: MultibodyPlantConfig = field(default_factory=arm_plant_config)
     simulator: SimulatorConfig = field(default_factory=SimulatorConfig)
     driver: DvrkDriver = field(default_factory=DvrkDriver)
+    ros_driver: Optional[CrtkDriver] = None  # noqa: UP045, yaml_load_typed does not support "|"
 
     def check(self) -> None:
         """Checks the values.
@@ -119,6 +122,8 @@ class StationConfig(ArmConfig):
         if fault := plant_config_fault(self.plant):
             raise StationError(f"plant.{fault}")
         self.driver.check()
+        if self.ros_driver is not None:
+            self.ros_driver.check()
 
 
 def load_station_config(path: str | Path) -> StationConfig:
@@ -136,7 +141,9 @@ def load_station_config(path: str | Path) -> StationConfig:
         raise ArmError(f"{path}: {error}") from error
     except Exception as error:  # exceptions of Drake, YAML and the operating system
         raise StationError(f"{path}: {' '.join(str(error).split())}") from error
-    config.driver.relative_to(Path(path).parent)
+    for driver in (config.driver, config.ros_driver):
+        if driver is not None:
+            driver.relative_to(Path(path).parent)
     return config
 
 
@@ -160,7 +167,7 @@ def make_arm_station(
     """
     config.check()
     if hardware:
-        return HardwareArmStation(config.mounted_arm, driver=config.driver, lcm=lcm)
+        return HardwareArmStation(config.mounted_arm, driver=config.ros_driver or config.driver, lcm=lcm)
     return ArmStation(
         config.mounted_arm,
         plant_config=config.plant,

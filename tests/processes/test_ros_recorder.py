@@ -159,6 +159,6 @@ def test_wrong_arguments_are_refused(tmp_path, monkeypatch):
         monkeypatch.setenv("ROS_DOMAIN_ID", domain)
         with pytest.raises(DvrkDrakeError, match=f"ROS domain {domain}: allowed: 0 to 232"):
             ros.RosDomain()
-    monkeypatch.setitem(sys.modules, "dvrk_drake.systems.ros.domain", None)
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
     with pytest.raises(DvrkDrakeError, match=r"needs the package cyclonedds: pip install cyclonedds"):
         RosRecorder(PSM, tmp_path / "a.mcap")

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
-from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
@@ -18,12 +19,14 @@ from dvrk_drake.systems.lcm.dvrk_command import draw_id
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
-from dvrk_drake.systems.ros.crtk_client import CrtkClient
+from dvrk_drake.systems.ros.crtk_client import CrtkClient, find_arm
+from dvrk_drake.systems.ros.deadman import DeadmanProcess
+from dvrk_drake.systems.ros.domain import RosDomain
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0
-#: Number of measurements between two checks of their rate.
-_RATE_INTERVAL = 20
+#: Number of measurements between two checks of their rate. Number of successful checks after an insufficient rate.
+_RATE_INTERVAL, _GOOD_RATES = 20, 5
 #: Time without a measurement after which the guard is stepped nevertheless [us].
 _SILENCE = 5_000
 #: Largest effort of a gravity compensation that is switched off [N m, N].
@@ -31,6 +34,9 @@ _NO_EFFORT = 1e-9
 #: Change of a command to the separate joint that is sent, as a fraction of the effort limit or of the range of the
 #: joint. Each command to this joint can change the control mode of the arm for a moment.
 _JAW_CHANGE = 0.01
+#: Longest time until the arm has sent its state and a measurement, and until it has confirmed `hold` [s]. Longest time
+#: until DDS detects the end of a killed process [s].
+_FIRST, _ENDED = 5.0, 3.0
 #: Time after which a single `hold` is repeated while no joint has a valid measurement [us].
 _HOLD_PERIOD = 100_000
 
@@ -46,7 +52,7 @@ class CrtkBridge:
 
     - measured_js arrives at less than 500 Hz.
     - The dVRK's own gravity compensation is on, or it cannot be verified that it is off.
-    - `blocked` returns a reason, e.g. because the deadman process has ended.
+    - The deadman process has ended, or another process publishes `hold`.
 
     The guard changes to FAULT if the arm is not enabled and homed, or if another process could move the arm.
 
@@ -61,8 +67,7 @@ class CrtkBridge:
         send_status: Callable[[bytes], None],
         *,
         report: Callable[[str], None] = lambda line: None,
-        blocked: Callable[[], str] = lambda: "",
-        model: IdentifiedModel | None = None,
+        deadman: DeadmanProcess | None = None,
     ) -> None:
         """Creates a bridge. The arm holds its pose from the first call of `update` on.
 
@@ -71,18 +76,17 @@ class CrtkBridge:
             driver: Configuration with the settings and the model of the guard, the accepted modes and the key.
             send_status: Function that sends an encoded status (lcmt_dvrk_status).
             report: Function that is called with one line for each change of the state.
-            blocked: Function that returns a reason to refuse POSITION and EFFORT, or "". It is called once per step.
-            model: Model of the guard if the driver has none. None: the model of the arm's SDF.
+            deadman: Deadman process, which this bridge ends. None: there is none, e.g. in a test.
 
         Raises:
             ModelError: The driver's model cannot be read, or is not valid for this arm.
             KeyFileError: The driver's key cannot be used.
         """
         arm = client.arm
-        self._client, self._send, self._report, self._blocked = client, send_status, report, blocked
+        self._client, self._send, self._report, self._deadman = client, send_status, report, deadman
         self._key = driver.load_key()
         self._clock = ArrivalClock()
-        checked = driver.load_model(arm) or model or IdentifiedModel.from_arm(arm)
+        checked = driver.load_model(arm) or IdentifiedModel.from_arm(arm)
         self.guard = CommandGuard(
             arm, draw_id(), ControlModel(checked), driver.guard, driver.accepted_modes(), self._clock.now
         )
@@ -98,7 +102,7 @@ class CrtkBridge:
         self._jaw_tolerance = {"servo_jf": _JAW_CHANGE * arm.effort_limits, "servo_jp": _JAW_CHANGE * range_}
         self._jaw_sent: tuple[str, float] = ("", 0.0)
         self._was_ready = False
-        self._num_measured, self._rate_problem = 0, ""
+        self._num_measured, self._good_rates, self._rate_problem = 0, 0, ""
         self._num_changes, self._other_publishers = -1, ""
         self._problem = self._described = ""
         self._last_hold = 0
@@ -117,6 +121,7 @@ class CrtkBridge:
         Raises:
             DvrkDrakeError: DDS cannot send a command to the arm.
         """
+        self._client.domain.clear()
         is_new = self._client.receive()
         now = self._clock.now()
         is_answer = not is_new and self._has_commands and not self._answered
@@ -131,9 +136,15 @@ class CrtkBridge:
         self._step(now, with_status=not is_answer)
 
     def close(self) -> None:
-        """Commands the arm to hold its present pose."""
+        """Commands the arm to hold its present pose, and ends the deadman process."""
         self._client.hold()
-        self._client.wait_until_received(1.0)
+        self._client.wait_until_received(_FIRST)
+        if self._deadman is not None:
+            self._deadman.close()
+
+    def fileno(self) -> int:
+        """Returns a file descriptor that is readable after a message of the arm has arrived."""
+        return self._client.domain.fileno()
 
     def _measure(self, now: int) -> None:
         """Checks the time stamp of the last measurement and stores the measurement for the guard."""
@@ -222,8 +233,12 @@ class CrtkBridge:
     def _block_reason(self) -> str:
         """Returns the reason to refuse POSITION and EFFORT, or ""."""
         client = self._client
-        if reason := self._blocked() or self._rate_problem:
+        if self._deadman is not None and (reason := self._deadman.problem()):
             return reason
+        if client.take_other_hold():
+            return "another process published hold, e.g. the deadman process"
+        if self._rate_problem:
+            return self._rate_problem
         if not client.arm.console_gravity_compensation:
             return ""
         topic = f"{client.namespace}/gravity_compensation/setpoint_js"
@@ -237,22 +252,28 @@ class CrtkBridge:
         return ""
 
     def _check_rate(self) -> str:
-        """Returns the reason why the rate of the measurements is not sufficient, or ""."""
+        """Returns the reason why the rate of the measurements is not sufficient, or "".
+
+        After an insufficient rate, several checks must succeed, so that the state does not alternate.
+        """
         rate, topic = self._clock.rate, f"{self._client.namespace}/measured_js"
         if rate is None:
             return f"the rate of {topic} is not known yet"
         if rate >= MIN_RATE:
-            return ""
-        # The text must not change with every measurement.
-        return (self._rate_problem if "Hz" in self._rate_problem else "") or (
+            self._good_rates += 1
+            return "" if self._good_rates >= _GOOD_RATES or not self._rate_problem else self._rate_problem
+        self._good_rates = 0
+        if "arrives at" in self._rate_problem:
+            return self._rate_problem  # the text does not change with every measurement
+        return (
             f"{topic} arrives at {rate:.0f} Hz; commands need {MIN_RATE:.0f} Hz. Start the dVRK's console with a "
             "period of 1 ms: dvrk_system -j FILE.json -p 0.001"
         )
 
     def _others(self) -> str:
         """Returns a text about other processes that could move the arm, or ""."""
-        if self._client.num_changes != self._num_changes:
-            self._num_changes = self._client.num_changes
+        if self._client.domain.num_changes != self._num_changes:
+            self._num_changes = self._client.domain.num_changes
             self._other_publishers = ", ".join(self._client.other_publishers())
         return f"another process publishes {self._other_publishers}. End it" if self._other_publishers else ""
 
@@ -266,21 +287,74 @@ class CrtkBridge:
             self._described = text
 
 
-def refuse_other_publishers(client: CrtkClient, wait: Callable[[Callable[[], bool], float], bool]) -> None:
-    """Waits until no other process publishes commands to the arm.
-
-    A killed process is known to DDS for about a second.
+def connect_bridge(
+    arm: Arm,
+    driver: DvrkDriver,
+    send_status: Callable[[bytes], None],
+    *,
+    topic: str | None = None,
+    domain: int | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> CrtkBridge:
+    """Finds an arm on ROS 2 and connects a bridge with its deadman process.
 
     Args:
-        client: Client of the arm.
-        wait: `RosDomain.wait_until`.
+        arm: Arm to connect.
+        driver: Configuration, see `CrtkBridge`.
+        send_status: Function that sends an encoded status (lcmt_dvrk_status).
+        topic: Topic measured_js of the arm or its namespace; see `find_arm`.
+        domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+        report: Function that is called with one line for each change of the state.
+
+    Returns:
+        Bridge. Call `CrtkBridge.close` at the end.
 
     Raises:
-        DvrkDrakeError: Another process could move the arm.
+        DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
-    if not wait(lambda: not client.other_publishers(), 3.0):
-        topics = ", ".join(client.other_publishers())
-        raise DvrkDrakeError(
-            f"another process publishes {topics}. Only one process may command an arm: end the other one, e.g. "
-            "another bridge, teleoperation or a script"
+    _compile(arm, driver)
+    ros = RosDomain(domain)
+    client = CrtkClient(ros, arm, find_arm(ros, arm, topic))
+    _wait_for_arm(ros, client)
+    return CrtkBridge(client, driver, send_status, report=report, deadman=DeadmanProcess(client.namespace, domain))
+
+
+def _compile(arm: Arm, driver: DvrkDriver) -> None:
+    """Compiles the functions of the guard. During a compilation, no message can be received."""
+    model = ControlModel(driver.load_model(arm) or IdentifiedModel.from_arm(arm))
+    guard = CommandGuard(arm, draw_id(), model, driver.guard)
+    zero = np.zeros(arm.num_joints)
+    for utime in (1_000, 2_000, 3_000):
+        guard.step(utime, utime, np.clip(zero, arm.position_lower, arm.position_upper), zero, zero)
+
+
+def _wait_for_arm(ros: RosDomain, client: CrtkClient) -> None:
+    """Waits for the arm, and until no other process publishes commands to it.
+
+    Raises:
+        ControllerError: A message did not arrive, the joints do not fit, no process receives the commands, or another
+            process could move the arm.
+    """
+
+    def is_complete() -> bool:
+        client.receive()
+        return bool(client.operating_state and client.measurement and not client.unheard_commands())
+
+    if not ros.wait_until(is_complete, _FIRST):
+        missing = [
+            name
+            for name, message in (("measured_js", client.measurement), ("operating_state", client.operating_state))
+            if message is None
+        ]
+        if missing:
+            raise ControllerError(f"no message on {client.namespace}/{missing[0]} within {_FIRST:g} s")
+        raise ControllerError(f"no process subscribes to {', '.join(client.unheard_commands())}. Is it a dVRK?")
+    measurement = client.measurement
+    if measurement is not None and measurement.stamp and measurement.problem:
+        raise ControllerError(measurement.problem)
+    # DDS considers a killed process as present for about a second.
+    if not ros.wait_until(lambda: not client.other_publishers(), _ENDED):
+        raise ControllerError(
+            f"another process publishes {', '.join(client.other_publishers())}. Only one process may command an arm: "
+            "end the other one, e.g. another bridge, teleoperation or a script"
         )

@@ -143,6 +143,7 @@ class CrtkClient:
     Attributes:
         arm: Arm with n joints.
         namespace: Namespace of the topics, e.g. "/MTML".
+        domain: ROS domain of the arm.
         measurement: Last measurement, or None before the first message.
         operating_state: Last operating state, or None before the first message.
         gravity_compensation: Largest absolute effort of the dVRK's own gravity compensation in the last message [N m,
@@ -159,7 +160,7 @@ class CrtkClient:
             namespace: Namespace of the topics, e.g. "/MTML". `find_arm` returns it.
         """
         arm.refuse_locked_joints("a client of a dVRK")
-        self.arm, self.namespace, self._domain = arm, namespace, domain
+        self.arm, self.namespace, self.domain = arm, namespace, domain
         self.measurement: JointMeasurement | None = None
         self.operating_state: OperatingState | None = None
         self.gravity_compensation: float | None = None
@@ -170,6 +171,7 @@ class CrtkClient:
         self._measured: Subscription[JointState] = subscribe(self._topic("measured_js"), JointState)
         self._state = subscribe(self._topic("operating_state"), OperatingState, depth=100, latched=True)
         self._gravity = subscribe(self._topic("gravity_compensation/setpoint_js"), JointState)
+        self._other_hold = subscribe(self._topic("hold"), Empty, ignore_own=True)
         self._jaw = None if self._separate is None else subscribe(self._jaw_topic("measured_js"), JointState)
         self._servo_jp = self._advertise("servo_jp")
         self._servo_jf = self._advertise("servo_jf")
@@ -214,6 +216,10 @@ class CrtkClient:
             if message.header.nanoseconds:
                 self.gravity_compensation = float(np.max(np.abs(message.effort), initial=0.0))
         return is_new
+
+    def take_other_hold(self) -> bool:
+        """Returns whether another process has published `hold` since the last call."""
+        return bool(self._other_hold.take())
 
     def servo_jf(self, effort: ArrayLike) -> None:
         """Commands efforts (n,) [N m, N]. The separate joint is not included; see `servo_separate`."""
@@ -267,12 +273,7 @@ class CrtkClient:
         """Returns the topics on which another process of the domain could move the arm, without duplicates."""
         separate = () if self._separate is None else tuple(map(self._jaw_topic, ("servo_jp", "servo_jf", "move_jp")))
         motion = {*map(self._topic, MOTION_TOPICS), *separate}
-        return sorted({e.topic for e in self._domain.publishers() if e.topic in motion and not e.is_own})
-
-    @property
-    def num_changes(self) -> int:
-        """Number of times that publishers of the domain appeared or ended."""
-        return self._domain.num_changes
+        return sorted({e.topic for e in self.domain.publishers() if e.topic in motion and not e.is_own})
 
     def _position_command(self, name: str, q: ArrayLike, v: ArrayLike | None) -> JointState:
         message = JointState(Header.now(), position=self._main(self._checked(name, q)))
@@ -305,7 +306,7 @@ class CrtkClient:
         return self._topic(f"{self.arm.separate_joint}/{name}")
 
     def _advertise(self, name: str) -> Publisher[JointState]:
-        return self._domain.advertise(self._topic(name), JointState)
+        return self.domain.advertise(self._topic(name), JointState)
 
 
 def find_arm(domain: RosDomain, arm: Arm, topic: str | None = None, seconds: float = _DISCOVERY) -> str:

@@ -76,7 +76,7 @@ def dds_topic(topic: str) -> str:
     return f"{_PREFIX}/{topic.removeprefix('/')}"
 
 
-def ros_qos(depth: int, *, reliable: bool = True, latched: bool = False, type_hash: str = "") -> Qos:
+def ros_qos(depth: int, *, reliable: bool = True, latched: bool = False, type_hash: str = "", ignore_own: bool = False) -> Qos:
     """Returns the quality of service of the dVRK's topics: by default reliable and volatile.
 
     Args:
@@ -84,6 +84,7 @@ def ros_qos(depth: int, *, reliable: bool = True, latched: bool = False, type_ha
         reliable: Whether lost messages are sent again.
         latched: Whether subscriptions that join later receive earlier messages.
         type_hash: Type hash to announce. "": no type hash is announced.
+        ignore_own: Whether a subscription ignores the publishers of its own domain object.
     """
     reliability = Policy.Reliability.Reliable(duration(milliseconds=_MAX_BLOCKING))
     policies = [
@@ -93,6 +94,8 @@ def ros_qos(depth: int, *, reliable: bool = True, latched: bool = False, type_ha
     ]
     if type_hash:
         policies.append(Policy.Userdata(f"typehash={type_hash};".encode()))
+    if ignore_own:
+        policies.append(Policy.IgnoreLocal.Participant)
     return Qos(*policies)
 
 
@@ -176,6 +179,7 @@ class RosDomain:
         depth: int = 1,
         reliable: bool = True,
         latched: bool = False,
+        ignore_own: bool = False,
     ) -> "Subscription[Message]":
         """Subscribes to a topic.
 
@@ -185,8 +189,11 @@ class RosDomain:
             depth: Number of messages that may arrive between two calls of `take`. Older messages are lost.
             reliable: Whether lost messages are sent again. Must be False if a publisher is best-effort.
             latched: Whether earlier messages of a latched topic are received.
+            ignore_own: Whether to ignore the publishers of this object.
         """
-        qos = ros_qos(depth, reliable=reliable, latched=latched, type_hash=type_hash(message_type))
+        qos = ros_qos(
+            depth, reliable=reliable, latched=latched, type_hash=type_hash(message_type), ignore_own=ignore_own
+        )
         return Subscription(self.participant, topic, message_type, qos, self._notify)
 
     def fileno(self) -> int:

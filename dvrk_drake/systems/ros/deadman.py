@@ -7,6 +7,7 @@ process needs neither the arm's model nor LCM, so that few faults can affect it.
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import signal
 import subprocess
@@ -30,6 +31,8 @@ _CONFIRMATION = 1.0
 #: Longest time until a new deadman process is ready [s].
 _START = 20.0
 _READY = "ready"
+#: Real-time priority, above that of the other processes of this package.
+_PRIORITY = 60
 
 
 class Deadman:
@@ -51,7 +54,7 @@ class Deadman:
 
         self._namespace, self._report, self._empty = namespace, report, Empty()
         self._commands = [domain.subscribe(f"{namespace}/{name}", JointState) for name in ("servo_jf", "servo_jp")]
-        self._ends = domain.subscribe(f"{namespace}/hold", Empty)
+        self._ends = domain.subscribe(f"{namespace}/hold", Empty, ignore_own=True)
         self._state = domain.subscribe(f"{namespace}/operating_state", OperatingState, depth=100, latched=True)
         self._hold = domain.advertise(f"{namespace}/hold", Empty)
         self._last_command: float | None = None
@@ -151,6 +154,8 @@ def main(namespace: str, domain: str) -> None:
     """Runs the deadman of a bridge, whose end closes the standard input."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     deadman = Deadman(open_ros_domain(int(domain) if domain else None), namespace, _report)
     print(_READY, flush=True)
     deadman.run(lambda: False, sys.stdin.fileno())
