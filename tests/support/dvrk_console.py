@@ -28,6 +28,8 @@ SUPPORT = Path(__file__).resolve().parent
 #: Time after the start of the console before it can home an arm [s]. If `home` arrives in the first second, the state
 #: remains HOMING, because the console has not yet measured the period of its control loop.
 START = 2.0
+#: Ended consoles. Cyclone DDS may crash if a subscription is deleted while its listener is called, so none is deleted.
+_ENDED = []
 
 
 def find_peer():
@@ -69,7 +71,7 @@ class Console:
         self._state = domain.subscribe(f"/{arm}/operating_state", m.OperatingState, depth=100, latched=True)
 
     def events(self):
-        """Returns the lines that the console has written so far, e.g. "event: MTML: control JOINT_SPACE/EFFORT_MODE"."""
+        """Returns the lines of the console so far, e.g. "event: MTML: control JOINT_SPACE/EFFORT_MODE"."""
         return self._events.read_text(errors="replace").splitlines()
 
     def modes(self):
@@ -115,9 +117,13 @@ class Console:
 
     def wait_for_position(self, position, tolerance=1e-6):
         """Waits until the measured joint positions [rad, m] are within a tolerance of a position."""
-        wait_until(
-            lambda: np.allclose(self.latest().position, position, rtol=0, atol=tolerance), "position", self.process
-        )
+
+        def reached():
+            # Before homing, messages have no positions.
+            measured = self.latest().position
+            return len(measured) == len(position) and np.allclose(measured, position, rtol=0, atol=tolerance)
+
+        wait_until(reached, "position", self.process)
 
     def end(self):
         """Ends both processes. The console is also ended if the process that started it was killed."""
@@ -131,8 +137,7 @@ class Console:
         with contextlib.suppress(OSError):
             if b"dvrk_console" in Path(f"/proc/{self.pid}/cmdline").read_bytes():
                 os.kill(self.pid, signal.SIGKILL)
-        self._publishers, self._subscriptions, self._state = {}, {}, None
-        self.domain.close()
+        _ENDED.append(self)
 
 
 @contextlib.contextmanager

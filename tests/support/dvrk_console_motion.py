@@ -115,7 +115,9 @@ def write_configuration(folder, peer, options, motions, port):
         shutil.copy(options.gravity_compensation, share / "arm" / "gravity_compensation.json")
         arm_file = share / "arm" / f"{options.arm}_KIN_SIMULATED.json"
         text = arm_file.read_text()
-        arm_file.write_text(text.replace('"kinematic"', '"gravity_compensation": "gravity_compensation.json", "kinematic"'))
+        arm_file.write_text(
+            text.replace('"kinematic"', '"gravity_compensation": "gravity_compensation.json", "kinematic"')
+        )
     return share
 
 
