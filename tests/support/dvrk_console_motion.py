@@ -45,6 +45,8 @@ JAW = {"jaw/servo_jf": ("prmForceTorqueJointSet", m.JointState)}
 TEXTS = {"hold": m.Empty, "free": m.Empty, "state_command": m.StringStamped, "use_gravity_compensation": m.Bool}
 #: Period of the component that exchanges the JSON objects [s].
 PERIOD = 0.001
+#: Largest number of objects that are read before the next command is read.
+MAX_OBJECTS = 100
 
 
 def output_message(kind, value):
@@ -142,19 +144,23 @@ def exchange(console, stream, control, control_port, options, motions):
         with contextlib.suppress(BlockingIOError):
             while True:
                 control.recv(512)
+        # Objects that arrived while this process was busy are dropped, so that commands are not delayed.
+        latest = {}
         with contextlib.suppress(BlockingIOError):
-            while stream in ready:
+            for _ in range(MAX_OBJECTS):
                 data, address = stream.recvfrom(65536)
-                name, now = data[2 : data.index(b'"', 2)].decode(), time.monotonic()
-                if name == "operating_state":
-                    value = json.loads(data)[name]
-                    told = (value["State"], value["IsHomed"], value["IsBusy"])
-                    if told != last_state:
-                        state.publish(m.OperatingState(m.Header.now(), *told))
-                        last_state = told
-                elif now >= due[name]:
-                    due[name] = max(due[name] + 1 / options.rate, now - 1 / options.rate)
-                    publishers[name].publish(output_message(OUTPUTS[name][1], json.loads(data)[name]))
+                latest[data[2 : data.index(b'"', 2)].decode()] = data
+        for name, data in latest.items():
+            now = time.monotonic()
+            if name == "operating_state":
+                value = json.loads(data)[name]
+                told = (value["State"], value["IsHomed"], value["IsBusy"])
+                if told != last_state:
+                    state.publish(m.OperatingState(m.Header.now(), *told))
+                    last_state = told
+            elif now >= due[name]:
+                due[name] = max(due[name] + 1 / options.rate, now - 1 / options.rate)
+                publishers[name].publish(output_message(OUTPUTS[name][1], json.loads(data)[name]))
 
 
 def interrupt(*_):
