@@ -21,7 +21,7 @@ def domain(monkeypatch):
 
 
 @pytest.mark.parametrize("motion", [False, True])
-def test_console_homes_follows_servo_jp_and_holds_after_efforts(tmp_path, motion):
+def test_console_homes_moves_and_holds(tmp_path, motion):
     with start_console("MTML", tmp_path, motion=motion) as console:
         from dvrk_drake.systems.ros.messages import Empty, JointState
 
@@ -58,7 +58,7 @@ def test_move_jp_arrives_and_is_busy_on_the_way(tmp_path):
         np.testing.assert_allclose(console.latest("setpoint_js").position, goal, atol=1e-9)
 
 
-def test_servo_cp_of_a_measured_pose_restores_the_joint_positions(tmp_path):
+def test_servo_cp_reaches_a_measured_pose(tmp_path):
     with start_console("MTML", tmp_path, motion=True) as console:
         from dvrk_drake.systems.ros.messages import JointState, PoseStamped
 
@@ -78,6 +78,20 @@ def test_servo_cp_of_a_measured_pose_restores_the_joint_positions(tmp_path):
             return np.allclose([p.x, p.y, p.z], [q.x, q.y, q.z], atol=1e-4)
 
         wait_until(at_pose, "pose", console.process)
+
+
+def test_psm_changes_its_control_space_with_each_effort_of_the_jaw(tmp_path):
+    with start_console("PSM1", tmp_path, motion=True) as console:
+        from dvrk_drake.systems.ros.messages import JointState
+
+        console.enable_and_home()
+        assert console.latest().name == ["yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw"]
+        for _ in range(2):
+            for name, number, space in (("jaw/servo_jf", 1, "CARTESIAN"), ("servo_jf", 6, "JOINT")):
+                before = len(console.modes())
+                console.command(name, JointState(effort=[0.01] * number))
+                wait_until(lambda n=before: len(console.modes()) > n, "a change of the mode", console.process)
+                assert console.modes()[-1] == f"{space}_SPACE/EFFORT_MODE"
 
 
 def test_context_ends_the_console_whose_parent_was_killed(tmp_path):

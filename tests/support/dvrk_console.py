@@ -94,7 +94,11 @@ class Console:
         wait_until(lambda: self.state() == ("ENABLED", False, False), "enabled", self.process)
         self.state_command("home")
         wait_until(lambda: self.state() == ("ENABLED", True, False), "homed", self.process)
-        wait_until(lambda: any("current state HOMED" in line for line in self.events()), "homed", self.process)
+        wait_until(lambda: "current state HOMED" in " ".join(self.events()), "homed", self.process)
+        if self.arm.startswith("PSM"):
+            # `run.py` has no instrument: the console asks for its type.
+            ends = r"current state TOOL_ENGAGED.*current state HOMED|tool type requested from user"
+            wait_until(lambda: re.search(ends, " ".join(self.events())), "instrument", self.process)
 
     def command(self, name, message):
         """Publishes one message on a command topic, e.g. "servo_jp", as soon as the console is subscribed to it."""

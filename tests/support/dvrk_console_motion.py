@@ -2,7 +2,8 @@
 
     python dvrk_console_motion.py PEER MTML --events events.log [--rate 1000] [--gravity-compensation gc.json]
 
-Additional topics: setpoint_js, measured_cp and measured_cv, and the commands move_jp, servo_cp and move_cp. The console
+Additional topics: setpoint_js, measured_cp and measured_cv, the commands move_jp, servo_cp and move_cp, and the topics of
+the jaw of a PSM. Unlike with `run.py`, the PSM has an instrument, and thus six joints and a jaw. The console
 component sawSocketStreamer exchanges JSON objects with this process over UDP. The process ends with SIGINT or SIGTERM.
 """
 
@@ -40,7 +41,8 @@ MOTIONS = {
     "servo_cp": ("prmPositionCartesianSet", m.PoseStamped),
     "move_cp": ("prmPositionCartesianSet", m.PoseStamped),
 }
-JAW = {"jaw/servo_jf": ("prmForceTorqueJointSet", m.JointState)}
+JAW_OUTPUTS = {name: OUTPUTS["measured_js"] for name in ("jaw/measured_js", "jaw/setpoint_js")}
+JAW_MOTIONS = {f"jaw/{name}": MOTIONS[name] for name in ("servo_jp", "move_jp", "servo_jf")}
 #: Commands without a motion, which the console receives as text.
 TEXTS = {"hold": m.Empty, "free": m.Empty, "state_command": m.StringStamped, "use_gravity_compensation": m.Bool}
 #: Period of the component that exchanges the JSON objects [s].
@@ -88,16 +90,19 @@ def udp_socket():
     return opened
 
 
-def write_configuration(folder, peer, options, motions, port):
+def write_configuration(folder, options, outputs, motions, port):
     """Copies the configuration of the console to a folder, and adds the component that exchanges JSON objects."""
     share = folder / "share"
-    shutil.copytree(peer / "share", share, ignore=shutil.ignore_patterns("cisstLog*"))
+    shutil.copytree(options.peer / "share", share, ignore=shutil.ignore_patterns("cisstLog*"))
     for path in [share, *share.rglob("*")]:
         path.chmod(path.stat().st_mode | 0o200)
+    # The console searches for the file of the instrument in its working directory. Without it, no jaw is available.
+    for path in (share / "tool").glob("*.json"):
+        shutil.copy(path, share)
     streamer = {
         "ip": "127.0.0.1",
         "port": str(port),
-        "read-commands": [{"name": name, "type": kind} for name, (kind, _) in OUTPUTS.items()],
+        "read-commands": [{"name": name, "type": kind} for name, (kind, _) in outputs.items()],
         "write-commands": [{"name": name, "type": kind} for name, (kind, _) in motions.items()],
         "write-events": ["operating_state"],
     }
@@ -123,14 +128,14 @@ def write_configuration(folder, peer, options, motions, port):
     return share
 
 
-def exchange(console, stream, control, control_port, options, motions):
+def exchange(console, stream, control, control_port, arm, rate, outputs, motions):
     """Forwards messages between the topics and the console until the console ends."""
     domain = RosDomain()
-    publishers = {name: domain.advertise(f"/{options.arm}/{name}", kind) for name, (_, kind) in OUTPUTS.items()}
-    state = domain.advertise(f"/{options.arm}/operating_state", m.OperatingState, latched=True)
+    publishers = {name: domain.advertise(f"/{arm}/{name}", kind) for name, (_, kind) in outputs.items()}
+    state = domain.advertise(f"/{arm}/operating_state", m.OperatingState, latched=True)
     kinds = {name: kind for name, (_, kind) in motions.items()} | TEXTS
-    inputs = {name: domain.subscribe(f"/{options.arm}/{name}", kind) for name, kind in kinds.items()}
-    address, last_state, due = None, None, dict.fromkeys(OUTPUTS, 0.0)
+    inputs = {name: domain.subscribe(f"/{arm}/{name}", kind) for name, kind in kinds.items()}
+    address, last_state, due = None, None, dict.fromkeys(outputs, 0.0)
     while console.poll() is None:
         ready, _, _ = select.select([stream, domain], [], [], 0.1)
         if domain in ready:
@@ -154,13 +159,13 @@ def exchange(console, stream, control, control_port, options, motions):
             now = time.monotonic()
             if name == "operating_state":
                 value = json.loads(data)[name]
-                told = (value["State"], value["IsHomed"], value["IsBusy"])
-                if told != last_state:
-                    state.publish(m.OperatingState(m.Header.now(), *told))
-                    last_state = told
+                published = (value["State"], value["IsHomed"], value["IsBusy"])
+                if published != last_state:
+                    state.publish(m.OperatingState(m.Header.now(), *published))
+                    last_state = published
             elif now >= due[name]:
-                due[name] = max(due[name] + 1 / options.rate, now - 1 / options.rate)
-                publishers[name].publish(output_message(OUTPUTS[name][1], json.loads(data)[name]))
+                due[name] = max(due[name] + 1 / rate, now - 1 / rate)
+                publishers[name].publish(output_message(outputs[name][1], json.loads(data)[name]))
 
 
 def interrupt(*_):
@@ -176,13 +181,15 @@ def main():
     parser.add_argument("--gravity-compensation", type=Path, help="gravity compensation file of the dVRK (MTM)")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, interrupt)
-    motions = MOTIONS | (JAW if options.arm.startswith("PSM") else {})
+    outputs, motions = OUTPUTS, MOTIONS
+    if options.arm.startswith("PSM"):
+        outputs, motions = OUTPUTS | JAW_OUTPUTS, MOTIONS | JAW_MOTIONS
     stream, control = udp_socket(), udp_socket()
     with udp_socket() as unused:
         control_port = unused.getsockname()[1]
     with tempfile.TemporaryDirectory(prefix="dvrk_console_") as name, open(options.events, "w") as events:
         folder = Path(name)
-        share = write_configuration(folder, options.peer, options, motions, stream.getsockname()[1])
+        share = write_configuration(folder, options, outputs, motions, stream.getsockname()[1])
         console = subprocess.Popen(
             [
                 *(options.peer / "bin/dvrk_console", f"system/system-{options.arm}_Classic_KIN_SIMULATED.json"),
@@ -195,7 +202,7 @@ def main():
         )
         print(f"{options.arm}: console pid {console.pid}", flush=True)
         try:
-            exchange(console, stream, control, control_port, options, motions)
+            exchange(console, stream, control, control_port, options.arm, options.rate, outputs, motions)
         except KeyboardInterrupt:
             pass
         finally:
