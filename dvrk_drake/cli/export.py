@@ -56,7 +56,8 @@ def export(
         dvrk_gc: Gravity-compensation file to write for an MTM, in the format of the dVRK controller.
         dvrk_kinematic_gc: Gravity-compensation file to write for a PSM, in the format of the dVRK controller.
         diff: Print the differences between the SDF of the arm and the exported SDF.
-        gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: 1e-6.
+        gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: the dry
+            friction of each joint, which holds a joint at rest despite such a difference.
         friction: Also compensate the dry friction of the model. The model must be identified from a motion.
         coulomb: Also compensate Coulomb friction with these values, one per joint [N m]. Not allowed with --friction.
         friction_ratio: Share of the friction of each joint to compensate, 0 to 1. Default: 0.8 0.8 0.8 0.4 0.6 0.6 0.

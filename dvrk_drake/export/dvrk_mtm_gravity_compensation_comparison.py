@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
+from dvrk_drake.export.dvrk_mtm_controller import (
     MTM_JOINTS,
     NUM_GRAVITY,
     controller_regressor,

@@ -25,7 +25,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.errors import ModelError
-from dvrk_drake.export.dvrk_mtm_gravity_compensation import check_tolerance, round_up
+from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import shared_plant
 
@@ -59,9 +59,9 @@ class KinematicCompensation:
         alpha, A, theta, D: DH parameters (7,) at zero joint positions [rad, m].
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
-        error: Largest differences (3,) between the torques of file and model on yaw, pitch and insertion [N m, N m, N].
-            They are computed within the joint limits, with a straight instrument (all instrument joints at zero) or
-            with the instrument joints at their locked positions.
+        loss: Largest differences between the torques of file and model on yaw, pitch and insertion. They are computed
+            with a straight instrument (all instrument joints at zero) or with the instrument joints at their locked
+            positions.
         wrist: Largest changes (3,) of the model's torques on these joints due to the positions of the instrument
             joints [N m, N m, N]. The file does not represent these changes. Not meaningful if the instrument joints are
             locked.
@@ -73,7 +73,7 @@ class KinematicCompensation:
     D: NDArray[np.float64]
     mass: NDArray[np.float64]
     center: NDArray[np.float64]
-    error: NDArray[np.float64]
+    loss: CompensationLoss
     wrist: NDArray[np.float64]
 
     def save(self, path: str | Path) -> None:
@@ -97,18 +97,20 @@ class KinematicCompensation:
             stream.write("\n")
 
 
-def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> KinematicCompensation:
+def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = None) -> KinematicCompensation:
     """Converts the gravity torque of yaw, pitch and insertion to the controller's chain, for a straight instrument.
 
     If the instrument joints of the model are locked, the chain represents the instrument at the locked positions.
 
     Args:
         model: Model of a PSM.
-        tolerance: Largest accepted torque error [N m, N]. Joint effects and feedforward scales below 1 cause errors.
+        tolerance: Largest accepted difference between the torques of the file and of the model on any joint [N m, N].
+            Joint effects and feedforward scales below 1 cause differences. None: the dry friction of each joint, see
+            `gravity_compensation_loss.accepted_differences`.
 
     Raises:
-        ModelError: The model is not of a PSM, the net mass on the insertion joint is not positive, or the torque
-            error exceeds `tolerance`.
+        ModelError: The model is not of a PSM, the net mass on the insertion joint is not positive, or a torque
+            difference exceeds `tolerance`.
     """
     arm = model.arm
     plant = shared_plant(arm)
@@ -116,7 +118,8 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
         raise ModelError(
             f"{arm.name} is not a PSM. The format dvrk-kinematic-gc supports only a PSM; for an MTM, use dvrk-gc"
         )
-    check_tolerance(tolerance)
+    accepted = accepted_differences(arm, tolerance)[: len(ARM_JOINTS)]
+    _refuse_disabled_joints(model)
     alpha, A, theta, D = _chain(plant)
     q = arm.sample_poses(600, np.random.default_rng(0))
     straight = np.where(np.arange(arm.num_joints) < 3, q, 0.0)
@@ -140,26 +143,29 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     step = np.linalg.lstsq(unknown, (tau - np.einsum("mjlk,lk->mj", Y, known)).ravel(), rcond=1e-9)[0]
     known[_FITTED, 1:] += step.reshape(-1, 3)
     tau_model = model.holding_torque(straight)[:, :3]
-    error = np.abs(np.einsum("mjlk,lk->mj", Y, known) - tau_model).max(axis=0)
-    if error.max() > tolerance:
-        errors = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
-        raise ModelError(
-            f"the controller's file cannot represent this model: the largest torque errors are {errors} [N m, N]. "
-            "The file supports only gravity with a feedforward scale of 1. Effects that are not represented: "
-            f"{_omitted_effects(model, straight)}. To accept the errors, repeat the command with "
-            f"--gc-tolerance {round_up(error.max()):g}"
-        )
+    tau_file = np.einsum("mjlk,lk->mj", Y, known)
+    causes = {"feedforward scale other than 1": tau_file - tau, **_omitted_effects(model, straight)}
+    loss = make_loss(arm, straight, tau_file - tau_model, causes)
+    loss.check(accepted)
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
     wrist = np.abs(model.holding_torque(q)[:, :3] - tau_model).max(axis=0)
-    return KinematicCompensation(alpha, A, theta, D, mass, center, error, wrist)
+    return KinematicCompensation(alpha, A, theta, D, mass, center, loss, wrist)
 
 
-def _omitted_effects(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
-    """Returns text that names each effect on yaw, pitch and insertion, and its largest torque at the poses q (m, n)."""
+def _refuse_disabled_joints(model: IdentifiedModel) -> None:
+    scale = model.feedforward_scale[: len(ARM_JOINTS)]
+    if off := [name for name, s in zip(ARM_JOINTS, scale, strict=True) if s == 0]:
+        raise ModelError(
+            f"{model.arm.name}: the feedforward is disabled for {', '.join(off)}, but the controller's file "
+            "compensates gravity on yaw, pitch and insertion. Identify a model from a recording in which they move"
+        )
+
+
+def _omitted_effects(model: IdentifiedModel, q: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Returns the difference (m, 3) that the omission of each effect causes at the poses q (m, n)."""
     gravity = len(model.base_parameters)
-    tau = np.abs(model.static_model.regressor(q)[:, :3, gravity:] * model.theta[gravity:]).max(axis=(0, 1))
-    described = [f"{ActuatorEffect.of(e)} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
-    return ", ".join(described) or "none"
+    torque = model.feedforward_scale[:, None] * model.static_model.regressor(q)[:, :, gravity:] * model.theta[gravity:]
+    return {f"effect {ActuatorEffect.of(e)}": -torque[:, :3, i] for i, e in enumerate(model.holding_effects)}
 
 
 def _chain(plant: MultibodyPlant) -> tuple[NDArray[np.float64], ...]:

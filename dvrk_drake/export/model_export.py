@@ -79,7 +79,7 @@ def prepare_export(
     if format in ("sdf", "urdf"):
         return ModelExport(model, format, origin, bodies=model_bodies(model))
     if format == "dvrk-kinematic-gc":
-        file = kinematic_compensation(model, **({} if tolerance is None else {"tolerance": tolerance}))
+        file = kinematic_compensation(model, tolerance)
         return ModelExport(model, format, origin, compensation=file)
     coulomb = None if friction is False else dry_friction(model) if friction is True else friction
     given = {
@@ -115,7 +115,8 @@ def export_model(
             dVRK's controller for an MTM and for a PSM. None selects SDF or URDF by the file name extension.
         origin: Source of the model, written to the file.
         tolerance: Largest accepted difference [N m, N] between the torques of the model and of a file for the dVRK's
-            controller. None: 1e-6.
+            controller, on any joint. None: the dry friction of each joint, because this friction holds a joint at rest
+            despite such a difference.
         friction: Coulomb friction (7,) [N m] to compensate, for "dvrk-gc". True uses the dry friction of the model's
             dynamics. False compensates no friction.
         friction_ratio: Share of the friction to compensate on each joint (7,), 0 to 1, for "dvrk-gc". None uses
@@ -129,13 +130,13 @@ def export_model(
         Content of the written file. `bodies.left_out` describes effects that an SDF or URDF does not represent.
 
     Raises:
-        ModelError: The format is unknown or cannot represent the model.
+        ModelError: The format is unknown or cannot represent the model within the tolerance.
         DvrkDrakeError: The file exists or cannot be written.
 
     Example:
         >>> import dvrk_drake as dvrk
         >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm"))
-        >>> exported = dvrk.export_model(model, "psm.json", "dvrk-kinematic-gc", tolerance=0.5)
+        >>> exported = dvrk.export_model(model, "psm.json", "dvrk-kinematic-gc")
         >>> exported.compensation.mass.shape  # masses [kg] of the links of the controller's chain
         (7,)
     """

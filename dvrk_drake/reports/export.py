@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,12 @@ from rich.table import Table
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies
-from dvrk_drake.export.dvrk_mtm_gravity_compensation import MTM_JOINTS, largest_differences
+from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import POSES, compensation_loss
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, KinematicCompensation
+from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLoss
 from dvrk_drake.export.model_export import ModelExport
 from dvrk_drake.export.sdf import LinkChange, changed_links
 from dvrk_drake.models.arm import Arm
@@ -35,7 +38,7 @@ def print_export(console: Console, path: str, export: ModelExport, *, verbose: b
     if export.bodies is not None:
         _print_bodies(console, arm, export, export.bodies, verbose)
     elif isinstance(export.compensation, KinematicCompensation):
-        _print_kinematic_compensation(console, export, export.compensation, verbose)
+        _print_kinematic_compensation(console, path, export, export.compensation, verbose)
     else:
         written = GravityCompensationFile.load(path)
         _print_compensation(console, path, export, written, verbose)
@@ -103,58 +106,101 @@ def _place(place: NDArray[np.float64]) -> str:
 def _print_compensation(
     console: Console, path: str, export: ModelExport, file: GravityCompensationFile, verbose: bool
 ) -> None:
-    """Prints the largest difference between a written file and its model, and the torque limits of the file."""
-    arm, off = export.model.arm, largest_differences(file, export.model)
-    j = int(np.argmax(off))
-    print_answer(
-        console,
-        f"The file differs from the model by at most {off[j]:.1e} N m ({MTM_JOINTS[j]}), at rest.",
-        f"dvrk-drake compare-gc {path} {_source(export.model, export.origin)}",
-    )
-    table = make_table("Torques at rest [N m]", "", "largest difference*", "torque limits", "dry friction")
+    """Prints the largest differences between a written file and its model, and the torque limits of the file."""
+    arm, loss = export.model.arm, compensation_loss(file, export.model)
+    next_step = f"dvrk-drake compare-gc {path} {_source(export.model, export.origin)}"
+    print_answer(console, _loss_text(loss), next_step)
+    table = make_table("Torques at rest [N m]", "", "difference*", "% of limit", "torque limits", "friction")
     friction = np.append((file.positive - file.negative)[10::5] / 2, 0.0)
     for j, name in enumerate(MTM_JOINTS):
-        clip = f"{file.torque_lower[j]:+.4f}..{file.torque_upper[j]:+.4f}"
-        table.add_row(name, f"{off[j]:.1e}", clip, f"{friction[j]:.4f}")
+        limits = f"{file.torque_lower[j]:+.4f}..{file.torque_upper[j]:+.4f}"
+        table.add_row(name, *_loss_cells(loss, j), limits, f"{friction[j]:.4f}")
     console.print(table)
-    print_note(console, "* between file and model at 4000 random poses over the joint range")
+    print_note(
+        console,
+        f"* largest difference between file and model at {POSES} random poses over the joint range, also in % of the "
+        "effort limit. Friction: dry friction that the file compensates during a motion.",
+    )
+    _print_causes(console, loss)
     if verbose:
         table = make_table("Friction compensation", "", "ratio", "dead band [rad/s]", "saturation [rad/s]")
         for j, name in enumerate(MTM_JOINTS):
             table.add_row(name, *(f"{x[j]:g}" for x in (file.friction_ratio, file.dead_band, file.saturation)))
         console.print(table)
         console.print()
+    if off := [joint.name for joint in export.model.joints if joint.feedforward_scale == 0]:
+        console.print(f"The file applies no torque because the feedforward scale is 0: {', '.join(off)}.")
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
         console.print(f"Joints whose torque limit equals the effort limit of the arm: {', '.join(short)}.")
-    console.print('Enter the path of the file as "gravity_compensation" in the JSON file of the arm.')
+    _print_estimates(console, export)
+    console.print(f"Install: {_installation('gravity_compensation', path)}.", markup=False)
+    usual = f"gc-{arm.name}-"
+    if not Path(path).name.startswith(usual):
+        console.print(f"The usual name of the file is {usual}<serial number>.json.", markup=False)
 
 
 def _print_kinematic_compensation(
-    console: Console, export: ModelExport, file: KinematicCompensation, verbose: bool
+    console: Console, path: str, export: ModelExport, file: KinematicCompensation, verbose: bool
 ) -> None:
     """Prints the largest differences from the model, and the links of the kinematic chain in the file."""
-    j = int(np.argmax(file.error / export.model.arm.effort_limits[: len(ARM_JOINTS)]))
-    units = ("N m", "N m", "N")
-    print_answer(
-        console,
-        f"The file differs from the model by at most {file.error[j]:.1e} {units[j]} ({ARM_JOINTS[j]}), at rest.",
-        "enter the path of the file in the JSON file of the arm",
-    )
+    print_answer(console, _loss_text(file.loss), _installation("kinematic_gc", path))
     locked = locked_text(export.model.arm)
     columns = (f"with {locked}",) if locked else ("straight instrument", "change by a bent wrist")
-    table = make_table("Largest difference from the model at rest", "", *columns, "")
-    for name, error, wrist, unit in zip(ARM_JOINTS, file.error, file.wrist, units, strict=True):
-        table.add_row(name, f"{error:.1e}", *([] if locked else [f"{wrist:.1e}"]), unit)
+    title = "Largest difference from the model at rest, also in % of the effort limit"
+    table = make_table(title, "", "", columns[0], "%", *columns[1:])
+    for j, (name, wrist) in enumerate(zip(ARM_JOINTS, file.wrist, strict=True)):
+        cells = _loss_cells(file.loss, j)
+        table.add_row(name, file.loss.units[j], *cells, *([] if locked else [f"{wrist:.2g}"]))
     console.print(table)
     if locked:
         print_note(console, "The torque for other positions of the instrument is not identified.")
-    if verbose:
+    else:
         console.print()
+    _print_causes(console, file.loss)
+    if verbose:
         table = make_table("Links of the chain, centre of mass in the DH frame", "", "mass [kg]", "x, y, z [mm]")
         for name, mass, centre in zip(NAMES, file.mass, file.center, strict=True):
             table.add_row(name, f"{mass:.4f}", " ".join(f"{1e3 * x:+8.2f}" for x in centre))
         console.print(table)
+        console.print()
+    _print_estimates(console, export)
+
+
+def _loss_text(loss: CompensationLoss) -> str:
+    j = loss.worst
+    if loss.difference.max() <= ROUNDING:
+        return "The torques of the file and the model are equal at rest."
+    return (
+        f"The file differs from the model by at most {100 * loss.share[j]:.1f} % of the effort limit "
+        f"({loss.joints[j]}, {loss.difference[j]:.2g} {loss.units[j]}), at rest."
+    )
+
+
+def _loss_cells(loss: CompensationLoss, j: int) -> tuple[str, str]:
+    """Returns the largest difference on a joint and its share of the effort limit [%]."""
+    if loss.difference[j] <= ROUNDING:
+        return "0", "0"
+    return f"{loss.difference[j]:.2g}", f"{100 * loss.share[j]:.2g}"
+
+
+def _print_causes(console: Console, loss: CompensationLoss) -> None:
+    """Prints the cause of the difference on each joint, and the pose of the largest difference."""
+    for cause in dict.fromkeys(filter(None, loss.causes)):
+        joints = ", ".join(name for name, own in zip(loss.joints, loss.causes, strict=True) if own == cause)
+        console.print(f"Cause ({joints}): {cause}.", markup=False)
+    if any(loss.causes):
+        pose = " ".join(f"{x:.2f}" for x in loss.poses[loss.worst])
+        console.print(f"Pose of the largest difference ({loss.joints[loss.worst]}) [rad; m]: {pose}.\n", markup=False)
+
+
+def _print_estimates(console: Console, export: ModelExport) -> None:
+    if export.model.provenance.method == "nominal":
+        console.print("The masses of the SDF are estimates. Identify your arm before you install a file.")
+
+
+def _installation(key: str, path: str) -> str:
+    return f'enter "{key}": "{Path(path).name}" in the JSON file of the arm'
 
 
 def print_comparison(

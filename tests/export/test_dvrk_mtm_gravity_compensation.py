@@ -10,19 +10,20 @@ import pytest
 from command_output import refusal
 
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_mtm_controller import controller_torque, unclipped_torque
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     CompensationOptions,
     compensation_from_model,
-    controller_torque,
+    compensation_loss,
     dry_friction,
-    largest_differences,
-    unclipped_torque,
 )
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.gravity_compensation_loss import LEAST_TOLERANCE, accepted_differences
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.figures.export import plot_compensation
@@ -191,34 +192,86 @@ def test_torque_limits_are_the_torque_range_plus_ten_percent():
 
 def test_rejects_a_model_that_the_file_cannot_represent():
     eccentric = IdentifiedModel.from_arm(load_arm("mtml"))
-    with pytest.raises(ModelError, match=r"wrist_roll 0\.0021 N m\..*gravity 0\.00.*--gc-tolerance 0\.00"):
+    for p in eccentric.base_parameters:
+        p.value *= 3 if p.name.startswith("m7 c7") else 1
+    with pytest.raises(
+        ModelError, match=r"wrist_roll 0\.0064 N m \(27\.\d % of .*, allowed: 0\.0026 .*roll axis"
+    ) as error:
         compensation_from_model(eccentric)
-    with pytest.raises(ModelError, match=r"estimated masses of the SDF.*dvrk-drake identify") as refusal:
-        compensation_from_model(eccentric)
-    assert "tilted" not in str(refusal.value) and "feedforward_scale" not in str(refusal.value)
+    assert "shoulder_pitch" not in str(error.value) and "tilt" not in str(error.value)
     # The tolerance in the message is sufficient.
-    compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
+    tolerance = float(str(error.value).split("--gc-tolerance ")[1])
+    compensation_from_model(eccentric, CompensationOptions(tolerance=tolerance))
+    with pytest.raises(ModelError, match="repeat the command with"):
+        compensation_from_model(eccentric, CompensationOptions(tolerance=0.95 * tolerance))
     spring = balanced()
     spring.effects = [DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.05)]
-    with pytest.raises(ModelError, match=r"wrist_pitch 0\.0\d+ N m\. Errors by cause: effects 0\.0\d+ N m \("):
-        compensation_from_model(spring)
+    with pytest.raises(ModelError, match=r"wrist_pitch 0\.0\d+ N m \(.*cause: effect joint.wrist_pitch cable sine 1\)"):
+        compensation_from_model(spring, CompensationOptions(tolerance=1e-6))
     # A polynomial of order 4 approximates 0.05 sin(q) over +-2.44 rad with an error of a few percent.
     compensation_from_model(spring, CompensationOptions(tolerance=0.05 * 0.08))
-    for change in ({"feedforward_scale": 0.5}, {"gravity": TILTED}):
+    for change, cause in (({"feedforward_scale": 0.5}, "feedforward scale"), ({"gravity": TILTED}, "tilt of 2.3 deg")):
         model = balanced()
         if "feedforward_scale" in change:
             model.joints[4].feedforward_scale = change["feedforward_scale"]
         else:
             model.arm = model.arm.with_gravity(change["gravity"])
             model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
-        with pytest.raises(ModelError, match="cannot represent"):
-            compensation_from_model(model)
+        with pytest.raises(ModelError, match=f"cannot represent.*cause: .*{cause}"):
+            compensation_from_model(model, CompensationOptions(tolerance=1e-3))
     with pytest.raises(ModelError, match="is not an MTM"):
         compensation_from_model(IdentifiedModel.from_arm(load_arm("psm")))
     with pytest.raises(ModelError, match="dead_band must be 7 numbers"):
         compensation_from_model(balanced(), CompensationOptions(dead_band=(0.1,)))
     with pytest.raises(ModelError, match=r"fric_comp_ratio_vec\[\d\] is .*; allowed: 0\.\.1"):
         compensation_from_model(balanced(), CompensationOptions(friction_ratio=(2.0,) * 7))
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr"])
+def test_default_tolerance_is_the_dry_friction_of_each_joint(name):
+    """The torque of the last link's eccentric mass has the amplitude m c g on this link's axis."""
+    model = IdentifiedModel.from_arm(load_arm(name))
+    loss = compensation_loss(compensation_from_model(model), model)
+    eccentric = np.hypot(*(p.value for p in model.base_parameters if p.name.startswith("m7 c7")))
+    assert loss.difference[-1] == pytest.approx(9.81 * eccentric, rel=1e-3)
+    assert np.all(loss.difference <= model.arm.dry_friction()) and loss.joints[loss.worst] == "wrist_roll"
+    assert set(loss.causes[1:]) == {"centre of mass of the last link off the roll axis"} and loss.causes[0] == ""
+    # At the poses of the loss, the torques have the stated difference.
+    off = controller_torque(compensation_from_model(model), loss.poses) - model.holding_torque(loss.poses)
+    np.testing.assert_allclose(np.abs(off).diagonal(), loss.difference, rtol=0, atol=1e-12)
+    accepted = accepted_differences(model.arm, None)
+    np.testing.assert_allclose(accepted, model.arm.dry_friction(), rtol=0, atol=1e-12)
+    assert accepted[-1] < 0.2 * model.arm.effort_limits[-1]
+    frictionless = dataclasses.replace(model.arm, effects=dataclasses.replace(model.arm.effects, friction=[]))
+    assert np.all(accepted_differences(frictionless, None) == LEAST_TOLERANCE)
+
+
+def test_joint_without_feedforward_gets_no_torque():
+    model = balanced()
+    model.joints[5].feedforward_scale = 0.0
+    file = compensation_from_model(model, CompensationOptions(coulomb=(0.01,) * 7, tolerance=1e-9))
+    q = model.arm.sample_poses(300, np.random.default_rng(6))
+    actual = controller_torque(file, q, np.full_like(q, 0.5))[:, 5]
+    assert np.all(actual == 0.0) and np.abs(controller_torque(file, q)[:, 4]).max() > 0.01
+
+
+def test_loss_names_each_effect():
+    model = balanced()
+    model.effects = [
+        DriveEffect("joint.wrist_pitch", "cable sine", 2.0, 0.01),
+        DriveEffect("joint.wrist_roll", "offset", 0.0, 0.002),
+        DriveEffect("actuator.wrist_platform", "spring", 7.0, 0.05),
+    ]
+    loss = compensation_loss(compensation_from_model(model, CompensationOptions(tolerance=1.0)), model)
+    assert loss.causes[4] == "effect joint.wrist_pitch cable sine 2"
+    assert loss.causes[6] == "effect joint.wrist_roll offset" and loss.difference[6] == pytest.approx(0.002)
+    # Two joints move the actuator of the platform. The polynomial of each joint omits the motion of the other joint.
+    assert loss.causes[2] == loss.causes[3] == "effect actuator.wrist_platform spring 7"
+    row = np.abs(joint_row(model.arm, "actuator.wrist_platform"))
+    bounds = np.maximum(np.abs(model.arm.position_lower), np.abs(model.arm.position_upper))
+    omitted = 0.05 * row[2] * row[3] * bounds[[3, 2]]
+    assert 0 < omitted[0] < 0.02
+    np.testing.assert_allclose(loss.difference[[2, 3]], omitted, rtol=0.1, atol=1e-9)
 
 
 @pytest.mark.parametrize("tolerance", ["nan", "inf", "-1"])
@@ -236,9 +289,9 @@ def test_tilted_base_is_rejected_or_approximated(tmp_path, capsys):
     model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
     given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     model.save(given)
-    assert main(["export", "--model", str(given), "--dvrk-gc", str(out)]) == 2
+    assert main(["export", "--model", str(given), "--dvrk-gc", str(out), "--gc-tolerance", "0.001"]) == 2
     error = refusal(capsys.readouterr().err)
-    assert "a base tilt of 0 instead of 2.3 deg" in error and not out.exists()
+    assert "base tilt of 2.3 deg" in error and not out.exists()
     # With the option in the message, the error of the file is the error in the message.
     tolerance = error.split("--gc-tolerance ")[1]
     assert main(["export", "--model", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0
@@ -246,9 +299,9 @@ def test_tilted_base_is_rejected_or_approximated(tmp_path, capsys):
     q = model.arm.sample_poses(300, np.random.default_rng(5))
     controller = np.array([dvrk_controller(out, pose, np.zeros(7)) for pose in q])
     error_of_file = np.abs(controller - model.holding_torque(q)).max(axis=0)
-    stated = largest_differences(GravityCompensationFile.load(out), model)
+    stated = compensation_loss(GravityCompensationFile.load(out), model).difference
     assert np.all(error_of_file <= 1.1 * stated + 1e-9) and error_of_file.max() < 1.1 * float(tolerance)
-    assert all(f"{x:.1e}" in printed for x in stated)
+    assert all(f"{x:.2g}" in printed for x in stated if x > 1e-9)
     # The polynomial reduces the error of the outer yaw, whose gravity torque is due to the tilt only.
     assert stated[0] < 0.6 * np.abs(model.holding_torque(q)[:, 0]).max()
 
@@ -315,12 +368,19 @@ def test_export_and_compare_commands(tmp_path, capsys):
     joints = json.loads(report.read_text())["joints"]
     assert [j["clipped"] for j in joints] == [0.0] * 7 and joints[0]["rms_inside"] is None
     out.unlink()
-    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out)]) == 2
+    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out), "--gc-tolerance", "0.001"]) == 2
     error = refusal(capsys.readouterr().err)
     assert not out.exists()
-    # The command with the option in the message is accepted.
+    # The command with the option in the message is accepted, and the command with the default tolerance.
     options = error.split("repeat the command with ")[1].split()
     assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out), *options]) == 0 and out.exists()
+    capsys.readouterr()
+    out = tmp_path / "gc-MTML-12345.json"
+    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "at most 9.3 % of the effort limit (wrist_roll, 0.0021 N m)" in printed and "estimates" in printed
+    assert 'enter "gravity_compensation": "gc-MTML-12345.json" in the JSON file of the arm' in printed
+    assert "usual name" not in printed
     capsys.readouterr()
     assert main(["export", "--model", str(model)]) == 2
     assert "--dvrk-gc" in capsys.readouterr().err

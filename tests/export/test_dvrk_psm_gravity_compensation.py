@@ -90,8 +90,19 @@ def test_chain_has_the_dimensions_of_the_arm(tmp_path):
 
 def test_rejects_a_model_that_the_file_cannot_represent():
     model = perturbed_psm()
-    model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
-    with pytest.raises(ModelError, match=r"errors are pitch 0\.1 .*: joint.pitch offset 0\.1\. .*--gc-tolerance 0\.1"):
+    model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1), DriveEffect("joint.yaw", "offset", 0.0, 0.02)]
+    file = kinematic_compensation(model)  # The dry friction of the pitch is 0.285 N m.
+    np.testing.assert_allclose(file.loss.difference, [0.02, 0.1, 0.0], rtol=0, atol=1e-9)
+    assert file.loss.causes == ("effect joint.yaw offset", "effect joint.pitch offset", "")
+    with pytest.raises(
+        ModelError, match=r"pitch 0\.1 N m \(3\.0 %.*cause: effect joint.pitch off.*--gc-tolerance 0\.1"
+    ):
+        kinematic_compensation(model, 0.05)
+    model.effects[0].coefficient = 0.3
+    with pytest.raises(ModelError, match=r"pitch 0\.3 N m \(9\.0 % of the effort limit, allowed: 0\.285 N m"):
+        kinematic_compensation(model)
+    model.joints[2].feedforward_scale = 0.0
+    with pytest.raises(ModelError, match="feedforward is disabled for insertion"):
         kinematic_compensation(model)
     heavy = perturbed_psm()
     (net,) = (p for p in heavy.base_parameters if "- m_counterweight" in p.name and p.name.startswith("(m3"))
@@ -105,7 +116,9 @@ def test_rejects_a_model_that_the_file_cannot_represent():
 def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):
     out = tmp_path / "psm.json"
     assert main(["export", "--arm", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
-    assert "pitch" in capsys.readouterr().out and out.is_file()
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "are equal at rest" in printed and out.is_file()
+    assert 'enter "kinematic_gc": "psm.json" in the JSON file of the arm' in printed
     assert main(["export", "--arm", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
     assert "is not a PSM" in refusal(capsys.readouterr().err)
 

@@ -13,11 +13,8 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
-from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
-    CompensationOptions,
-    compensation_from_model,
-    controller_torque,
-)
+from dvrk_drake.export.dvrk_mtm_controller import controller_torque
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm_files import load_arm

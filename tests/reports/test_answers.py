@@ -194,11 +194,11 @@ CASES = {
     "export SDF": (r"\d+ links differ", lambda c, v: exported(c, v, poses()[0].model, "out.sdf")),
     "export URDF": (r"\d+ links differ", lambda c, v: exported(c, v, motions()[2].model, "out.urdf")),
     "export dVRK, MTM": (
-        r"The file differs from the model by at most \d\.\de-\d+ N m \(\w+\)",
+        r"The file differs from the model by at most \d+\.\d % of the effort limit \(\w+, 0\.\d+ N m\)",
         lambda c, v: exported(c, v, poses()[0].model, "gc.json", format="dvrk-gc", tolerance=1.0),
     ),
     "export dVRK, PSM": (
-        r"The file differs from the model by at most \d\.\de-\d+ N",
+        r"The torques of the file and the model are equal at rest",
         lambda c, v: exported(
             c, v, dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm")), "psm.json", format="dvrk-kinematic-gc"
         ),

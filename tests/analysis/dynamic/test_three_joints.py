@@ -92,7 +92,7 @@ def test_commands_end_to_end(folder, capsys):
 def test_controller_file_contains_the_held_instrument(folder):
     """The chain has a straight instrument, but its last link can represent any rigid instrument."""
     model = IdentifiedModel.from_arm(ARM)
-    assert kinematic_compensation(model).error.max() < 1e-6
+    assert kinematic_compensation(model).loss.difference.max() < 1e-6
     identified = IdentifiedModel.load(folder / "model.yaml")
     assert kinematic_compensation(identified, tolerance=10.0).mass[-1] > 0
 
