@@ -76,7 +76,9 @@ def dds_topic(topic: str) -> str:
     return f"{_PREFIX}/{topic.removeprefix('/')}"
 
 
-def ros_qos(depth: int, *, reliable: bool = True, latched: bool = False, type_hash: str = "", ignore_own: bool = False) -> Qos:
+def ros_qos(
+    depth: int, *, reliable: bool = True, latched: bool = False, type_hash: str = "", ignore_own: bool = False
+) -> Qos:
     """Returns the quality of service of the dVRK's topics: by default reliable and volatile.
 
     Args:
