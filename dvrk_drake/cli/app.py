@@ -125,6 +125,14 @@ Key = Annotated[
         "The arm and the controller need the same key.",
     ),
 ]
+RosTopic = Annotated[
+    str | None,
+    Parameter(metavar="TOPIC", help="ROS 2 topic measured_js of the arm, or its namespace. Default: /<ARM>."),
+]
+RosDomain = Annotated[
+    int | None,
+    Parameter(metavar="N", converter=whole_number, help="ROS domain. Default: $ROS_DOMAIN_ID, or else 0."),
+]
 Realtime = Annotated[
     bool,
     Parameter(show_default=False, help="Request real-time scheduling. Print a warning if it is not permitted."),

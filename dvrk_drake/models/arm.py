@@ -66,6 +66,7 @@ class Arm:
         effects: Friction, cable and sensor effects of the real arm. A simulation includes only those that are named in
             `simulated_effects`.
         separate_joint: Name of the joint that the dVRK publishes on separate ROS topics, e.g. "jaw", or "".
+        console_gravity_compensation: Whether the dVRK's controller can compensate the gravity of this arm.
         locked_joints: Positions of the joints that are locked [rad, m], see `with_locked_joints`. They are not among
             the n independent joints.
 
@@ -100,6 +101,7 @@ class Arm:
     identification: IdentificationSettings
     effects: ArmEffects
     separate_joint: str = ""
+    console_gravity_compensation: bool = False
     locked_joints: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
 
     def __post_init__(self) -> None:

@@ -171,6 +171,7 @@ def _build_arm(
         identification=_identification_settings(path, mechanism, instrument),
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
         separate_joint=instrument.separate_joint,
+        console_gravity_compensation=mechanism.console_gravity_compensation,
     )
 
 

@@ -131,6 +131,8 @@ class Mechanism:
     position. An actuator without an entry has the position of its joint. `effort_cut_off` is the cut-off
     frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects` are the friction, cable and
     sensor effects of the real arm. A simulation includes only those that are named in `simulated_effects`.
+    `console_gravity_compensation` states whether the dVRK's controller can compensate the gravity of this arm. It then
+    publishes the efforts on the ROS topic gravity_compensation/setpoint_js.
     """
 
     sdf: str = ""
@@ -143,6 +145,7 @@ class Mechanism:
     effort_cut_off: float = field(default=10.0, metadata=_CUT_OFFS)
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
+    console_gravity_compensation: bool = False
 
 
 @dataclass

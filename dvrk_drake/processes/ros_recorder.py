@@ -7,18 +7,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dvrk_drake.errors import DvrkDrakeError, RecordingError
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.recorder import FIRST_STATUS, Rate
 from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
 from dvrk_drake.recordings.recording_stream import check_stream_output
 from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
-    from dvrk_drake.processes.ros_topics import JointState, RosDomain, Subscription
+    from dvrk_drake.systems.ros.domain import Subscription
+    from dvrk_drake.systems.ros.messages import JointState
 
 #: Longest wait for a message between two checks for a stop [s].
 _POLL = 0.1
+#: Messages of one topic that may arrive while the recorder writes. Older messages are lost.
+_DEPTH = 5000
 #: Time to wait for other fitting topics after the first one was discovered [s].
 _DISCOVERY = 1.0
 
@@ -52,7 +56,7 @@ class RosRecorder:
         self.num_rows = 0
         self._num_invalid = 0
         self._rate = Rate()
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: list[Subscription[JointState]] = []
         self._silent: set[str] = set()
         self._bag: GrowingMcap | None = None
 
@@ -108,6 +112,8 @@ class RosRecorder:
 
     def _subscribe(self, stopped: Callable[[], bool]) -> None:
         """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one."""
+        from dvrk_drake.systems.ros.messages import JointState
+
         start, found = time.monotonic(), None
         topics: dict[str, bool] = {}
         while not stopped():
@@ -120,10 +126,11 @@ class RosRecorder:
         main = choose_topic(self.source, self._arm, self._topic, {name: name for name in topics})
         others = joint_state_topics(self._arm, main.rpartition("/")[0])[1:]
         for name in (main, *(topic.name for topic in others)):
-            self._subscriptions.append(self._domain.subscribe(name, reliable=topics.get(name, True)))
+            subscription = self._domain.subscribe(name, JointState, depth=_DEPTH, reliable=topics.get(name, True))
+            self._subscriptions.append(subscription)
             self._silent.add(name)
 
-    def _record(self, subscription: Subscription, message: JointState, published: int) -> None:
+    def _record(self, subscription: Subscription[JointState], message: JointState, published: int) -> None:
         """Writes a message. The bag is created at the first valid message of the arm."""
         is_valid = bool(message.header.stamp.sec or message.header.stamp.nanosec)
         if subscription is self._subscriptions[0]:
@@ -158,16 +165,3 @@ class RosRecorder:
 
     def _num_lost(self) -> int:
         return sum(subscription.num_lost for subscription in self._subscriptions)
-
-
-def open_ros_domain(domain: int | None = None) -> RosDomain:
-    """Joins a ROS domain, see `RosDomain`.
-
-    Raises:
-        DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
-    """
-    try:
-        from dvrk_drake.processes.ros_topics import RosDomain
-    except ModuleNotFoundError as error:
-        raise DvrkDrakeError("ROS 2 needs the package cyclonedds: pip install cyclonedds") from error
-    return RosDomain(domain)

@@ -16,7 +16,9 @@ from dvrk_drake.processes import ros_recorder as module
 from dvrk_drake.processes.ros_recorder import RosRecorder
 from dvrk_drake.recordings.reading import read_recording
 
-ros = pytest.importorskip("dvrk_drake.processes.ros_topics", reason="needs cyclonedds")
+ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
+messages_module = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
+JointState, Header, Time = messages_module.JointState, messages_module.Header, messages_module.Time
 
 PSM = load_arm("psm")
 JOINTS = list(PSM.joint_names)
@@ -76,9 +78,7 @@ def message(k, joints=slice(0, 6), names=JOINTS, stamp=None):
     """Returns message k of `ros_publisher` and its time of publication."""
     stamp = START + k * PERIOD if stamp is None else stamp
     q, qd, tau = rows(k)[:, joints].tolist()
-    return ros.JointState(
-        ros.Header(ros.Time(*divmod(stamp, 10**9)), ""), list(names[joints]), q, qd, tau
-    ), START + k * PERIOD
+    return JointState(Header(Time(*divmod(stamp, 10**9)), ""), list(names[joints]), q, qd, tau), START + k * PERIOD
 
 
 class SubstituteDomain:
@@ -92,7 +92,7 @@ class SubstituteDomain:
     def joint_state_topics(self):
         return dict.fromkeys(self._messages, True)
 
-    def subscribe(self, topic, *, reliable):
+    def subscribe(self, topic, message_type, *, depth, reliable):
         pending = iter(self._messages.get(topic, ()))
         return SimpleNamespace(topic=topic, num_lost=3, take=lambda: [m for m in [next(pending, None)] if m])
 
@@ -117,7 +117,7 @@ def record(tmp_path, monkeypatch):
 
 
 def test_invalid_messages_do_not_start_the_recording(record, tmp_path):
-    invalid = (ros.JointState(), START)
+    invalid = (JointState(), START)
     recorder, lines = record(
         {TOPIC: [invalid, invalid, *map(message, range(9))], JAW: [message(k, slice(6, 7)) for k in range(-2, 9)]}
     )
@@ -140,7 +140,7 @@ def test_missing_jaw_is_noted(record):
     ("messages", "options", "error"),
     [
         ({TOPIC: [message(0, names=["disc"] * 7)]}, {}, "has the joints disc, .*; PSM also needs yaw, pitch"),
-        ({TOPIC: [(ros.JointState(), 1)] * 4}, {}, "all 4 messages have header stamp 0 .* Home the arm first"),
+        ({TOPIC: [(JointState(), 1)] * 4}, {}, "all 4 messages have header stamp 0 .* Home the arm first"),
         ({TOPIC: []}, {}, f"no message within 0 s on {TOPIC} of ROS domain 0"),
         ({TOPIC: [], "/PSM2/measured_js": []}, {}, "several topics fit PSM: /PSM1/measured_js, /PSM2/measured_js"),
         ({TOPIC: []}, {"topic": "/MTML"}, r"has no JointState topic /MTML\. Topics .*: /PSM1/measured_js\."),
@@ -159,6 +159,6 @@ def test_wrong_arguments_are_refused(tmp_path, monkeypatch):
         monkeypatch.setenv("ROS_DOMAIN_ID", domain)
         with pytest.raises(DvrkDrakeError, match=f"ROS domain {domain}: allowed: 0 to 232"):
             ros.RosDomain()
-    monkeypatch.setitem(sys.modules, "dvrk_drake.processes.ros_topics", None)
+    monkeypatch.setitem(sys.modules, "dvrk_drake.systems.ros.domain", None)
     with pytest.raises(DvrkDrakeError, match=r"needs the package cyclonedds: pip install cyclonedds"):
         RosRecorder(PSM, tmp_path / "a.mcap")

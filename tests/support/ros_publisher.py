@@ -26,7 +26,8 @@ def main(domain, reliable):
     from cyclonedds.topic import Topic
 
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.ros_topics import Header, JointState, RosDomain, Time, dds_topic, ros_qos
+    from dvrk_drake.systems.ros.domain import RosDomain, dds_topic, ros_qos
+    from dvrk_drake.systems.ros.messages import Header, JointState, Time
 
     joints = list(load_arm("psm").joint_names)
     participant = RosDomain(domain).participant

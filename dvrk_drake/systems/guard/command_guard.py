@@ -188,6 +188,7 @@ class CommandGuard:
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
         #: Reason of the watchdog hold until an operator resumes. Empty if there is no watchdog hold.
         self.hold_reason = ""
+        self._driver_reason = ""
         self.refusal_code = self.ignored_code = lcmt_dvrk_status.REFUSAL_NONE
         self.counts = GuardCounts()
         self._modes = tuple(_ACTIVE) if modes is None else modes
@@ -260,10 +261,10 @@ class CommandGuard:
     def blocked_reason(self) -> str:
         """Reason why POSITION and EFFORT are refused although there is no fault, or "" if they are accepted.
 
-        The reason is `hold_reason` until an operator resumes. Otherwise, the reason is that a period of the guard was
-        too long.
+        The reason is `hold_reason` until an operator resumes. Otherwise, it is the reason that the driver passed to
+        `block`, or that a period of the guard was too long.
         """
-        return self.hold_reason or self._period.fault
+        return self.hold_reason or self._driver_reason or self._period.fault
 
     @property
     def gravity_effort(self) -> Vector:
@@ -362,6 +363,16 @@ class CommandGuard:
             self.state, self._powered = lcmt_dvrk_status.STATE_FAULT, powered
             self.fault_code, self.fault_text = code, text
         self._powered &= has_power
+
+    def block(self, reason: str) -> None:
+        """Refuses POSITION and EFFORT until the driver calls this method with "". The arm holds in the meantime.
+
+        Args:
+            reason: Reason why the driver cannot execute commands safely, or "" if it can.
+        """
+        self._driver_reason = reason
+        if reason and self._is_starting_or_in_force():
+            self._take_over(reason)
 
     def _measure(self, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> None:
         """Checks and stores a measurement. An invalid measurement leads to HOLD or FAULT."""

@@ -1,0 +1,91 @@
+"""Commands for a dVRK arm on ROS 2: bridge and deadman."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, app
+from dvrk_drake.cli.support import interrupt_ends_process, mounted, quiet_drake
+
+
+@app.command(group=HARDWARE)
+def bridge(
+    *,
+    arm: Arm,
+    topic: RosTopic = None,
+    domain: RosDomain = None,
+    model: Annotated[
+        Model | None, Parameter(help="Model with which the guard checks measurements. Default: the model of the SDF.")
+    ] = None,
+    driver: Annotated[str | None, Parameter(metavar="FILE.yaml")] = None,
+    lcm_url: LcmUrl = "",
+    key: Key = None,
+    gravity: Gravity = None,
+    realtime: Realtime = False,
+) -> None:
+    """Connect a dVRK arm on ROS 2 to LCM, with the command guard in between.
+
+    Enable and home the arm at its console first. The bridge starts a deadman process, which holds the arm if the bridge
+    is killed.
+
+    Args:
+        driver: Configuration file of the driver (docs/lcm.md). Default: the default configuration.
+    """
+    from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.processes.bridge import run_bridge
+    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.pace import make_realtime, settle_memory
+    from dvrk_drake.processes.simulated_arm import load_driver, stop_on_signals
+    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+
+    def ready() -> None:
+        if realtime:
+            for warning in make_realtime():
+                print(f"dvrk-drake: warning: {warning}", file=sys.stderr, flush=True)
+        settle_memory()
+
+    quiet_drake()
+    configuration = DvrkDriver() if driver is None else load_driver(driver)
+    configuration.key_file = key or configuration.key_file
+    configuration.model = model or configuration.model
+    with interrupt_ends_process():
+        connected = mounted(load_arm(arm), gravity)
+        url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
+        stopped = stop_on_signals()
+    print(f"connecting {connected.name} to LCM {url}; Ctrl-C ends the bridge, and the arm holds its pose", flush=True)
+    run_bridge(
+        connected,
+        configuration,
+        url,
+        topic=topic,
+        domain=domain,
+        stopped=stopped,
+        report=lambda line: print(line, flush=True),
+        ready=ready,
+    )
+    print("bridge ended; hold was published", flush=True)
+
+
+@app.command(group=HARDWARE)
+def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> None:
+    """Hold a dVRK arm on ROS 2 when its commands stop for 50 ms.
+
+    The bridge starts its own deadman process. Use this command for other programs that publish servo_jf or servo_jp, or
+    on another computer.
+    """
+    from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.processes.deadman import Deadman
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.systems.ros.open_domain import open_ros_domain
+
+    ros = open_ros_domain(domain)
+    from dvrk_drake.systems.ros.crtk_client import find_arm
+
+    namespace = find_arm(ros, load_arm(arm), topic)
+    monitor = Deadman(ros, namespace, lambda line: print(line, flush=True))
+    stopped = stop_on_signals()
+    print(f"deadman of {namespace}; Ctrl-C ends it", flush=True)
+    monitor.run(stopped)

@@ -1,0 +1,160 @@
+"""Deadman process: commands a dVRK arm to hold its pose when the commands to the arm stop.
+
+A dVRK has no time-out for commands. Without this process, the last effort acts until another command arrives. The
+process needs neither the arm's model nor LCM, so that few faults can affect it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
+
+if TYPE_CHECKING:
+    from dvrk_drake.systems.ros.domain import RosDomain
+
+#: Time without a command after which the arm is commanded to hold its pose [s].
+TIMEOUT = 0.05
+#: Time between two checks [s].
+_POLL = 0.005
+#: Longest time until the arm confirms the message `hold` [s].
+_CONFIRMATION = 1.0
+#: Longest time until a new deadman process is ready [s].
+_START = 20.0
+_READY = "ready"
+
+
+class Deadman:
+    """Publishes `hold` when an arm has received no command on servo_jf or servo_jp for 50 ms.
+
+    The process that sends commands ends them with `hold`. Without further commands, the deadman then does nothing. It
+    also does nothing while the arm is not enabled.
+    """
+
+    def __init__(self, domain: RosDomain, namespace: str, report: Callable[[str], None]) -> None:
+        """Subscribes to the commands of an arm.
+
+        Args:
+            domain: ROS domain of the arm.
+            namespace: Namespace of the topics, e.g. "/MTML".
+            report: Function that is called with one line when `hold` is published.
+        """
+        from dvrk_drake.systems.ros.messages import Empty, JointState, OperatingState
+
+        self._namespace, self._report, self._empty = namespace, report, Empty()
+        self._commands = [domain.subscribe(f"{namespace}/{name}", JointState) for name in ("servo_jf", "servo_jp")]
+        self._ends = domain.subscribe(f"{namespace}/hold", Empty)
+        self._state = domain.subscribe(f"{namespace}/operating_state", OperatingState, depth=100, latched=True)
+        self._hold = domain.advertise(f"{namespace}/hold", Empty)
+        self._last_command: float | None = None
+        self._last_published = 0
+
+    def run(self, stopped: Callable[[], bool], bridge: int | None = None) -> None:
+        """Monitors the commands until `stopped` returns true, or until the bridge process ends.
+
+        Args:
+            stopped: Function that returns whether to stop.
+            bridge: File descriptor of a pipe from the bridge process. The end of this process closes the pipe. None:
+                there is no such pipe.
+        """
+        pipes = [] if bridge is None else [bridge]
+        while not stopped():
+            ended = bool(select.select(pipes, [], [], _POLL)[0])
+            self._update(time.monotonic())
+            silence = 0.0 if self._last_command is None else time.monotonic() - self._last_command
+            if silence > TIMEOUT:
+                self._publish_hold(f"no command for {1e3 * silence:.0f} ms")
+            if ended:
+                if self._last_command is not None:
+                    self._publish_hold("the bridge has ended")
+                return
+
+    def _update(self, now: float) -> None:
+        for subscription in self._commands:
+            for _, published in subscription.take():
+                self._last_command, self._last_published = now, max(published, self._last_published)
+        holds = [published for _, published in self._ends.take()]
+        states = [state.state for state, _ in self._state.take()]
+        if (holds and max(holds) >= self._last_published) or (states and states[-1] != "ENABLED"):
+            self._last_command = None
+
+    def _publish_hold(self, reason: str) -> None:
+        self._hold.publish(self._empty)
+        self._last_command = None
+        self._report(f"deadman: {self._namespace}: {reason}; published hold at {time.time():.3f} s")
+        if not self._hold.wait_until_received(_CONFIRMATION):
+            self._report(f"deadman: {self._namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
+
+
+class DeadmanProcess:
+    """Deadman process for one bridge. It continues after `kill -9` of the bridge, and ends after it has held the arm.
+
+    Attributes:
+        pid: Identifier of the process.
+    """
+
+    def __init__(self, namespace: str, domain: int | None) -> None:
+        """Starts the process and waits until it receives commands; see `Deadman`.
+
+        Args:
+            namespace: Namespace of the topics, e.g. "/MTML".
+            domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+
+        Raises:
+            DvrkDrakeError: The process did not start.
+        """
+        command = [sys.executable, "-m", __name__, namespace, "" if domain is None else str(domain)]
+        # A session of its own, so that Ctrl-C in a terminal ends only the bridge.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, text=True
+        )
+        self.pid = self._process.pid
+        assert self._process.stdout is not None
+        started = select.select([self._process.stdout], [], [], _START)[0]
+        if not started or self._process.stdout.readline().strip() != _READY:
+            self.close()
+            raise DvrkDrakeError("the deadman process did not start. Without it, the bridge commands no arm")
+
+    def problem(self) -> str:
+        """Returns a text if the process has ended, or "" while it runs."""
+        if self._process.poll() is None:
+            return ""
+        return "the deadman process has ended. Restart the bridge"
+
+    def close(self) -> None:
+        """Ends the process."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(2 * _CONFIRMATION)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _report(line: str) -> None:
+    # The terminal of the bridge may be closed. This must not end the process.
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+
+
+def main(namespace: str, domain: str) -> None:
+    """Runs the deadman of a bridge, whose end closes the standard input."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    deadman = Deadman(open_ros_domain(int(domain) if domain else None), namespace, _report)
+    print(_READY, flush=True)
+    deadman.run(lambda: False, sys.stdin.fileno())
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

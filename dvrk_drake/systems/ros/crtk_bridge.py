@@ -1,0 +1,286 @@
+"""Bridge between the ROS 2 topics of a dVRK arm and the LCM messages of this package, with a command guard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.lcm_messages import describe_state
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_inbox import CommandInbox
+from dvrk_drake.systems.guard.follower import GuardOutput
+from dvrk_drake.systems.lcm.dvrk_command import draw_id
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
+from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
+from dvrk_drake.systems.ros.crtk_client import CrtkClient
+
+#: Lowest rate of measured_js for POSITION and EFFORT [Hz].
+MIN_RATE = 500.0
+#: Number of measurements between two checks of their rate.
+_RATE_INTERVAL = 20
+#: Time without a measurement after which the guard is stepped nevertheless [us].
+_SILENCE = 5_000
+#: Largest effort of a gravity compensation that is switched off [N m, N].
+_NO_EFFORT = 1e-9
+#: Change of a command to the separate joint that is sent, as a fraction of the effort limit or of the range of the
+#: joint. Each command to this joint can change the control mode of the arm for a moment.
+_JAW_CHANGE = 0.01
+#: Time after which a single `hold` is repeated while no joint has a valid measurement [us].
+_HOLD_PERIOD = 100_000
+
+
+class CrtkBridge:
+    """Guards the commands to one dVRK arm and publishes its status.
+
+    Commands are LCM messages (lcmt_dvrk_command), which the caller passes to `put`. The bridge steps the guard once per
+    measurement, and once more when a command that answers this measurement arrives. It publishes the output of the
+    guard on the ROS topics of the arm: efforts on `servo_jf`, positions on `servo_jp`.
+
+    The guard refuses POSITION and EFFORT, and ends them, in these cases:
+
+    - measured_js arrives at less than 500 Hz.
+    - The dVRK's own gravity compensation is on, or it cannot be verified that it is off.
+    - `blocked` returns a reason, e.g. because the deadman process has ended.
+
+    The guard changes to FAULT if the arm is not enabled and homed, or if another process could move the arm.
+
+    Attributes:
+        guard: The command guard.
+    """
+
+    def __init__(
+        self,
+        client: CrtkClient,
+        driver: DvrkDriver,
+        send_status: Callable[[bytes], None],
+        *,
+        report: Callable[[str], None] = lambda line: None,
+        blocked: Callable[[], str] = lambda: "",
+        model: IdentifiedModel | None = None,
+    ) -> None:
+        """Creates a bridge. The arm holds its pose from the first call of `update` on.
+
+        Args:
+            client: Client of the arm.
+            driver: Configuration with the settings and the model of the guard, the accepted modes and the key.
+            send_status: Function that sends an encoded status (lcmt_dvrk_status).
+            report: Function that is called with one line for each change of the state.
+            blocked: Function that returns a reason to refuse POSITION and EFFORT, or "". It is called once per step.
+            model: Model of the guard if the driver has none. None: the model of the arm's SDF.
+
+        Raises:
+            ModelError: The driver's model cannot be read, or is not valid for this arm.
+            KeyFileError: The driver's key cannot be used.
+        """
+        arm = client.arm
+        self._client, self._send, self._report, self._blocked = client, send_status, report, blocked
+        self._key = driver.load_key()
+        self._clock = ArrivalClock()
+        checked = driver.load_model(arm) or model or IdentifiedModel.from_arm(arm)
+        self.guard = CommandGuard(
+            arm, draw_id(), ControlModel(checked), driver.guard, driver.accepted_modes(), self._clock.now
+        )
+        self._inbox = CommandInbox(self.guard, self._key)
+        self._has_commands = self._answered = False
+        self._status = lcmt_dvrk_status()
+        self._status.arm_name, self._status.num_joints = arm.name, arm.num_joints
+        self._measured_utime, self._last_step = 0, 0
+        self._nan = np.full(arm.num_joints, np.nan)
+        self._measured = (self._nan, self._nan, self._nan)
+        self._separate = arm.joint_names.index(arm.separate_joint) if arm.separate_joint else None
+        range_ = arm.position_upper - arm.position_lower
+        self._jaw_tolerance = {"servo_jf": _JAW_CHANGE * arm.effort_limits, "servo_jp": _JAW_CHANGE * range_}
+        self._jaw_sent: tuple[str, float] = ("", 0.0)
+        self._was_ready = False
+        self._num_measured, self._rate_problem = 0, ""
+        self._num_changes, self._other_publishers = -1, ""
+        self._problem = self._described = ""
+        self._last_hold = 0
+        self._rate_problem = self._check_rate()
+
+    def put(self, data: bytes) -> None:
+        """Stores an LCM message of the command channel for the next `update`."""
+        self._inbox.put(data)
+        self._has_commands = True
+
+    def update(self) -> None:
+        """Receives measurements, steps the guard if something has arrived, and publishes its output.
+
+        Call this method when a message has arrived, and at least every 5 ms.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send a command to the arm.
+        """
+        is_new = self._client.receive()
+        now = self._clock.now()
+        is_answer = not is_new and self._has_commands and not self._answered
+        if is_new:
+            self._measure(now)
+        elif not is_answer and now < self._last_step + _SILENCE:
+            return
+        self._answered = is_answer
+        if self._has_commands:
+            self._inbox.deliver(self.guard, now)
+            self._has_commands = False
+        self._step(now, with_status=not is_answer)
+
+    def close(self) -> None:
+        """Commands the arm to hold its present pose."""
+        self._client.hold()
+        self._client.wait_until_received(1.0)
+
+    def _measure(self, now: int) -> None:
+        """Checks the time stamp of the last measurement and stores the measurement for the guard."""
+        measurement = self._client.measurement
+        assert measurement is not None
+        problem = measurement.problem
+        self._num_measured += 1
+        if self._num_measured % _RATE_INTERVAL == 0:
+            self._rate_problem = self._check_rate()
+        if measurement.stamp:
+            self._measured_utime, jump = self._clock.convert(measurement.stamp, measurement.arrival)
+            problem = problem or (jump and f"{self._client.namespace}/measured_js: {jump}")
+        else:
+            self._measured_utime = now
+        if problem and problem != self._problem:
+            self._report(problem)
+        self._problem = problem
+        is_valid = not problem
+        self._measured = (measurement.q, measurement.v, measurement.effort) if is_valid else (self._nan,) * 3
+
+    def _step(self, now: int, *, with_status: bool) -> None:
+        guard, client = self.guard, self._client
+        not_ready = client.not_ready_reason
+        if not_ready:
+            guard.report_fault(f"{client.namespace}: {not_ready}", has_power=False)
+        elif not self._was_ready:
+            self._switch_gravity_compensation_off()
+        self._was_ready = not not_ready
+        if others := self._others():
+            guard.report_fault(others)
+        guard.block(self._block_reason())
+        output = guard.step(now, self._measured_utime, *self._measured)
+        self._last_step = now
+        if with_status:
+            self._send_status(output)
+        if self._was_ready:
+            self._publish(output, now)
+        self._describe()
+
+    def _publish(self, output: GuardOutput, now: int) -> None:
+        """Publishes the output of the guard on the topics of the arm."""
+        client = self._client
+        if np.all(output.joint_flags & lcmt_dvrk_status.FLAG_IMPLAUSIBLE):
+            # The arm measures its joints itself, so it can still hold its pose.
+            if now >= self._last_hold + _HOLD_PERIOD:
+                client.hold()
+                self._last_hold = now
+        elif output.control_mode == lcmt_dvrk_command.EFFORT:
+            self._send_jaw("servo_jf", output.effort)
+            client.servo_jf(output.effort)
+        elif output.control_mode != lcmt_dvrk_command.OFF:
+            self._send_jaw("servo_jp", output.position)
+            client.servo_jp(output.position, output.velocity)
+        elif self.guard.state == lcmt_dvrk_status.STATE_OFF:
+            client.state_command("disable")
+
+    def _send_jaw(self, name: str, values: NDArray[np.float64]) -> None:
+        """Commands the separate joint, if the command has changed. Call this method before the command to the arm."""
+        if self._separate is None:
+            return
+        value = float(values[self._separate])
+        if self._jaw_sent[0] == name and abs(value - self._jaw_sent[1]) <= self._jaw_tolerance[name][self._separate]:
+            return
+        self._client.servo_separate(name, value)
+        self._jaw_sent = (name, value)
+
+    def _send_status(self, output: GuardOutput) -> None:
+        """Sends the status of the last measurement. Without new measurements, it is repeated with the same utime."""
+        status = self._status
+        q, v, effort = self._measured
+        acts = output.control_mode == lcmt_dvrk_command.EFFORT and self._was_ready
+        status.utime, status.sequence = self._measured_utime, status.sequence + 1
+        status.position, status.velocity, status.effort_measured = q.tolist(), v.tolist(), effort.tolist()
+        status.effort_commanded = (output.effort if acts else effort).tolist()
+        status.gravity_compensation = (self._client.gravity_compensation or 0.0) > _NO_EFFORT
+        fill_in_guard(status, self.guard)
+        data = status.encode()
+        self._send(data if self._key is None else self._key.sign(data))
+
+    def _switch_gravity_compensation_off(self) -> None:
+        self._client.gravity_compensation = None
+        self._client.use_gravity_compensation(False)
+        self._jaw_sent = ("", 0.0)
+        self._report(f"{self._client.namespace}: switched off the dVRK's own gravity compensation")
+
+    def _block_reason(self) -> str:
+        """Returns the reason to refuse POSITION and EFFORT, or ""."""
+        client = self._client
+        if reason := self._blocked() or self._rate_problem:
+            return reason
+        if not client.arm.console_gravity_compensation:
+            return ""
+        topic = f"{client.namespace}/gravity_compensation/setpoint_js"
+        if client.gravity_compensation is None:
+            return f"no valid message on {topic}, so the dVRK's own gravity compensation may be on"
+        if client.gravity_compensation > _NO_EFFORT:
+            return (
+                f"the dVRK's own gravity compensation is on: {topic} has {client.gravity_compensation:.3g} N m. Switch "
+                "it off at the console"
+            )
+        return ""
+
+    def _check_rate(self) -> str:
+        """Returns the reason why the rate of the measurements is not sufficient, or ""."""
+        rate, topic = self._clock.rate, f"{self._client.namespace}/measured_js"
+        if rate is None:
+            return f"the rate of {topic} is not known yet"
+        if rate >= MIN_RATE:
+            return ""
+        # The text must not change with every measurement.
+        return (self._rate_problem if "Hz" in self._rate_problem else "") or (
+            f"{topic} arrives at {rate:.0f} Hz; commands need {MIN_RATE:.0f} Hz. Start the dVRK's console with a "
+            "period of 1 ms: dvrk_system -j FILE.json -p 0.001"
+        )
+
+    def _others(self) -> str:
+        """Returns a text about other processes that could move the arm, or ""."""
+        if self._client.num_changes != self._num_changes:
+            self._num_changes = self._client.num_changes
+            self._other_publishers = ", ".join(self._client.other_publishers())
+        return f"another process publishes {self._other_publishers}. End it" if self._other_publishers else ""
+
+    def _describe(self) -> None:
+        """Reports a change of the state of the guard."""
+        guard = self.guard
+        sender = f", sender {guard.sender_id}" if guard.sender_id else ""
+        text = describe_state(guard.state, guard.fault_text or guard.blocked_reason) + sender
+        if text != self._described:
+            self._report(text)
+            self._described = text
+
+
+def refuse_other_publishers(client: CrtkClient, wait: Callable[[Callable[[], bool], float], bool]) -> None:
+    """Waits until no other process publishes commands to the arm.
+
+    A killed process is known to DDS for about a second.
+
+    Args:
+        client: Client of the arm.
+        wait: `RosDomain.wait_until`.
+
+    Raises:
+        DvrkDrakeError: Another process could move the arm.
+    """
+    if not wait(lambda: not client.other_publishers(), 3.0):
+        topics = ", ".join(client.other_publishers())
+        raise DvrkDrakeError(
+            f"another process publishes {topics}. Only one process may command an arm: end the other one, e.g. "
+            "another bridge, teleoperation or a script"
+        )

@@ -1,0 +1,352 @@
+"""ROS 2 domain over Cyclone DDS, without an installation of ROS.
+
+DDS (Data Distribution Service) is the middleware of ROS 2. The ROS 2 topic `/<ARM>/measured_js` is the DDS topic
+`rt/<ARM>/measured_js` (https://design.ros2.org/articles/topic_and_service_names.html).
+"""
+
+import contextlib
+import os
+import select
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    Listener,
+    Policy,
+    Qos,
+    ReadCondition,
+    SampleState,
+    ViewState,
+)
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.systems.ros.messages import JointState, dds_type_name, ros_type_name, type_hash
+
+Message = TypeVar("Message", bound=IdlStruct)
+
+#: Largest domain whose default UDP ports exist.
+MAX_DOMAIN = 232
+#: Time that a reliable writer waits for a slow reader [ms], as in the dVRK's ROS interface.
+_MAX_BLOCKING = 100
+#: Beginning of the DDS names of ROS 2 topics.
+_PREFIX = "rt"
+#: Number of messages that a latched topic keeps for subscribers that join later, as in the dVRK's ROS interface.
+_LATCHED = 100
+#: Time after which other processes consider a killed process as ended [s]. Cyclone DDS uses 10 s by default.
+_LEASE = 1
+_CONFIG = "CYCLONEDDS_URI"
+#: Largest number of discovered endpoints.
+_MAX_ENDPOINTS = 10_000
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """Publisher or subscription of a topic, in any process of the domain.
+
+    Attributes:
+        topic: ROS 2 name of the topic.
+        type_name: ROS 2 name of the message type.
+        reliable: Whether lost messages are sent again.
+        latched: Whether subscriptions that join later receive earlier messages.
+        type_hash: Announced type hash, or "" if there is none.
+        is_own: Whether the endpoint belongs to this participant.
+    """
+
+    topic: str
+    type_name: str
+    reliable: bool
+    latched: bool
+    type_hash: str
+    is_own: bool
+
+
+def dds_topic(topic: str) -> str:
+    """Returns the DDS name of a ROS 2 topic, e.g. "rt/PSM1/measured_js" for "/PSM1/measured_js"."""
+    return f"{_PREFIX}/{topic.removeprefix('/')}"
+
+
+def ros_qos(depth: int, *, reliable: bool = True, latched: bool = False, type_hash: str = "") -> Qos:
+    """Returns the quality of service of the dVRK's topics: by default reliable and volatile.
+
+    Args:
+        depth: Number of messages that a publisher or a subscription keeps.
+        reliable: Whether lost messages are sent again.
+        latched: Whether subscriptions that join later receive earlier messages.
+        type_hash: Type hash to announce. "": no type hash is announced.
+    """
+    reliability = Policy.Reliability.Reliable(duration(milliseconds=_MAX_BLOCKING))
+    policies = [
+        reliability if reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(depth),
+    ]
+    if type_hash:
+        policies.append(Policy.Userdata(f"typehash={type_hash};".encode()))
+    return Qos(*policies)
+
+
+class RosDomain:
+    """DDS participant of a ROS 2 domain.
+
+    Attributes:
+        name: Name of the domain, for messages, e.g. "ROS domain 0".
+        participant: DDS participant.
+        num_changes: Number of times that publishers of the domain appeared or ended.
+    """
+
+    def __init__(self, domain: int | None = None) -> None:
+        """Joins a domain.
+
+        Args:
+            domain: Number of the domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+
+        Raises:
+            DvrkDrakeError: The number is not valid, or the network of the domain cannot be used.
+        """
+        text = os.environ.get("ROS_DOMAIN_ID", "") or "0" if domain is None else str(domain)
+        if not text.isdecimal() or int(text) > MAX_DOMAIN:
+            raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
+        self.name, self.num_changes = f"ROS domain {text}", 0
+        self._listener = Listener(on_data_available=self._count_change)
+        try:
+            self.participant = _participant(int(text))
+            self._publications = BuiltinDataReader(
+                self.participant, BuiltinTopicDcpsPublication, listener=self._listener
+            )
+            self._subscriptions = BuiltinDataReader(self.participant, BuiltinTopicDcpsSubscription)
+        except DDSException as error:
+            raise DvrkDrakeError(f"{self.name} cannot be used: {error}. Check the network and {_CONFIG}") from error
+        self._alive = {
+            reader: ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Alive)
+            for reader in (self._publications, self._subscriptions)
+        }
+        # Cyclone DDS has no file descriptor for arriving messages. Its listeners write to this pipe.
+        self._readable, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+
+    def close(self) -> None:
+        """Leaves the domain. Publishers and subscriptions of this domain must not be used any more."""
+        self.participant = self._publications = self._subscriptions = None
+        self._alive = {}
+
+    def publishers(self) -> list[Endpoint]:
+        """Returns the ROS 2 publishers discovered so far."""
+        return self._endpoints(self._publications)
+
+    def subscribers(self) -> list[Endpoint]:
+        """Returns the ROS 2 subscriptions discovered so far."""
+        return self._endpoints(self._subscriptions)
+
+    def joint_state_topics(self) -> dict[str, bool]:
+        """Returns a mapping from each discovered JointState topic to whether all its publishers are reliable."""
+        reliable: dict[str, bool] = {}
+        for endpoint in self.publishers():
+            if endpoint.type_name == ros_type_name(dds_type_name(JointState)):
+                reliable[endpoint.topic] = endpoint.reliable and reliable.get(endpoint.topic, True)
+        return dict(sorted(reliable.items()))
+
+    def advertise(
+        self, topic: str, message_type: type[Message], *, depth: int = 5, latched: bool = False
+    ) -> "Publisher[Message]":
+        """Creates a publisher of a topic.
+
+        Args:
+            topic: ROS 2 name of the topic.
+            message_type: Type of the messages.
+            depth: Number of messages that are kept for slow subscriptions.
+            latched: Whether subscriptions that join later receive the last 100 messages.
+        """
+        return Publisher(self.participant, topic, message_type, _LATCHED if latched else depth, latched)
+
+    def subscribe(
+        self,
+        topic: str,
+        message_type: type[Message],
+        *,
+        depth: int = 1,
+        reliable: bool = True,
+        latched: bool = False,
+    ) -> "Subscription[Message]":
+        """Subscribes to a topic.
+
+        Args:
+            topic: ROS 2 name of the topic.
+            message_type: Type of the messages.
+            depth: Number of messages that may arrive between two calls of `take`. Older messages are lost.
+            reliable: Whether lost messages are sent again. Must be False if a publisher is best-effort.
+            latched: Whether earlier messages of a latched topic are received.
+        """
+        qos = ros_qos(depth, reliable=reliable, latched=latched, type_hash=type_hash(message_type))
+        return Subscription(self.participant, topic, message_type, qos, self._notify)
+
+    def fileno(self) -> int:
+        """Returns a file descriptor that is readable after a message of a subscription has arrived."""
+        return self._readable
+
+    def clear(self) -> None:
+        """Makes the file descriptor unreadable until the next message arrives. Call this method before `take`."""
+        try:
+            while os.read(self._readable, 4096):
+                pass
+        except BlockingIOError:
+            pass
+
+    def wait(self, seconds: float) -> bool:
+        """Waits until a message of a subscription arrives, at most `seconds`. Returns whether one arrived."""
+        ready = bool(select.select([self._readable], [], [], max(seconds, 0.0))[0])
+        if ready:
+            self.clear()
+        return ready
+
+    def wait_until(self, condition: Callable[[], bool], seconds: float, poll: float = 0.02) -> bool:
+        """Waits until a condition is true, at most `seconds`. Returns whether it is true.
+
+        Args:
+            condition: Condition, checked after each message and every `poll` seconds.
+            seconds: Longest time to wait [s].
+            poll: Longest time between two checks [s].
+        """
+        end = time.monotonic() + seconds
+        while not (met := condition()) and (left := end - time.monotonic()) > 0:
+            self.wait(min(poll, left))
+        return met
+
+    def _notify(self, reader: DataReader) -> None:
+        # Cyclone DDS calls this function in a thread of its own. A full pipe already wakes up the reader.
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._wake, b"\0")
+
+    def _count_change(self, reader: DataReader) -> None:
+        # Cyclone DDS calls this function in a thread of its own.
+        self.num_changes += 1
+
+    def _endpoints(self, reader: BuiltinDataReader) -> list[Endpoint]:
+        found = []
+        for sample in reader.read(_MAX_ENDPOINTS, condition=self._alive[reader]):
+            topic = getattr(sample, "topic_name", "")
+            if not topic.startswith(f"{_PREFIX}/"):
+                continue
+            data = sample.qos[Policy.Userdata] if Policy.Userdata in sample.qos else None  # noqa: SIM401, Qos has no get
+            text = b"" if data is None else bytes(data.data)
+            found.append(
+                Endpoint(
+                    topic=topic.removeprefix(_PREFIX),
+                    type_name=ros_type_name(sample.type_name),
+                    reliable=isinstance(sample.qos[Policy.Reliability], Policy.Reliability.Reliable),
+                    latched=sample.qos[Policy.Durability] == Policy.Durability.TransientLocal,
+                    type_hash=text.decode(errors="replace").partition("typehash=")[2].partition(";")[0],
+                    is_own=sample.participant_key == self.participant.guid,
+                )
+            )
+        return found
+
+
+def _participant(domain: int) -> DomainParticipant:
+    """Joins a domain with a short lease, so that other processes soon detect the end of a killed process."""
+    configured = os.environ.get(_CONFIG)
+    lease = f"<CycloneDDS><Domain><Discovery><LeaseDuration>{_LEASE}s</LeaseDuration></Discovery></Domain></CycloneDDS>"
+    # A list of configurations is separated by commas. A later entry takes precedence over an earlier one.
+    os.environ[_CONFIG] = f"{lease},{configured}" if configured else lease
+    try:
+        return DomainParticipant(domain)
+    finally:
+        if configured is None:
+            del os.environ[_CONFIG]
+        else:
+            os.environ[_CONFIG] = configured
+
+
+class Publisher(Generic[Message]):
+    """Publisher of one topic.
+
+    Attributes:
+        topic: ROS 2 name of the topic.
+    """
+
+    def __init__(
+        self, participant: DomainParticipant, topic: str, message_type: type[Message], depth: int, latched: bool
+    ) -> None:
+        """Creates a publisher, see `RosDomain.advertise`."""
+        self.topic = topic
+        qos = ros_qos(depth, latched=latched, type_hash=type_hash(message_type))
+        self._writer = DataWriter(participant, Topic(participant, dds_topic(topic), message_type), qos=qos)
+
+    def publish(self, message: Message) -> None:
+        """Publishes a message.
+
+        Raises:
+            DvrkDrakeError: DDS could not send the message, e.g. because a subscription does not acknowledge messages.
+        """
+        try:
+            self._writer.write(message)
+        except DDSException as error:
+            raise DvrkDrakeError(f"{self.topic}: the message could not be sent: {error}") from error
+
+    def num_subscribers(self) -> int:
+        """Returns the number of subscriptions that receive the messages."""
+        return len(self._writer.get_matched_subscriptions())
+
+    def wait_until_received(self, seconds: float) -> bool:
+        """Waits until all subscriptions have confirmed all messages, at most `seconds`. Returns whether they have."""
+        return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+
+
+class Subscription(Generic[Message]):
+    """Messages of one topic.
+
+    Attributes:
+        topic: ROS 2 name of the topic.
+        num_lost: Number of messages that DDS reported as lost.
+        num_malformed: Number of messages that are not of the type of this topic.
+    """
+
+    def __init__(
+        self,
+        participant: DomainParticipant,
+        topic: str,
+        message_type: type[Message],
+        qos: Qos,
+        notify: Callable[[DataReader], None],
+    ) -> None:
+        """Subscribes to a topic, see `RosDomain.subscribe`."""
+        self.topic, self.num_lost, self.num_malformed = topic, 0, 0
+        self._message_type = message_type
+        self._listener = Listener(on_sample_lost=self._count_lost, on_data_available=notify)
+        self._reader = DataReader(
+            participant, Topic(participant, dds_topic(topic), message_type), qos=qos, listener=self._listener
+        )
+
+    def take(self) -> list[tuple[Message, int]]:
+        """Returns the messages since the last call, with their times of publication [ns since 1970]."""
+        messages: list[tuple[Message, int]] = []
+        while True:
+            try:
+                samples = self._reader.take(1)
+            except DDSException:
+                raise
+            except Exception:  # the decoder raises exceptions of many types for a malformed message
+                self.num_malformed += 1
+                continue
+            if not samples:
+                return messages
+            sample = samples[0]
+            if isinstance(sample, self._message_type):
+                messages.append((sample, sample.sample_info.source_timestamp))
+
+    def num_publishers(self) -> int:
+        """Returns the number of publishers whose messages are received."""
+        return len(self._reader.get_matched_publications())
+
+    def _count_lost(self, reader: DataReader, status: Any) -> None:
+        # Cyclone DDS calls this function in a thread of its own.
+        self.num_lost = status.total_count
