@@ -21,7 +21,7 @@ ONE_PYTHON = (
     *("recordings/test_recording", "recordings/test_conversion", "recordings/test_public_recordings_document"),
     *("recordings/test_array_file", "recordings/test_csv_without_header", "recordings/test_cisst_collector"),
     *("recordings/test_reading", "recordings/test_ros_bag", "recordings/test_samples"),
-    *("export/test_dvrk_mtm_gravity_compensation", "export/test_dvrk_psm_gravity_compensation"),
+    "export/test_dvrk_",
     "dynamics/test_nearest_links",
     "systems/guard/",
     *("analysis/check/", "analysis/dynamic/", "analysis/payload/", "analysis/test_recalibration", "analysis/signals/"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from command_output import refusal
 from dvrk_judge import judge
 
 from dvrk_drake.cli import main
@@ -11,6 +12,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     CompensationOptions,
     compensation_from_model,
     compensation_loss,
+    dry_friction,
 )
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
@@ -71,7 +73,7 @@ def identified(shared_data, folder, recording, arm, *options):
     return IdentifiedModel.load(path)
 
 
-RECORDINGS = [("mtm_static/mtm_2015_good72.csv", "mtml"), ("mtm_static/mtmr_2017_sweep40.csv", "mtmr")]
+RECORDINGS = [("mtm_static/mtm_2015_good72.csv", "mtmr"), ("mtm_static/mtmr_2017_sweep40.csv", "mtmr")]
 
 
 @pytest.mark.parametrize("source", ["mtml", "mtmr", *RECORDINGS])
@@ -111,6 +113,29 @@ def test_command_exports_within_the_tolerance_at_the_first_try(source, shared_da
     poses = judge(shared_data, "judge", path, np.hstack([loss.poses, 0 * loss.poses]))
     stated = np.abs(poses - model.holding_torque(loss.poses)).diagonal()
     np.testing.assert_allclose(stated, loss.difference, rtol=0, atol=1e-12)
+
+
+def test_tilted_arm_is_refused_or_approximated(shared_data, tmp_path, capsys):
+    """The model is identified from a motion, and the file compensates its friction."""
+    model = identified(shared_data, tmp_path, "trajectories/mtm_one.csv", "mtmr", "--coordinates", "wpi")
+    path = tmp_path / "gc.json"
+    arguments = ["export", "--model", str(tmp_path / "model.yaml"), "--dvrk-gc", str(path), "--friction"]
+    capsys.readouterr()
+    assert main(arguments) == 2
+    error = refusal(capsys.readouterr().err)
+    assert "wrist_pitch 0.014 N m" in error and "base tilt of 3.0 deg" in error and not path.exists()
+    assert main([*arguments, *error.split("repeat the command with ")[1].split()]) == 0
+    loss = compensation_loss(GravityCompensationFile.load(path), model)
+    q = model.arm.sample_poses(600, np.random.default_rng(21))
+    limits = model.arm.effort_limits
+    at_rest = judge(shared_data, "judge", path, np.hstack([q, 0 * q]))
+    difference = np.abs(at_rest - np.clip(model.holding_torque(q), -limits, limits)).max(axis=0)
+    assert np.all(difference <= SAMPLING * loss.difference) and difference[3] > 0.5 * loss.difference[3]
+    # At full speed, the file adds the stated share of the friction.
+    q = q[np.all(np.abs(at_rest) < 0.5 * limits, axis=1)]
+    up, down = (judge(shared_data, "judge", path, np.hstack([q, np.full_like(q, v)])) for v in (1.0, -1.0))
+    friction = np.array(CompensationOptions().friction_ratio) * dry_friction(model)
+    np.testing.assert_allclose((up - down)[:, :4] / 2, np.tile(friction[:4], (len(q), 1)), rtol=0, atol=1e-12)
 
 
 def test_torques_of_any_file_equal_those_of_the_controller(shared_data, tmp_path):
