@@ -54,19 +54,21 @@ def run_bridge(
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         stopped: Function that returns whether to stop.
         report: Function that is called with one line for each change of the state.
-        ready: Function that is called before the first command to the arm, e.g. to request real-time scheduling.
+        ready: Function that is called before the networks are opened, e.g. to request real-time scheduling. The threads
+            of the networks and the deadman process inherit the scheduling.
 
     Raises:
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
+    _compile(arm, driver)
+    ready()
     ros = open_ros_domain(domain)
     from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, refuse_other_publishers
     from dvrk_drake.systems.ros.crtk_client import CrtkClient, find_arm
 
-    _compile(arm, driver)
     namespace = find_arm(ros, arm, topic)
+    refuse_other_publishers(ros, arm, namespace)
     client = CrtkClient(ros, arm, namespace)
-    refuse_other_publishers(client, ros.wait_until)
     _wait_for_arm(ros, client)
     with closing(DeadmanProcess(namespace, domain)) as deadman:
         report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
@@ -79,7 +81,6 @@ def run_bridge(
             blocked=deadman.problem,
         )
         network.subscribe(command_channel(arm), lambda channel, data: bridge.put(data)).set_queue_capacity(_QUEUE)
-        ready()
         try:
             while not stopped():
                 select.select([ros.fileno(), network.fileno()], [], [], _POLL)

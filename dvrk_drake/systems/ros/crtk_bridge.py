@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
@@ -18,10 +19,13 @@ from dvrk_drake.systems.lcm.dvrk_command import draw_id
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
-from dvrk_drake.systems.ros.crtk_client import CrtkClient
+from dvrk_drake.systems.ros.crtk_client import CrtkClient, other_publishers
+from dvrk_drake.systems.ros.domain import RosDomain
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0
+#: Accepted error of the measured rate, as a fraction.
+_RATE_TOLERANCE = 0.05
 #: Number of measurements between two checks of their rate.
 _RATE_INTERVAL = 20
 #: Time without a measurement after which the guard is stepped nevertheless [us].
@@ -33,6 +37,11 @@ _NO_EFFORT = 1e-9
 _JAW_CHANGE = 0.01
 #: Time after which a single `hold` is repeated while no joint has a valid measurement [us].
 _HOLD_PERIOD = 100_000
+#: Time until the publishers of other processes are discovered [s]. Time until the publishers of a killed process end
+#: [s].
+_DISCOVERY, _ENDED = 1.0, 3.0
+#: Shortest time between two reports of problems with measured_js [us].
+_REPORT_PERIOD = 1_000_000
 
 
 class CrtkBridge:
@@ -101,7 +110,7 @@ class CrtkBridge:
         self._num_measured, self._rate_problem = 0, ""
         self._num_changes, self._other_publishers = -1, ""
         self._problem = self._described = ""
-        self._last_hold = 0
+        self._last_hold = self._last_report = 0
         self._rate_problem = self._check_rate()
 
     def put(self, data: bytes) -> None:
@@ -148,9 +157,11 @@ class CrtkBridge:
             problem = problem or (jump and f"{self._client.namespace}/measured_js: {jump}")
         else:
             self._measured_utime = now
-        if problem and problem != self._problem:
+        if problem and problem != self._problem and now >= self._last_report + _REPORT_PERIOD:
             self._report(problem)
-        self._problem = problem
+            self._problem, self._last_report = problem, now
+        elif not problem:
+            self._problem = ""
         is_valid = not problem
         self._measured = (measurement.q, measurement.v, measurement.effort) if is_valid else (self._nan,) * 3
 
@@ -176,12 +187,15 @@ class CrtkBridge:
     def _publish(self, output: GuardOutput, now: int) -> None:
         """Publishes the output of the guard on the topics of the arm."""
         client = self._client
-        if np.all(output.joint_flags & lcmt_dvrk_status.FLAG_IMPLAUSIBLE):
-            # The arm measures its joints itself, so it can still hold its pose.
+        is_effort = output.control_mode == lcmt_dvrk_command.EFFORT
+        all_implausible = np.all(output.joint_flags & lcmt_dvrk_status.FLAG_IMPLAUSIBLE)
+        if all_implausible or (is_effort and self._block_reason()):
+            # The arm measures its joints itself, so it can still hold its pose. After a measurement fault, the guard
+            # commands efforts, which are not safe for example with the gravity compensation of the dVRK.
             if now >= self._last_hold + _HOLD_PERIOD:
                 client.hold()
                 self._last_hold = now
-        elif output.control_mode == lcmt_dvrk_command.EFFORT:
+        elif is_effort:
             self._send_jaw("servo_jf", output.effort)
             client.servo_jf(output.effort)
         elif output.control_mode != lcmt_dvrk_command.OFF:
@@ -230,10 +244,8 @@ class CrtkBridge:
         if client.gravity_compensation is None:
             return f"no valid message on {topic}, so the dVRK's own gravity compensation may be on"
         if client.gravity_compensation > _NO_EFFORT:
-            return (
-                f"the dVRK's own gravity compensation is on: {topic} has {client.gravity_compensation:.3g} N m. Switch "
-                "it off at the console"
-            )
+            # The text must not change with every message.
+            return f"the dVRK's own gravity compensation is on: {topic} is not zero. Switch it off at the console"
         return ""
 
     def _check_rate(self) -> str:
@@ -241,7 +253,7 @@ class CrtkBridge:
         rate, topic = self._clock.rate, f"{self._client.namespace}/measured_js"
         if rate is None:
             return f"the rate of {topic} is not known yet"
-        if rate >= MIN_RATE:
+        if rate >= (1.0 - _RATE_TOLERANCE) * MIN_RATE:
             return ""
         # The text must not change with every measurement.
         return (self._rate_problem if "Hz" in self._rate_problem else "") or (
@@ -266,20 +278,23 @@ class CrtkBridge:
             self._described = text
 
 
-def refuse_other_publishers(client: CrtkClient, wait: Callable[[Callable[[], bool], float], bool]) -> None:
-    """Waits until no other process publishes commands to the arm.
+def refuse_other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> None:
+    """Waits until no other process publishes commands to an arm.
 
-    A killed process is known to DDS for about a second.
+    Call this function before the creation of a `CrtkClient`. Its publishers would stop a bridge that already runs. A
+    killed process is known to DDS for about a second.
 
     Args:
-        client: Client of the arm.
-        wait: `RosDomain.wait_until`.
+        domain: ROS domain of the arm.
+        arm: Arm.
+        namespace: Namespace of the topics, e.g. "/MTML".
 
     Raises:
         DvrkDrakeError: Another process could move the arm.
     """
-    if not wait(lambda: not client.other_publishers(), 3.0):
-        topics = ", ".join(client.other_publishers())
+    domain.wait_until(lambda: False, _DISCOVERY)
+    if not domain.wait_until(lambda: not other_publishers(domain, arm, namespace), _ENDED):
+        topics = ", ".join(other_publishers(domain, arm, namespace))
         raise DvrkDrakeError(
             f"another process publishes {topics}. Only one process may command an arm: end the other one, e.g. "
             "another bridge, teleoperation or a script"
