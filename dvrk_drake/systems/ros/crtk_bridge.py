@@ -37,9 +37,8 @@ _NO_EFFORT = 1e-9
 _JAW_CHANGE = 0.01
 #: Time after which a single `hold` is repeated while no joint has a valid measurement [us].
 _HOLD_PERIOD = 100_000
-#: Time until the publishers of other processes are discovered [s]. Time until the publishers of a killed process end
-#: [s].
-_DISCOVERY, _ENDED = 1.0, 3.0
+#: Longest time until the publishers of a killed process end [s].
+_ENDED = 3.0
 #: Shortest time between two reports of problems with measured_js [us].
 _REPORT_PERIOD = 1_000_000
 
@@ -281,8 +280,8 @@ class CrtkBridge:
 def refuse_other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> None:
     """Waits until no other process publishes commands to an arm.
 
-    Call this function before the creation of a `CrtkClient`. Its publishers would stop a bridge that already runs. A
-    killed process is known to DDS for about a second.
+    Call this function after `find_arm` and before the creation of a `CrtkClient`. The publishers of a client would stop
+    a bridge that already runs. A killed process is known to DDS for about a second.
 
     Args:
         domain: ROS domain of the arm.
@@ -292,7 +291,6 @@ def refuse_other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> None
     Raises:
         DvrkDrakeError: Another process could move the arm.
     """
-    domain.wait_until(lambda: False, _DISCOVERY)
     if not domain.wait_until(lambda: not other_publishers(domain, arm, namespace), _ENDED):
         topics = ", ".join(other_publishers(domain, arm, namespace))
         raise DvrkDrakeError(

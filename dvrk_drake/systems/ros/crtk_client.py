@@ -17,7 +17,8 @@ from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
 from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
 
-#: Longest time to wait for the topics of an arm [s]. Time to wait for other fitting topics after the first one [s].
+#: Longest time to wait for the topics of an arm [s]. Time to wait for other topics of the domain after the first one
+#: [s].
 _DISCOVERY, _OTHERS = 10.0, 1.0
 #: Topics with which a client moves an arm. A second publisher on one of them could move the arm at the same time.
 MOTION_TOPICS = (
@@ -343,6 +344,6 @@ def find_arm(domain: RosDomain, arm: Arm, topic: str | None = None, seconds: flo
         RecordingError: No topic or several topics fit. The message lists the topics of the domain.
     """
     domain.wait_until(lambda: bool(fitting_topics(arm, topic, domain.joint_state_topics())), seconds)
-    domain.wait_until(lambda: topic is not None, min(_OTHERS, seconds))
+    domain.wait_until(lambda: False, min(_OTHERS, seconds))
     topics = {name: name for name in domain.joint_state_topics()}
     return choose_topic(domain.name, arm, topic, topics).rpartition("/")[0]
