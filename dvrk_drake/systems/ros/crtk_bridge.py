@@ -35,8 +35,8 @@ _NO_EFFORT = 1e-9
 #: Change of a command to the separate joint that is sent, as a fraction of the effort limit or of the range of the
 #: joint. Each command to this joint can change the control mode of the arm for a moment.
 _JAW_CHANGE = 0.01
-#: Time after which a single `hold` is repeated while no joint has a valid measurement [us].
-_HOLD_PERIOD = 100_000
+#: Time after which `hold` is repeated while no joint has a valid measurement, or `disable` in the state OFF [us].
+_REPEAT = 100_000
 #: Longest time until the publishers of a killed process end [s].
 _ENDED = 3.0
 #: Shortest time between two reports of problems with measured_js [us].
@@ -109,7 +109,7 @@ class CrtkBridge:
         self._num_measured, self._rate_problem = 0, ""
         self._num_changes, self._other_publishers = -1, ""
         self._problem = self._described = ""
-        self._last_hold = self._last_report = 0
+        self._last_sent = self._last_report = 0
         self._rate_problem = self._check_rate()
 
     def put(self, data: bytes) -> None:
@@ -191,17 +191,18 @@ class CrtkBridge:
         if all_implausible or (is_effort and self._block_reason()):
             # The arm measures its joints itself, so it can still hold its pose. After a measurement fault, the guard
             # commands efforts, which are not safe for example with the gravity compensation of the dVRK.
-            if now >= self._last_hold + _HOLD_PERIOD:
+            if now >= self._last_sent + _REPEAT:
                 client.hold()
-                self._last_hold = now
+                self._last_sent = now
         elif is_effort:
             self._send_jaw("servo_jf", output.effort)
             client.servo_jf(output.effort)
         elif output.control_mode != lcmt_dvrk_command.OFF:
             self._send_jaw("servo_jp", output.position)
             client.servo_jp(output.position, output.velocity)
-        elif self.guard.state == lcmt_dvrk_status.STATE_OFF:
+        elif self.guard.state == lcmt_dvrk_status.STATE_OFF and now >= self._last_sent + _REPEAT:
             client.state_command("disable")
+            self._last_sent = now
 
     def _send_jaw(self, name: str, values: NDArray[np.float64]) -> None:
         """Commands the separate joint, if the command has changed. Call this method before the command to the arm."""
