@@ -41,22 +41,24 @@ def run_bridge(
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         stopped: Function that returns whether to stop.
         report: Function that is called with one line for each change of the state.
-        ready: Function that is called before the first command to the arm, e.g. to request real-time scheduling.
+        ready: Function that is called before the networks are opened, e.g. to request real-time scheduling.
 
     Raises:
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
     require_cyclonedds()
-    from dvrk_drake.systems.ros.crtk_bridge import connect_bridge
+    from dvrk_drake.systems.ros.crtk_bridge import compile_guard, connect_bridge
 
-    network = lcm.LCM(url)
-    channel = status_channel(arm)
+    # Threads of LCM and DDS inherit the scheduling of this thread. A compilation with real-time scheduling would stop all
+    # other processes of its core.
+    compile_guard(arm, driver)
+    ready()
+    network, channel = lcm.LCM(url), status_channel(arm)
     bridge = connect_bridge(
         arm, driver, lambda data: network.publish(channel, data), topic=topic, domain=domain, report=report
     )
     try:
         network.subscribe(command_channel(arm), lambda channel, data: bridge.put(data)).set_queue_capacity(_QUEUE)
-        ready()
         while not stopped():
             select.select([bridge.fileno(), network.fileno()], [], [], _POLL)
             for _ in range(_MESSAGES_PER_STEP):

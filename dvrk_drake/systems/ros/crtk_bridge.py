@@ -19,12 +19,14 @@ from dvrk_drake.systems.lcm.dvrk_command import draw_id
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
-from dvrk_drake.systems.ros.crtk_client import CrtkClient, find_arm
+from dvrk_drake.systems.ros.crtk_client import CrtkClient, find_arm, other_publishers
 from dvrk_drake.systems.ros.deadman import DeadmanProcess
 from dvrk_drake.systems.ros.domain import RosDomain
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0
+#: Accepted error of the measured rate, as a fraction.
+_RATE_TOLERANCE = 0.05
 #: Number of measurements between two checks of their rate. Number of successful checks after an insufficient rate.
 _RATE_INTERVAL, _GOOD_RATES = 20, 5
 #: Time without a measurement after which the guard is stepped nevertheless [us].
@@ -37,8 +39,10 @@ _JAW_CHANGE = 0.01
 #: Longest time until the arm has sent its state and a measurement, and until it has confirmed `hold` [s]. Longest time
 #: until DDS detects the end of a killed process [s].
 _FIRST, _ENDED = 5.0, 3.0
-#: Time after which a single `hold` is repeated while no joint has a valid measurement [us].
-_HOLD_PERIOD = 100_000
+#: Time after which `hold` is repeated while no joint has a valid measurement, or `disable` in the state OFF [us].
+_REPEAT = 100_000
+#: Shortest time between two reports of problems with measured_js [us].
+_REPORT_PERIOD = 1_000_000
 
 
 class CrtkBridge:
@@ -104,8 +108,8 @@ class CrtkBridge:
         self._was_ready = False
         self._num_measured, self._good_rates, self._rate_problem = 0, 0, ""
         self._num_changes, self._other_publishers = -1, ""
-        self._problem = self._described = ""
-        self._last_hold = 0
+        self._problem = self._described = self._blocked = ""
+        self._last_sent = self._last_report = 0
         self._rate_problem = self._check_rate()
 
     def put(self, data: bytes) -> None:
@@ -159,9 +163,11 @@ class CrtkBridge:
             problem = problem or (jump and f"{self._client.namespace}/measured_js: {jump}")
         else:
             self._measured_utime = now
-        if problem and problem != self._problem:
+        if problem and problem != self._problem and now >= self._last_report + _REPORT_PERIOD:
             self._report(problem)
-        self._problem = problem
+            self._problem, self._last_report = problem, now
+        elif not problem:
+            self._problem = ""
         is_valid = not problem
         self._measured = (measurement.q, measurement.v, measurement.effort) if is_valid else (self._nan,) * 3
 
@@ -175,7 +181,8 @@ class CrtkBridge:
         self._was_ready = not not_ready
         if others := self._others():
             guard.report_fault(others)
-        guard.block(self._block_reason())
+        self._blocked = self._block_reason()
+        guard.block(self._blocked)
         output = guard.step(now, self._measured_utime, *self._measured)
         self._last_step = now
         if with_status:
@@ -187,19 +194,23 @@ class CrtkBridge:
     def _publish(self, output: GuardOutput, now: int) -> None:
         """Publishes the output of the guard on the topics of the arm."""
         client = self._client
-        if np.all(output.joint_flags & lcmt_dvrk_status.FLAG_IMPLAUSIBLE):
-            # The arm measures its joints itself, so it can still hold its pose.
-            if now >= self._last_hold + _HOLD_PERIOD:
+        is_effort = output.control_mode == lcmt_dvrk_command.EFFORT
+        all_implausible = np.all(output.joint_flags & lcmt_dvrk_status.FLAG_IMPLAUSIBLE)
+        if all_implausible or (is_effort and self._blocked):
+            # The arm measures its joints itself, so it can still hold its pose. After a measurement fault, the guard
+            # commands efforts, which are not safe for example with the gravity compensation of the dVRK.
+            if now >= self._last_sent + _REPEAT:
                 client.hold()
-                self._last_hold = now
-        elif output.control_mode == lcmt_dvrk_command.EFFORT:
+                self._last_sent = now
+        elif is_effort:
             self._send_jaw("servo_jf", output.effort)
             client.servo_jf(output.effort)
         elif output.control_mode != lcmt_dvrk_command.OFF:
             self._send_jaw("servo_jp", output.position)
             client.servo_jp(output.position, output.velocity)
-        elif self.guard.state == lcmt_dvrk_status.STATE_OFF:
+        elif self.guard.state == lcmt_dvrk_status.STATE_OFF and now >= self._last_sent + _REPEAT:
             client.state_command("disable")
+            self._last_sent = now
 
     def _send_jaw(self, name: str, values: NDArray[np.float64]) -> None:
         """Commands the separate joint, if the command has changed. Call this method before the command to the arm."""
@@ -245,10 +256,8 @@ class CrtkBridge:
         if client.gravity_compensation is None:
             return f"no valid message on {topic}, so the dVRK's own gravity compensation may be on"
         if client.gravity_compensation > _NO_EFFORT:
-            return (
-                f"the dVRK's own gravity compensation is on: {topic} has {client.gravity_compensation:.3g} N m. Switch "
-                "it off at the console"
-            )
+            # The text must not change with every message.
+            return f"the dVRK's own gravity compensation is on: {topic} is not zero. Switch it off at the console"
         return ""
 
     def _check_rate(self) -> str:
@@ -259,7 +268,7 @@ class CrtkBridge:
         rate, topic = self._clock.rate, f"{self._client.namespace}/measured_js"
         if rate is None:
             return f"the rate of {topic} is not known yet"
-        if rate >= MIN_RATE:
+        if rate >= (1.0 - _RATE_TOLERANCE) * MIN_RATE:
             self._good_rates += 1
             return "" if self._good_rates >= _GOOD_RATES or not self._rate_problem else self._rate_problem
         self._good_rates = 0
@@ -312,14 +321,24 @@ def connect_bridge(
     Raises:
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
-    _compile(arm, driver)
+    compile_guard(arm, driver)
     ros = RosDomain(domain)
-    client = CrtkClient(ros, arm, find_arm(ros, arm, topic))
+    namespace = find_arm(ros, arm, topic)
+    # The publishers of a new client would stop a bridge that already runs. So their check comes first. DDS considers a
+    # killed process as present for about a second.
+    if not ros.wait_until(lambda: not other_publishers(ros, arm, namespace), _ENDED):
+        raise ControllerError(
+            f"another process publishes {', '.join(other_publishers(ros, arm, namespace))}. Only one process may "
+            "command an arm: end the other one, e.g. another bridge, teleoperation or a script"
+        )
+    client = CrtkClient(ros, arm, namespace)
     _wait_for_arm(ros, client)
-    return CrtkBridge(client, driver, send_status, report=report, deadman=DeadmanProcess(client.namespace, domain))
+    deadman = DeadmanProcess(namespace, domain)
+    report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
+    return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)
 
 
-def _compile(arm: Arm, driver: DvrkDriver) -> None:
+def compile_guard(arm: Arm, driver: DvrkDriver) -> None:
     """Compiles the functions of the guard. During a compilation, no message can be received."""
     model = ControlModel(driver.load_model(arm) or IdentifiedModel.from_arm(arm))
     guard = CommandGuard(arm, draw_id(), model, driver.guard)
@@ -329,11 +348,10 @@ def _compile(arm: Arm, driver: DvrkDriver) -> None:
 
 
 def _wait_for_arm(ros: RosDomain, client: CrtkClient) -> None:
-    """Waits for the arm, and until no other process publishes commands to it.
+    """Waits for the operating state and the first measurement.
 
     Raises:
-        ControllerError: A message did not arrive, the joints do not fit, no process receives the commands, or another
-            process could move the arm.
+        ControllerError: A message did not arrive, the joints do not fit, or no process receives the commands.
     """
 
     def is_complete() -> bool:
@@ -352,9 +370,3 @@ def _wait_for_arm(ros: RosDomain, client: CrtkClient) -> None:
     measurement = client.measurement
     if measurement is not None and measurement.stamp and measurement.problem:
         raise ControllerError(measurement.problem)
-    # DDS considers a killed process as present for about a second.
-    if not ros.wait_until(lambda: not client.other_publishers(), _ENDED):
-        raise ControllerError(
-            f"another process publishes {', '.join(client.other_publishers())}. Only one process may command an arm: "
-            "end the other one, e.g. another bridge, teleoperation or a script"
-        )

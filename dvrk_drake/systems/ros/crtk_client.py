@@ -17,7 +17,8 @@ from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
 from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
 
-#: Longest time to wait for the topics of an arm [s]. Time to wait for other fitting topics after the first one [s].
+#: Longest time to wait for the topics of an arm [s]. Time to wait for other topics of the domain after the first one
+#: [s].
 _DISCOVERY, _OTHERS = 10.0, 1.0
 #: Topics with which a client moves an arm. A second publisher on one of them could move the arm at the same time.
 MOTION_TOPICS = (
@@ -37,8 +38,12 @@ MOTION_TOPICS = (
     "move_cp",
     "move_cr",
 )
+#: Topics with which a client moves the separate joint.
+_SEPARATE_TOPICS = ("servo_jp", "servo_jf", "move_jp")
 #: Time after which a measurement of the separate joint is out of date [s].
-_JAW_AGE = 0.1
+_JAW_AGE = 0.02
+#: Largest number of characters of a received text that is shown.
+_SHOWN = 40
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class JointStateReader:
         self._arm, self._topic = arm, topic
         self._main = [joint for joint in arm.joint_names if joint != arm.separate_joint]
         self._columns = np.array([arm.joint_names.index(joint) for joint in self._main])
-        self._order: tuple[list[str], list[int]] = ([], [])
+        self._order: tuple[list[str] | None, list[int]] = (None, [])
         self._jaw: tuple[float, float, float] | None = None
         self._jaw_arrival = 0
 
@@ -96,7 +101,7 @@ class JointStateReader:
             values = np.array([message.position, message.velocity, message.effort])
             blocks[:, self._columns] = values[:, order]
             if len(self._main) < self._arm.num_joints:
-                problem, arrival = self._add_jaw(blocks, arrival)
+                problem = self._add_jaw(blocks, arrival)
         if not problem and not np.isfinite(blocks).all():
             problem = f"{self._topic}: a position, velocity or effort is not finite"
         if problem:
@@ -117,7 +122,7 @@ class JointStateReader:
             return f"{self._topic}: header stamp 0 marks invalid data. Home the arm"
         if message.name != self._order[0]:
             if missing := [joint for joint in self._main if joint not in message.name]:
-                found = ", ".join(message.name) or "none"
+                found = ", ".join(shown(name) for name in message.name[: 2 * self._arm.num_joints]) or "none"
                 return f"{self._topic} has the joints {found}; {self._arm.name} also needs {', '.join(missing)}"
             self._order = (list(message.name), [message.name.index(joint) for joint in self._main])
         sizes = [len(part) for part in (message.position, message.velocity, message.effort)]
@@ -128,13 +133,13 @@ class JointStateReader:
             )
         return ""
 
-    def _add_jaw(self, blocks: NDArray[np.float64], arrival: int) -> tuple[str, int]:
-        """Adds the separate joint to `blocks` (3, n). Returns a problem or "", and the earlier time of arrival."""
+    def _add_jaw(self, blocks: NDArray[np.float64], arrival: int) -> str:
+        """Adds the separate joint to `blocks` (3, n). Returns a problem or ""."""
         name = self._arm.separate_joint
         if self._jaw is None or arrival - self._jaw_arrival > 1e9 * _JAW_AGE:
-            return f"no valid message on {self._topic.rpartition('/')[0]}/{name}/measured_js", arrival
+            return f"no valid message on {self._topic.rpartition('/')[0]}/{name}/measured_js"
         blocks[:, self._arm.joint_names.index(name)] = self._jaw
-        return "", min(arrival, self._jaw_arrival)
+        return ""
 
 
 class CrtkClient:
@@ -147,7 +152,7 @@ class CrtkClient:
         measurement: Last measurement, or None before the first message.
         operating_state: Last operating state, or None before the first message.
         gravity_compensation: Largest absolute effort of the dVRK's own gravity compensation in the last message [N m,
-            N]; None before the first valid message.
+            N]; None before the first valid message with a finite effort for each joint.
         num_received: Number of messages on measured_js.
     """
 
@@ -178,8 +183,7 @@ class CrtkClient:
         self._move_jp = self._advertise("move_jp")
         if self._separate is not None:
             self._jaw_commands = {
-                name: domain.advertise(self._jaw_topic(name), JointState)
-                for name in ("servo_jp", "servo_jf", "move_jp")
+                name: domain.advertise(self._jaw_topic(name), JointState) for name in _SEPARATE_TOPICS
             }
         self._hold = domain.advertise(self._topic("hold"), Empty)
         self._use_gravity_compensation = domain.advertise(self._topic("use_gravity_compensation"), Bool)
@@ -198,7 +202,7 @@ class CrtkClient:
         if state is None:
             return f"no message on {self._topic('operating_state')}"
         if state.state != "ENABLED":
-            return f"operating_state is {state.state}"
+            return f"operating_state is {shown(state.state)}"
         return "" if state.is_homed else "operating_state is ENABLED, but the arm is not homed"
 
     def receive(self) -> bool:
@@ -213,8 +217,10 @@ class CrtkClient:
         for state, _ in self._state.take():
             self.operating_state = state
         for message, _ in self._gravity.take():
-            if message.header.nanoseconds:
-                self.gravity_compensation = float(np.max(np.abs(message.effort), initial=0.0))
+            # A message without efforts does not show that the gravity compensation is off.
+            is_complete = len(message.effort) == self.arm.num_joints and np.isfinite(message.effort).all()
+            if message.header.nanoseconds and is_complete:
+                self.gravity_compensation = float(np.max(np.abs(message.effort)))
         return is_new
 
     def take_other_hold(self) -> bool:
@@ -270,10 +276,8 @@ class CrtkClient:
         return [publisher.topic for publisher in publishers if not publisher.num_subscribers()]
 
     def other_publishers(self) -> list[str]:
-        """Returns the topics on which another process of the domain could move the arm, without duplicates."""
-        separate = () if self._separate is None else tuple(map(self._jaw_topic, ("servo_jp", "servo_jf", "move_jp")))
-        motion = {*map(self._topic, MOTION_TOPICS), *separate}
-        return sorted({e.topic for e in self.domain.publishers() if e.topic in motion and not e.is_own})
+        """Returns the topics on which another process of the domain could move the arm, see `other_publishers`."""
+        return other_publishers(self.domain, self.arm, self.namespace)
 
     def _position_command(self, name: str, q: ArrayLike, v: ArrayLike | None) -> JointState:
         message = JointState(Header.now(), position=self._main(self._checked(name, q)))
@@ -309,6 +313,24 @@ class CrtkClient:
         return self.domain.advertise(self._topic(name), JointState)
 
 
+def shown(text: str) -> str:
+    """Returns a received text for a message: on one line and with a limited length."""
+    return text if text.isprintable() and len(text) <= _SHOWN else repr(text[:_SHOWN])
+
+
+def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
+    """Returns the topics on which another process of the domain could move an arm, without duplicates.
+
+    Args:
+        domain: ROS domain of the arm.
+        arm: Arm.
+        namespace: Namespace of the topics, e.g. "/MTML".
+    """
+    names = [*MOTION_TOPICS, *(f"{arm.separate_joint}/{name}" for name in _SEPARATE_TOPICS if arm.separate_joint)]
+    motion = {f"{namespace}/{name}" for name in names}
+    return sorted({e.topic for e in domain.publishers() if e.topic in motion and not e.is_own})
+
+
 def find_arm(domain: RosDomain, arm: Arm, topic: str | None = None, seconds: float = _DISCOVERY) -> str:
     """Waits until the arm's topic measured_js is discovered, and returns the namespace of the arm, e.g. "/PSM1".
 
@@ -323,6 +345,6 @@ def find_arm(domain: RosDomain, arm: Arm, topic: str | None = None, seconds: flo
         RecordingError: No topic or several topics fit. The message lists the topics of the domain.
     """
     domain.wait_until(lambda: bool(fitting_topics(arm, topic, domain.joint_state_topics())), seconds)
-    domain.wait_until(lambda: topic is not None, min(_OTHERS, seconds))
+    domain.wait_until(lambda: False, min(_OTHERS, seconds))
     topics = {name: name for name in domain.joint_state_topics()}
     return choose_topic(domain.name, arm, topic, topics).rpartition("/")[0]
