@@ -49,8 +49,8 @@ def run_bridge(
     require_cyclonedds()
     from dvrk_drake.systems.ros.crtk_bridge import compile_guard, connect_bridge
 
-    # Threads of LCM and DDS inherit the scheduling of this thread. A compilation with real-time scheduling would stop all
-    # other processes of its core.
+    # Threads of LCM and DDS inherit the scheduling of this thread. A compilation with real-time scheduling would stop
+    # all other processes of its core.
     compile_guard(arm, driver)
     ready()
     network, channel = lcm.LCM(url), status_channel(arm)

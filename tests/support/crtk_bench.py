@@ -1,8 +1,9 @@
 """Test bench for a bridge to a dVRK: a substitute client without DDS, and clocks that the test sets."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
@@ -16,7 +17,6 @@ from dvrk_drake.systems.ros.crtk_client import JointMeasurement
 MS = 1_000_000
 START = 1_795_257_600 * 10**9
 ARMS = {name: load_arm(name) for name in ("mtml", "psm")}
-MODELS = {name: IdentifiedModel.from_arm(arm) for name, arm in ARMS.items()}
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
 
@@ -26,8 +26,8 @@ class SubstituteClient:
     def __init__(self, name):
         self.arm, self.namespace = ARMS[name], f"/{ARMS[name].name}"
         self.measurement, self.gravity_compensation, self.not_ready_reason = None, 0.0, ""
-        self.others, self.num_changes = [], 0
-        self.sent, self.is_new = [], False
+        self.others, self.domain = [], SimpleNamespace(num_changes=0, clear=lambda: None)
+        self.sent, self.is_new, self.other_hold = [], False, False
         #: Effort of the dVRK's own gravity compensation after it was switched off; None: no message arrives.
         self.gravity_after_switch = 0.0
 
@@ -39,6 +39,10 @@ class SubstituteClient:
 
     def other_publishers(self):
         return self.others
+
+    def take_other_hold(self):
+        taken, self.other_hold = self.other_hold, False
+        return taken
 
     def wait_until_received(self, seconds):
         return True
@@ -69,7 +73,7 @@ class CrtkBench:
         now: Time of the monotonic clock [ns].
         statuses: Statuses so far.
         lines: Reported lines so far.
-        blocked: Reason that `blocked` returns.
+        blocked: Problem of the deadman process, or "".
     """
 
     def __init__(self, monkeypatch, name="mtml", *, period=1.0, modes=("position", "effort"), key_file=""):
@@ -86,8 +90,7 @@ class CrtkBench:
             driver,
             self._store,
             report=self.lines.append,
-            blocked=lambda: self.blocked,
-            model=MODELS[name],
+            deadman=SimpleNamespace(problem=lambda: self.blocked, close=lambda: self.lines.append("deadman ended")),
         )
 
     def time_ns(self):

@@ -270,10 +270,11 @@ class CrtkBridge:
             return f"the rate of {topic} is not known yet"
         if rate >= (1.0 - _RATE_TOLERANCE) * MIN_RATE:
             self._good_rates += 1
-            return "" if self._good_rates >= _GOOD_RATES or not self._rate_problem else self._rate_problem
+            was_low = "arrives at" in self._rate_problem
+            return self._rate_problem if was_low and self._good_rates < _GOOD_RATES else ""
         self._good_rates = 0
-        if "arrives at" in self._rate_problem:
-            return self._rate_problem  # the text does not change with every measurement
+        if "arrives at" in self._rate_problem:  # the text does not change with every measurement
+            return self._rate_problem
         return (
             f"{topic} arrives at {rate:.0f} Hz; commands need {MIN_RATE:.0f} Hz. Start the dVRK's console with a "
             "period of 1 ms: dvrk_system -j FILE.json -p 0.001"

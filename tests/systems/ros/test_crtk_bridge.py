@@ -128,13 +128,13 @@ def test_arm_that_is_not_enabled_is_a_fault_and_gets_no_command(bench, reason):
 
 def test_second_publisher_is_a_fault_as_long_as_it_exists(bench):
     bench.started().clear()
-    bench.client.others, bench.client.num_changes = ["/MTML/servo_jf", "/MTML/servo_jp"], 1
+    bench.client.others, bench.client.domain.num_changes = ["/MTML/servo_jf", "/MTML/servo_jp"], 1
     bench.run(10)
     assert set(bench.names()) == {"servo_jp"}
     assert bench.status.fault_text == "another process publishes /MTML/servo_jf, /MTML/servo_jp. End it"
     bench.reset()
     assert bench.status.guard_state == Status.STATE_FAULT
-    bench.client.others, bench.client.num_changes = [], 2
+    bench.client.others, bench.client.domain.num_changes = [], 2
     bench.reset()
     assert bench.status.guard_state == Status.STATE_HOLD
 
