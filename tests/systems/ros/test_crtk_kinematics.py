@@ -68,8 +68,8 @@ def test_pose_is_the_product_of_the_dh_table(name):
     for q in arm.sample_poses(20, np.random.default_rng(0)):
         X = RigidTransform()
         for value, (kind, a, alpha, d, offset) in zip(q, TABLES[name], strict=False):
-            theta, d = (value + offset, d) if kind == "r" else (offset, d + value)
-            X = X @ dh(theta, a, alpha, d, modified=name == "psm")
+            turn, slide = (value, 0.0) if kind == "r" else (0.0, value)
+            X = X @ dh(offset + turn, a, alpha, d + slide, modified=name == "psm")
         np.testing.assert_allclose(kinematics.pose(q).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=1e-12)
 
 
@@ -81,9 +81,7 @@ def test_pose_is_that_of_drake_and_velocity_is_its_derivative(name):
     for q in arm.sample_poses(20, generator):
         set_arm_positions(plant, context, arm, q)
         X = kinematics.pose(q)
-        np.testing.assert_allclose(
-            X.GetAsMatrix4(), frame.CalcPoseInWorld(context).GetAsMatrix4(), rtol=0, atol=1e-15
-        )
+        np.testing.assert_allclose(X.GetAsMatrix4(), frame.CalcPoseInWorld(context).GetAsMatrix4(), rtol=0, atol=1e-15)
         v, h = generator.normal(size=7), 1e-6
         ahead, behind = kinematics.pose(q + h * v), kinematics.pose(q - h * v)
         rotation = ahead.rotation().multiply(behind.rotation().inverse()).ToAngleAxis()
