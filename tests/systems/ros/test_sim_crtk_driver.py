@@ -93,7 +93,7 @@ def test_efforts_act_on_the_arm(name):
     # The same efforts as a command, without gravity compensation.
     simulated.send("use_gravity_compensation", is_on=False, seconds=0.0)
     simulated.send("servo_jf", gravity[:n], seconds=0.1)
-    np.testing.assert_allclose(simulated.q, q, rtol=0, atol=1e-2)
+    np.testing.assert_allclose(simulated.q, q, rtol=0, atol=0.03)
     # The arm falls with zero efforts, and hold stops it.
     before = simulated.q
     simulated.send("servo_jf", np.zeros(n), seconds=0.3)
