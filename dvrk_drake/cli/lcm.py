@@ -1,16 +1,16 @@
-"""Commands for the control of an arm over LCM: arm, key and run."""
+"""Commands for the control of an arm over LCM: key and run."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, app
-from dvrk_drake.cli.support import interrupt_ends_process, load_key, mounted, print_written, quiet_drake
+from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Model, Realtime, app
+from dvrk_drake.cli.support import interrupt_ends_process, load_key, print_warning, print_written, quiet_drake
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,52 +42,6 @@ class ControlledArm:
             help="Print and clear a fault of the arm. If the watchdog of the guard holds the arm, resume control.",
         ),
     ] = False
-
-
-@app.command(group=HARDWARE)
-def arm(
-    *,
-    arm: Arm,
-    driver: Annotated[str | None, Parameter(metavar="FILE.yaml")] = None,
-    lcm_url: LcmUrl = "",
-    key: Key = None,
-    pose: Annotated[list[float] | None, Parameter(metavar="Q ..", consume_multiple=True)] = None,
-    gravity: Gravity = None,
-    meshcat: Annotated[bool, Parameter(show_default=False)] = False,
-    realtime: Realtime = False,
-) -> None:
-    """Run a simulated arm with its driver and command guard on LCM.
-
-    Args:
-        driver: Configuration file of the driver (docs/lcm.md). Default: the default configuration.
-        pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.
-        meshcat: Show the arm in a web browser.
-    """
-    from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.lcm_network import open_lcm
-    from dvrk_drake.processes.live_view import live_view
-    from dvrk_drake.processes.pace import make_realtime, settle_memory
-    from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
-    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-
-    quiet_drake()
-    simulated_arm = mounted(load_arm(arm), gravity)
-    configuration = DvrkDriver() if driver is None else load_driver(driver)
-    configuration.key_file = key or configuration.key_file
-    start = start_pose(simulated_arm, pose)
-    url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
-    print(f"starting the simulated {simulated_arm.name}", flush=True)
-    with interrupt_ends_process():
-        simulated = SimulatedArm(simulated_arm, configuration, url, start)
-        stopped = stop_on_signals()
-    with live_view(arm, url) if meshcat else nullcontext():
-        if realtime:
-            for warning in make_realtime():
-                _warn(warning)
-        settle_memory()
-        print(f"simulated {simulated_arm.name} on LCM {url}; press Ctrl-C to end", flush=True)
-        pace = simulated.run(stopped, lambda line: print(line, flush=True))
-    print(f"ended; {pace.late} steps started more than one period late", flush=True)
 
 
 @app.command(group=HARDWARE)
@@ -222,7 +176,7 @@ def _friction_compensator(
     elements = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
     ratios = {e.coordinate: r for e, r, springs_back in elements if not springs_back}
     if reduced := ", ".join(f"{name} {r:.2f}" for name, r in ratios.items() if r < 0.99 * ratio):
-        _warn(
+        print_warning(
             "the friction ratio is reduced, because friction must resist the error of the gravity model. Ratios: "
             f"{reduced}"
         )
@@ -263,17 +217,17 @@ def ready_controller(
     arm, key = load_arm(controlled.arm), load_key(controlled.key)
     model = IdentifiedModel.from_arm(arm) if controlled.model is None else IdentifiedModel.load(controlled.model, arm)
     if controlled.model is not None and (warning := model_warning(controlled.model, model)):
-        _warn(warning)
+        print_warning(warning)
     url = open_lcm(controlled.lcm_url).get_lcm_url()
     print(f"waiting for {arm.name} on LCM {url}", flush=True)
     with closing(ArmLink(arm, url, key=key)) as link:
         if controlled.reset:
-            reset_fault(link, _warn)
+            reset_fault(link, print_warning)
         status, period = first_status(link)
     controller = ArmController(arm, model, mode, period, friction, gains)
     if controlled.realtime:
         for warning in make_realtime():
-            _warn(warning)
+            print_warning(warning)
     settle_memory()
     return controller, lambda: ArmLink(arm, url, key=key, before=status), period
 
@@ -292,7 +246,3 @@ def model_warning(path: str, model: IdentifiedModel) -> str:
         return ""
     recording = model.validation.recording
     return f"{path}: failed validation on {recording}: {', '.join(bad)}; for these joints, zero torque may be better"
-
-
-def _warn(text: str) -> None:
-    print(f"dvrk-drake: warning: {text}", file=sys.stderr, flush=True)

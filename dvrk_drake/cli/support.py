@@ -215,6 +215,11 @@ def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
             console.print(str(warning), style="yellow", markup=False, soft_wrap=True)
 
 
+def print_warning(text: str) -> None:
+    """Prints a warning on standard error."""
+    print(f"dvrk-drake: warning: {text}", file=sys.stderr, flush=True)
+
+
 def write_json(path: str, content: object) -> None:
     """Writes the file given with --json."""
     from dvrk_drake.models.files import atomic_write

@@ -15,8 +15,9 @@ from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
-from dvrk_drake.processes.teacher import CubicTrajectory, RestDetector
+from dvrk_drake.processes.teacher import RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
+from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 
 #: Largest time step of the trajectory between two statuses [s]. This limit prevents a jump of the desired state after a
 #: pause of the computer.

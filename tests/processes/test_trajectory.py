@@ -8,7 +8,8 @@ from sticky_arm import random_poses
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.coupled_limits import offset_pose
-from dvrk_drake.processes.teacher import CubicTrajectory, RestDetector
+from dvrk_drake.processes.teacher import RestDetector
+from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 
 ARMS = ("mtml", "psm")
 

@@ -1,0 +1,272 @@
+"""State machine of a simulated dVRK arm: operating state, control modes and commands."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.ros.crtk_joint_group import JointGroup
+
+State = Literal["DISABLED", "ENABLED", "PAUSED", "FAULT"]
+#: Function that returns the joint positions (n,) for a commanded pose and the present set-point (n,), or None if the
+#: arm cannot reach the pose.
+Inverse = Callable[[Sequence[float], NDArray[np.float64]], NDArray[np.float64] | None]
+
+_STATE_COMMANDS = ("enable", "disable", "pause", "resume", "home", "unhome")
+#: Mapping from each command of joints to its values, for messages.
+_JOINT_COMMANDS = {"servo_jp": "positions", "move_jp": "positions", "servo_jf": "efforts"}
+#: Shortest time between two lines on refused commands [s].
+_QUIET = 2.0
+#: Largest number of characters of a text in a message.
+_MAX_TEXT = 40
+
+
+@dataclass(frozen=True)
+class CrtkCommand:
+    """Command to an arm.
+
+    Attributes:
+        name: Name of the topic in the namespace of the arm, e.g. "servo_jp" or "jaw/servo_jp".
+        values: Positions or efforts [rad, m, N m, N]. `servo_cp`: x, y, z [m], then the quaternion x, y, z, w.
+        velocities: Velocities for `servo_jp` [rad/s, m/s]. Empty: zero.
+        text: Text of `state_command`.
+        is_on: Value of `use_gravity_compensation`.
+    """
+
+    name: str
+    values: Sequence[float] = ()
+    velocities: Sequence[float] = ()
+    text: str = ""
+    is_on: bool = False
+
+
+class CrtkArmState:
+    """Operating state and control modes of a simulated dVRK arm, without ROS.
+
+    Vectors have n elements in the arm's order [rad, rad/s, N m; m, m/s, N].
+
+    The arm is initially DISABLED and not homed. `enable` supplies power, and the arm regulates the measured pose.
+    `home` moves the arm to the home pose. After this motion, the arm accepts commands. In FAULT and DISABLED, the
+    motors have no power.
+
+    Differences from a dVRK: A command with a wrong number of values or a value that is not finite changes nothing.
+    `pause` can be repeated. `home` after `unhome` homes the arm again. The jaw has its own control mode, but `hold`
+    and `free` also apply to the jaw.
+
+    Attributes:
+        state: Operating state.
+        is_homed: Whether the arm was homed since it was last enabled.
+        is_biased: Whether the measured positions are valid, i.e. the arm was homed and not unhomed.
+        gravity_compensation: Whether gravity compensation is added to commanded efforts.
+    """
+
+    def __init__(self, arm: Arm, *, gravity_compensation: bool = False, inverse: Inverse | None = None) -> None:
+        """Creates the state machine.
+
+        Args:
+            arm: Arm with limits and joint names. Its `separate_joint` has topics of its own.
+            gravity_compensation: Initial state of the gravity compensation.
+            inverse: Inverse kinematics for `servo_cp`. None: `servo_cp` is refused.
+        """
+        n = arm.num_joints
+        separate = [i for i in range(n) if arm.joint_names[i] == arm.separate_joint]
+        self._main = JointGroup(arm, [i for i in range(n) if i not in separate])
+        self._jaw: JointGroup | None = JointGroup(arm, separate) if separate else None
+        self._jaw_name, self._effort_limits, self._inverse = arm.separate_joint, arm.effort_limits, inverse
+        self.state: State = "DISABLED"
+        self.is_homed = self.is_biased = False
+        self.gravity_compensation = gravity_compensation
+        self._is_homing = False
+        self._lines: tuple[str, ...] = ()
+        self._described = ""
+        self._num_refused, self._next_refusal = 0, 0.0
+
+    def __deepcopy__(self, memo: object) -> CrtkArmState:
+        # Drake copies the state of a context before every update, so copying must be fast.
+        other = copy.copy(self)
+        other._main = copy.copy(self._main)
+        other._jaw = copy.copy(self._jaw)
+        return other
+
+    @property
+    def groups(self) -> list[JointGroup]:
+        """Groups of joints: the joints of the arm, then its separate joint if there is one."""
+        return [self._main] if self._jaw is None else [self._main, self._jaw]
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the arm moves to the home pose or to the goal of `move_jp`."""
+        return any(group.is_moving for group in self.groups)
+
+    @property
+    def is_powered(self) -> bool:
+        """Whether the motors have power."""
+        return self.state in ("ENABLED", "PAUSED")
+
+    @property
+    def desired_state(self) -> NDArray[np.float64]:
+        """Set-point (2n,): q, then v."""
+        n = len(self._effort_limits)
+        desired = np.empty(2 * n)
+        for group in self.groups:
+            desired[group.joints], desired[n + group.joints] = group.q, group.v
+        return desired
+
+    def motor_effort(self, position_control: NDArray[np.float64], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the motor efforts (n,) inside the effort limits.
+
+        Args:
+            position_control: Efforts (n,) of the position controller at the set-point.
+            gravity: Efforts (n,) that compensate gravity.
+        """
+        if not self.is_powered:
+            return np.zeros(len(gravity))
+        effort = position_control.copy()
+        for group in self.groups:
+            if group.is_effort_controlled:
+                effort[group.joints] = group.effort + self.gravity_compensation * gravity[group.joints]
+        return np.clip(effort, -self._effort_limits, self._effort_limits)
+
+    def step(
+        self, time: float, q: NDArray[np.float64], v: NDArray[np.float64], commands: Sequence[CrtkCommand] = ()
+    ) -> None:
+        """Processes a measurement, then commands, and advances the set-point.
+
+        Args:
+            time: Present time [s].
+            q, v: Measured positions and velocities (n,).
+            commands: Commands in the order of their publication.
+        """
+        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
+            q = self.desired_state[: len(q)]
+            if self.is_powered:
+                self._remove_power("FAULT")
+        for group in self.groups:
+            group.step(time, q[group.joints])
+        for command in commands:
+            if refusal := self._receive(command, time):
+                self._report_refusal(f"{command.name[:_MAX_TEXT]} refused: {refusal}", time)
+        if self._is_homing and not self.is_busy:
+            self._is_homing, self.is_homed, self.is_biased = False, True, True
+        if (described := self.describe()) != self._described:
+            self._lines, self._described = (*self._lines, described), described
+
+    def take_lines(self) -> tuple[str, ...]:
+        """Returns lines on changes of state or mode and on refused commands since the last call."""
+        lines, self._lines = self._lines, ()
+        return lines
+
+    def describe(self) -> str:
+        """Returns a line on operating state and control modes, e.g. "ENABLED, homed, control mode position"."""
+        parts: list[str] = [self.state]
+        if self.is_powered:
+            parts.append("homing" if self._is_homing else "homed" if self.is_homed else "not homed")
+        if self.is_ready:
+            parts.append(f"control mode {self._main.mode}")
+            if self._jaw is not None and self._jaw.mode != self._main.mode:
+                parts.append(f"{self._jaw_name} {self._jaw.mode}")
+            if self.gravity_compensation:
+                parts.append("gravity compensation on")
+        return ", ".join(parts)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the arm accepts commands."""
+        return self.state == "ENABLED" and self.is_homed
+
+    def _receive(self, command: CrtkCommand, time: float) -> str:
+        """Executes a command. Returns the reason why it is refused, or ""."""
+        name = command.name
+        if name == "state_command":
+            return self._change_state(command.text, time)
+        if name == "use_gravity_compensation":
+            self.gravity_compensation = command.is_on
+            return ""
+        if not self.is_ready:
+            return f"the arm is {self.describe()}; allowed: ENABLED, homed"
+        if name in ("hold", "free"):
+            for group in self.groups:
+                group.hold() if name == "hold" else group.free()
+            return ""
+        prefix, _, verb = name.rpartition("/")
+        group = self._group(prefix)
+        if group is None or verb not in _JOINT_COMMANDS:
+            return self._servo_cp(command.values) if name == "servo_cp" else "unknown command"
+        fault = group.fault(command.values, _JOINT_COMMANDS[verb])
+        if not fault and len(command.velocities):
+            fault = group.fault(command.velocities, "velocities")
+        if fault:
+            return fault
+        if verb == "servo_jp":
+            group.servo_jp(command.values, command.velocities)
+        elif verb == "move_jp":
+            group.move_jp(command.values, time)
+        else:
+            group.servo_jf(command.values)
+        return ""
+
+    def _group(self, prefix: str) -> JointGroup | None:
+        """Returns the group of the topics below `prefix`, or None if there is no such group."""
+        return self._main if not prefix else self._jaw if prefix == self._jaw_name else None
+
+    def _servo_cp(self, pose: Sequence[float]) -> str:
+        if len(pose) != 7 or not np.all(np.isfinite(pose)) or not 0.5 < np.linalg.norm(pose[3:]) < 2.0:
+            return "the pose is not finite, or its quaternion is not a unit quaternion"
+        n = len(self._effort_limits)
+        q = None if self._inverse is None else self._inverse(pose, self.desired_state[:n])
+        if q is None:
+            return "the arm cannot reach the pose from the present set-point"
+        self._main.servo_jp(q[self._main.joints])
+        return ""
+
+    def _change_state(self, command: str, time: float) -> str:
+        if command not in _STATE_COMMANDS:
+            return f'"{command[:_MAX_TEXT]}"; allowed: {", ".join(_STATE_COMMANDS)}'
+        if command == "disable":
+            if self.is_powered:
+                self._remove_power("DISABLED")
+            self.state = "DISABLED"
+        elif command == "unhome":
+            self.is_homed = self.is_biased = self._is_homing = False
+            if self.is_powered:
+                self._regulate()
+        elif command == "enable" and not self.is_powered:
+            self.state, self.is_homed = "ENABLED", False
+            self._regulate()
+        elif command == "home" and self.state == "ENABLED":
+            if not self.is_homed and not self._is_homing:
+                self._is_homing = True
+                for group in self.groups:
+                    group.move_jp(None, time)
+        elif command == "pause" and self.is_powered:
+            self.state, self._is_homing = "PAUSED", False
+            self._regulate()
+        elif command == "resume" and self.state == "PAUSED":
+            self.state = "ENABLED"
+        elif not (command == "enable" and self.state == "ENABLED"):
+            return f'"{command}" is not supported in the state {self.state}'
+        return ""
+
+    def _regulate(self) -> None:
+        """Regulates the present pose."""
+        for group in self.groups:
+            group.hold()
+
+    def _remove_power(self, state: State) -> None:
+        self.state, self._is_homing = state, False
+        for group in self.groups:
+            group.release()
+
+    def _report_refusal(self, line: str, time: float) -> None:
+        if time < self._next_refusal:
+            self._num_refused += 1
+            return
+        more = f" ({self._num_refused} more commands refused before)" if self._num_refused else ""
+        self._lines = (*self._lines, line + more)
+        self._num_refused, self._next_refusal = 0, time + _QUIET

@@ -1,0 +1,201 @@
+"""CRTK topics of a simulated arm over DDS."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.ros.crtk_arm_state import CrtkArmState, CrtkCommand
+from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
+from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
+from dvrk_drake.systems.ros.messages import (
+    Bool,
+    Empty,
+    Header,
+    JointState,
+    OperatingState,
+    Point,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    StringStamped,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
+
+#: Time between two checks for subscriptions [s].
+_SUBSCRIBERS_PERIOD = 0.1
+#: Messages of `state_command` between two ticks, e.g. "enable" and "home". Other topics keep the newest message.
+_STATE_COMMANDS = 10
+
+
+@dataclass(frozen=True)
+class ArmValues:
+    """Values that an arm publishes, in the arm's order of joints [rad, rad/s, N m; m, m/s, N].
+
+    Attributes:
+        q, v, effort: Measured values (n,).
+        setpoint_q, setpoint_v: Set-point (n,).
+        setpoint_effort: Commanded motor efforts (n,).
+        gravity_effort: Gravity compensation (n,) that is added to commanded efforts.
+    """
+
+    q: NDArray[np.float64]
+    v: NDArray[np.float64]
+    effort: NDArray[np.float64]
+    setpoint_q: NDArray[np.float64]
+    setpoint_v: NDArray[np.float64]
+    setpoint_effort: NDArray[np.float64]
+    gravity_effort: NDArray[np.float64]
+
+
+class CrtkArmTopics:
+    """Publishers and subscriptions of one arm, with the names, types and quality of service of a dVRK.
+
+    A topic without subscriptions is not published, because encoding needs time. `operating_state` is latched and
+    published when it changes.
+    """
+
+    def __init__(self, arm: Arm, namespace: str, domain: RosDomain, kinematics: CrtkKinematics) -> None:
+        """Creates the topics.
+
+        Args:
+            arm: Arm. Its `separate_joint` has topics of its own. An arm without a separate joint has a gripper that is
+                measured only, at the angle 0.
+            namespace: Namespace of the topics, e.g. "/MTML".
+            domain: ROS domain.
+            kinematics: Kinematics of the arm.
+        """
+        self._kinematics = kinematics
+        jaw = arm.separate_joint
+        self._main = [i for i, name in enumerate(arm.joint_names) if name != jaw]
+        self._jaw = [i for i, name in enumerate(arm.joint_names) if name == jaw]
+        self._names = list(arm.joint_names)
+        outputs: dict[str, type] = {
+            "measured_js": JointState,
+            "setpoint_js": JointState,
+            "measured_cp": PoseStamped,
+            "setpoint_cp": PoseStamped,
+            "measured_cv": TwistStamped,
+            "gravity_compensation/setpoint_js": JointState,
+            **({f"{jaw}/{s}_js": JointState for s in ("measured", "setpoint")} if jaw else {}),
+            **({} if jaw else {"gripper/measured_js": JointState}),
+        }
+        self._publishers: dict[str, Publisher[Any]] = {
+            name: domain.advertise(f"{namespace}/{name}", message_type) for name, message_type in outputs.items()
+        }
+        self._operating_state = domain.advertise(f"{namespace}/operating_state", OperatingState, latched=True)
+        self._published_state: tuple[str, bool, bool] | None = None
+        joint_commands = ("servo_jp", "servo_jf", "move_jp")
+        inputs: dict[str, type] = {
+            "state_command": StringStamped,
+            "use_gravity_compensation": Bool,
+            **dict.fromkeys(joint_commands, JointState),
+            "servo_cp": PoseStamped,
+            "hold": Empty,
+            "free": Empty,
+            **({f"{jaw}/{command}": JointState for command in joint_commands} if jaw else {}),
+        }
+        self._subscriptions: dict[str, Subscription[Any]] = {}
+        for name, message_type in inputs.items():
+            depth = _STATE_COMMANDS if message_type is StringStamped else 1
+            self._subscriptions[name] = domain.subscribe(f"{namespace}/{name}", message_type, depth=depth)
+        self._wanted: set[str] = set()
+        self._next_check = 0.0
+
+    def take(self) -> list[CrtkCommand]:
+        """Returns the commands since the last call, in the order of their publication."""
+        received = [
+            (published, _command(name, message))
+            for name, subscription in self._subscriptions.items()
+            for message, published in subscription.take()
+        ]
+        return [command for _, command in sorted(received, key=lambda item: item[0])]
+
+    def publish_state(self, machine: CrtkArmState) -> None:
+        """Publishes the operating state if it has changed."""
+        state = (machine.state, machine.is_homed, machine.is_busy)
+        if state != self._published_state:
+            self._published_state = state
+            self._operating_state.publish(OperatingState(Header.now(), *state))
+
+    def publish(self, values: ArmValues, *, is_valid: bool) -> None:
+        """Publishes values with the present time of day.
+
+        Args:
+            values: Values to publish.
+            is_valid: Whether the values are valid. If not, the messages have the time stamp 0 and no values.
+        """
+        if (now := time.monotonic()) >= self._next_check:
+            self._next_check = now + _SUBSCRIBERS_PERIOD
+            self._wanted = {name for name, publisher in self._publishers.items() if publisher.num_subscribers()}
+        header = Header.now() if is_valid else Header()
+        for name in self._wanted:
+            self._publishers[name].publish(self._message(name, values, header) if is_valid else self._empty(name))
+
+    def _message(self, name: str, values: ArmValues, header: Header) -> Any:
+        if name == "measured_js":
+            return self._joint_state(header, self._main, values.q, values.v, values.effort)
+        if name == "setpoint_js":
+            return self._joint_state(header, self._main, values.setpoint_q, values.setpoint_v, values.setpoint_effort)
+        if name == "measured_cp":
+            return _pose(header, self._kinematics.pose(values.q))
+        if name == "setpoint_cp":
+            return _pose(header, self._kinematics.pose(values.setpoint_q))
+        if name == "measured_cv":
+            V = self._kinematics.velocity(values.q, values.v).tolist()
+            return TwistStamped(header, Twist(Vector3(*V[3:]), Vector3(*V[:3])))
+        if name == "gravity_compensation/setpoint_js":
+            return self._joint_state(header, self._main, effort=values.gravity_effort)
+        if name == "gripper/measured_js":
+            return JointState(header, ["gripper"], [0.0])
+        if name.endswith("/measured_js"):
+            return self._joint_state(header, self._jaw, values.q, values.v, values.effort)
+        return self._joint_state(header, self._jaw, values.setpoint_q, values.setpoint_v, values.setpoint_effort)
+
+    @staticmethod
+    def _empty(name: str) -> Any:
+        return {"js": JointState, "cp": PoseStamped, "cv": TwistStamped}[name[-2:]]()
+
+    def _joint_state(
+        self,
+        header: Header,
+        joints: Sequence[int],
+        q: NDArray[np.float64] | None = None,
+        v: NDArray[np.float64] | None = None,
+        effort: NDArray[np.float64] | None = None,
+    ) -> JointState:
+        numbers = ([] if values is None else values[joints].tolist() for values in (q, v, effort))
+        return JointState(header, [self._names[i] for i in joints], *numbers)
+
+
+def _pose(header: Header, X: RigidTransform) -> PoseStamped:
+    rotation = X.rotation().ToQuaternion()
+    return PoseStamped(
+        header,
+        Pose(
+            Point(*X.translation().tolist()),
+            Quaternion(rotation.x(), rotation.y(), rotation.z(), rotation.w()),
+        ),
+    )
+
+
+def _command(name: str, message: Any) -> CrtkCommand:
+    """Returns the command in a message of the topic `name`."""
+    if isinstance(message, JointState):
+        values = message.effort if name.endswith("servo_jf") else message.position
+        return CrtkCommand(name, values, message.velocity if name.endswith("servo_jp") else ())
+    if isinstance(message, PoseStamped):
+        p, r = message.pose.position, message.pose.orientation
+        return CrtkCommand(name, (p.x, p.y, p.z, r.x, r.y, r.z, r.w))
+    if isinstance(message, StringStamped):
+        return CrtkCommand(name, text=message.string)
+    return CrtkCommand(name, is_on=isinstance(message, Bool) and message.data)
