@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import select
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING
 
@@ -67,7 +67,7 @@ def run_bridge(
     namespace = find_arm(ros, arm, topic)
     client = CrtkClient(ros, arm, namespace)
     refuse_other_publishers(client, ros.wait_until)
-    _wait_for_arm(ros, client)
+    wait_for_arm(ros, client, ("servo_jp", "servo_jf", "hold"))
     with closing(DeadmanProcess(namespace, domain)) as deadman:
         report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
         network = lcm.LCM(url)
@@ -100,8 +100,13 @@ def _compile(arm: Arm, driver: DvrkDriver) -> None:
         guard.step(utime, utime, np.clip(zero, arm.position_lower, arm.position_upper), zero, zero)
 
 
-def _wait_for_arm(ros: RosDomain, client: CrtkClient) -> None:
-    """Waits for the operating state and the first measurement.
+def wait_for_arm(ros: RosDomain, client: CrtkClient, commands: Sequence[str]) -> None:
+    """Waits for the operating state, the first measurement, and the subscriptions of the arm.
+
+    Args:
+        ros: ROS domain.
+        client: Client of the arm.
+        commands: Names of the commands to which the arm must subscribe, see `CrtkClient.unheard_commands`.
 
     Raises:
         ControllerError: A message did not arrive, the joints do not fit, or nobody receives the commands.
@@ -109,7 +114,7 @@ def _wait_for_arm(ros: RosDomain, client: CrtkClient) -> None:
 
     def is_complete() -> bool:
         client.receive()
-        return bool(client.operating_state and client.measurement and not client.unheard_commands())
+        return bool(client.operating_state and client.measurement and not client.unheard_commands(commands))
 
     if ros.wait_until(is_complete, _FIRST):
         if client.measurement is not None and client.measurement.stamp and client.measurement.problem:
@@ -119,4 +124,4 @@ def _wait_for_arm(ros: RosDomain, client: CrtkClient) -> None:
         raise ControllerError(f"no message on {client.namespace}/measured_js within {_FIRST:g} s")
     if client.operating_state is None:
         raise ControllerError(f"no message on {client.namespace}/operating_state within {_FIRST:g} s. Is it a dVRK?")
-    raise ControllerError(f"no process subscribes to {', '.join(client.unheard_commands())}. Is it a dVRK?")
+    raise ControllerError(f"no process subscribes to {', '.join(client.unheard_commands(commands))}. Is it a dVRK?")
