@@ -32,10 +32,10 @@ from dvrk_drake.processes.collector import (
     CollectionSettings,
     Steps,
 )
+from dvrk_drake.processes.crtk_monitor import CrtkMonitor, unit
 from dvrk_drake.processes.teacher import RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
-from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
@@ -45,13 +45,6 @@ if TYPE_CHECKING:
 GOAL_PERIOD = 0.1
 #: Time without progress after which a motion is stopped [s].
 STALL = 2.0
-#: Time without a message on measured_js after which the collection is stopped [s].
-SILENCE = 0.3
-#: Largest plausible change of a position between two messages: a fraction of the range of the joint, and ranges per
-#: second of the time between the messages.
-JUMP, _JUMP_SPEED = 0.02, 2.0
-#: Time for which the effort may exceed its limit [s]. A shorter peak is friction or noise.
-OVERLOAD = 0.05
 #: Time for which the arm must be at rest at the start of an approach [s].
 APPROACH_REST = 0.2
 #: Distance [rad, m] outside the limits that is accepted at the start, because the limits of two arms differ.
@@ -134,15 +127,12 @@ class CrtkCollector:
         self.done = output.finished(poses)
         self._arm = arm = client.arm
         self._poses, self._client, self._output, self._settings = poses, client, output, settings
-        self._model, self._stopped, self._enter, self._report = model, stopped, enter, report
+        self._stopped, self._enter, self._report = stopped, enter, report
+        self._monitor = CrtkMonitor(client, model, settings.max_effort)
         self._span = arm.position_upper - arm.position_lower
         self._tolerance = MAX_TRACKING_ERROR * self._span
-        self._clock = ArrivalClock()
         self._now = self._time = self._paused_at = 0.0
-        self._q = self._tau = self._goal = np.zeros(arm.num_joints)
-        self._num_received = self._stamp = 0
-        self._overload_since: float | None = None
-        self._num_changes = -1
+        self._goal = np.zeros(arm.num_joints)
         self._num_before = np.count_nonzero(self.done)
         self._activity = "starting"
         self._steps = self._collect()
@@ -160,7 +150,7 @@ class CrtkCollector:
         step = min(now - self._now, _MAX_STEP) if self._now else 0.0
         self._now = now
         try:
-            self._receive()
+            self._monitor.update(now, with_effort=not self.paused)
             if self._stopped():
                 self.finished = True
                 return
@@ -185,66 +175,6 @@ class CrtkCollector:
             return ""
         return f"; about {self._time / count * np.count_nonzero(~self.done) / 60:.1f} min left"
 
-    def _receive(self) -> None:
-        """Receives messages and checks the arm.
-
-        Raises:
-            CollectionError: The collection must stop.
-        """
-        client, name = self._client, self._arm.name
-        is_new = client.receive()
-        if reason := client.not_ready_reason:
-            raise CollectionError(f"{name} stopped: {reason}")
-        if client.num_changes != self._num_changes:
-            self._num_changes = client.num_changes
-            if others := ", ".join(client.other_publishers()):
-                raise CollectionError(f"{name} stopped: another process publishes {others}. End it")
-        measurement = client.measurement
-        silence = self._now - (1e-9 * measurement.arrival if measurement else 0.0)
-        if measurement is None or silence > SILENCE:
-            raise CollectionError(f"{name} stopped: no message on {client.namespace}/measured_js for {SILENCE:g} s")
-        if not is_new:
-            return
-        if measurement.problem:
-            raise CollectionError(f"{name} stopped: {measurement.problem}")
-        if jump := self._clock.convert(measurement.stamp, measurement.arrival)[1]:
-            raise CollectionError(f"{name} stopped: {client.namespace}/measured_js: {jump}")
-        if unheard := client.unheard_commands(("move_jp", "hold")):
-            raise CollectionError(f"{name} stopped: no process subscribes to {', '.join(unheard)}")
-        self._check_jump(measurement.q, measurement.stamp)
-        self._q, self._tau = measurement.q, measurement.effort
-        self._num_received, self._stamp = client.num_received, measurement.stamp
-        if not self.paused:
-            self._check_effort()
-
-    def _check_jump(self, q: NDArray[np.float64], stamp: int) -> None:
-        if not self._stamp:
-            return
-        limit = self._span * (JUMP + _JUMP_SPEED * 1e-9 * (stamp - self._stamp))
-        change = q - self._q
-        if np.any(np.abs(change) > limit):
-            j = int(np.argmax(np.abs(change) / limit))
-            raise CollectionError(
-                f"{self._arm.name} stopped: {self._arm.joint_names[j]} jumped by {change[j]:.3g} {self._unit(j)} "
-                "between two messages. Check the encoder and potentiometer of the joint"
-            )
-
-    def _check_effort(self) -> None:
-        excess = np.abs(self._tau - self._model.gravity_effort(self._q)) / self._arm.effort_limits
-        if not np.any(excess > self._settings.max_effort):
-            self._overload_since = None
-            return
-        if self._overload_since is None:
-            self._overload_since = self._now
-        if self._now - self._overload_since >= OVERLOAD:
-            j = int(np.argmax(excess))
-            unit = "N" if self._arm.prismatic[j] else "N m"
-            raise CollectionError(
-                f"{self._arm.name} stopped: the effort {self._tau[j]:.3g} {unit} of {self._arm.joint_names[j]} differs "
-                f"from the gravity effort of the model by {excess[j]:.2f} of its limit; allowed: "
-                f"{self._settings.max_effort:g} (--max-effort). Check for an obstacle"
-            )
-
     def _pause_or_continue(self) -> None:
         if not self.paused:
             self._client.hold()
@@ -257,11 +187,11 @@ class CrtkCollector:
 
     def _collect(self) -> Steps:
         """Measures the remaining poses. After a pause, a new call repeats the present pose from the beginning."""
-        if outside := self._arm.limit_violations(self._q, _START_TOLERANCE):
+        if outside := self._arm.limit_violations(self._monitor.q, _START_TOLERANCE):
             raise CollectionError(
                 f"{self._arm.name} cannot start: {'; '.join(outside)} [rad, m]. Move the arm inside its limits first"
             )
-        self._goal = self._q
+        self._goal = self._monitor.q
         for k in range(len(self._poses)):
             if not self.done[k] and k + 1 not in self.unsettled:
                 yield from self._measure_pose(k)
@@ -297,7 +227,7 @@ class CrtkCollector:
         before = next_goal = self._time
         while elapsed < path.duration:
             step, before = self._time - before, self._time
-            if np.all(np.abs(self._goal - self._q) <= self._tolerance):
+            if np.all(np.abs(self._goal - self._monitor.q) <= self._tolerance):
                 elapsed, waited = elapsed + step, 0.0
             elif (waited := waited + step) > STALL:
                 raise self._does_not_follow()
@@ -322,8 +252,8 @@ class CrtkCollector:
         while True:
             state = self._client.operating_state
             assert state is not None
-            near = np.all(np.abs(self._goal - self._q) <= self._tolerance)
-            if detector.is_at_rest(self._time, self._q) and near and not state.is_busy:
+            near = np.all(np.abs(self._goal - self._monitor.q) <= self._tolerance)
+            if detector.is_at_rest(self._time, self._monitor.q) and near and not state.is_busy:
                 return True
             if self._time > end:
                 if not near:
@@ -335,23 +265,20 @@ class CrtkCollector:
         """Returns the means of q (n,) and tau (n,), concatenated, over the messages of the next `MEASURE` seconds."""
         end = self._time + MEASURE
         samples: list[NDArray[np.float64]] = []
-        last = self._num_received
+        last = self._monitor.num_received
         while self._time < end or not samples:
-            if self._num_received != last:
-                samples.append(np.concatenate([self._q, self._tau]))
-                last = self._num_received
+            if self._monitor.num_received != last:
+                samples.append(np.concatenate([self._monitor.q, self._monitor.effort]))
+                last = self._monitor.num_received
             yield
         return np.mean(samples, axis=0)
 
     def _does_not_follow(self) -> CollectionError:
-        j = int(np.argmax(np.abs(self._goal - self._q) / self._tolerance))
+        j = int(np.argmax(np.abs(self._goal - self._monitor.q) / self._tolerance))
         return CollectionError(
-            f"{self._arm.name} stopped: it does not follow. {self._arm.joint_names[j]} is at {self._q[j]:.3g} "
-            f"{self._unit(j)}, its goal is {self._goal[j]:.3g} {self._unit(j)}. Check for an obstacle"
+            f"{self._arm.name} stopped: it does not follow. {self._arm.joint_names[j]} is at {self._monitor.q[j]:.3g} "
+            f"{unit(self._arm, j)}, its goal is {self._goal[j]:.3g} {unit(self._arm, j)}. Check for an obstacle"
         )
-
-    def _unit(self, joint: int) -> str:
-        return "m" if self._arm.prismatic[joint] else "rad"
 
 
 def approaches(arm: Arm, pose: NDArray[np.float64], settings: CollectionSettings) -> list[NDArray[np.float64] | None]:
