@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.ros.crtk_joint_group import JointGroup
 
 State = Literal["DISABLED", "ENABLED", "PAUSED", "FAULT"]
@@ -23,6 +24,8 @@ _STATE_COMMANDS = ("enable", "disable", "pause", "resume", "home", "unhome")
 _JOINT_COMMANDS = {"servo_jp": "positions", "move_jp": "positions", "servo_jf": "efforts"}
 #: Shortest time between two lines on refused commands [s].
 _QUIET = 2.0
+#: Tolerance for the norm of a quaternion.
+_QUATERNION_TOLERANCE = 0.01
 #: Largest number of characters of a text in a message.
 _MAX_TEXT = 40
 
@@ -191,8 +194,8 @@ class CrtkArmState:
         if not self.is_ready:
             return f"the arm is {self.describe()}; allowed: ENABLED, homed"
         if name in ("hold", "free"):
-            for group in self.groups:
-                group.hold() if name == "hold" else group.free()
+            for each in self.groups:
+                each.hold() if name == "hold" else each.free()
             return ""
         prefix, _, verb = name.rpartition("/")
         group = self._group(prefix)
@@ -216,8 +219,9 @@ class CrtkArmState:
         return self._main if not prefix else self._jaw if prefix == self._jaw_name else None
 
     def _servo_cp(self, pose: Sequence[float]) -> str:
-        if len(pose) != 7 or not np.all(np.isfinite(pose)) or not 0.5 < np.linalg.norm(pose[3:]) < 2.0:
-            return "the pose is not finite, or its quaternion is not a unit quaternion"
+        is_plausible = len(pose) == 7 and all(abs(value) < IMPLAUSIBLE for value in pose)
+        if not (is_plausible and abs(np.linalg.norm(pose[3:]) - 1.0) < _QUATERNION_TOLERANCE):
+            return f"the pose must have finite numbers below {IMPLAUSIBLE:g} and a unit quaternion"
         n = len(self._effort_limits)
         q = None if self._inverse is None else self._inverse(pose, self.desired_state[:n])
         if q is None:

@@ -120,7 +120,7 @@ class JointGroup:
             # A trajectory that replaces another one begins in motion and may exceed the limits.
             self.q = np.clip(position, self._lower, self._upper)
             if elapsed >= self._trajectory.duration:
-                self._trajectory = None
+                self._trajectory, self.v = None, np.zeros(len(q))
 
     def _change(self, mode: ControlMode) -> None:
         self.mode, self._trajectory = mode, None

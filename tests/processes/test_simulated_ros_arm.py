@@ -1,0 +1,227 @@
+"""`dvrk-drake arm --ros`: a real process over DDS in a network namespace, and refused options."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from command_output import refusal
+from own_network import end, inside, outside, run_inside, start
+from ros_publisher import DOMAIN_FILE
+from waiting import TIMEOUT
+
+from dvrk_drake.cli import main
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
+
+ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
+from dvrk_drake.systems.ros.messages import (  # noqa: E402
+    Bool,
+    Empty,
+    Header,
+    JointState,
+    OperatingState,
+    PoseStamped,
+    StringStamped,
+    TwistStamped,
+)
+
+COMMANDS = {
+    "state_command": StringStamped,
+    "servo_jp": JointState,
+    "servo_jf": JointState,
+    "move_jp": JointState,
+    "servo_cp": PoseStamped,
+    "hold": Empty,
+    "free": Empty,
+    "use_gravity_compensation": Bool,
+}
+STATES = {
+    "measured_js": JointState,
+    "setpoint_js": JointState,
+    "measured_cp": PoseStamped,
+    "setpoint_cp": PoseStamped,
+    "measured_cv": TwistStamped,
+    "gravity_compensation/setpoint_js": JointState,
+}
+
+
+class Client:
+    """Client of a simulated arm in another process."""
+
+    def __init__(self, arm, namespace, *options):
+        self.arm = load_arm(arm)
+        self.process = start(sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", *options)
+        self.domain, self.namespace = ros.RosDomain(), namespace
+        jaw = self.arm.separate_joint
+        self.num_main = self.arm.num_joints - bool(jaw)
+        jaw_commands = {f"jaw/{name}": JointState for name in ("servo_jp", "servo_jf", "move_jp")}
+        jaw_states = {f"jaw/{name}_js": JointState for name in ("measured", "setpoint")}
+        self.commands = {
+            name: self.domain.advertise(f"{namespace}/{name}", kind)
+            for name, kind in {**COMMANDS, **(jaw_commands if jaw else {})}.items()
+        }
+        states = {**STATES, **(jaw_states if jaw else {"gripper/measured_js": JointState})}
+        self.states = {name: self.domain.subscribe(f"{namespace}/{name}", kind) for name, kind in states.items()}
+        self.operating_state = self.subscribe_operating_state()
+        self.last, self.reached = {}, []
+        self.until(
+            lambda: (
+                all(command.num_subscribers() for command in self.commands.values())
+                and all(state.num_publishers() for state in self.states.values())
+            ),
+            "the topics are connected",
+        )
+
+    def subscribe_operating_state(self):
+        return self.domain.subscribe(f"{self.namespace}/operating_state", OperatingState, depth=100, latched=True)
+
+    def until(self, condition, what):
+        def updated():
+            assert self.process.poll() is None, self.process.stdout.read()
+            for name, subscription in self.states.items():
+                for message, _ in subscription.take():
+                    self.last[name] = message
+            self.reached += [message for message, _ in self.operating_state.take()]
+            return condition()
+
+        assert self.domain.wait_until(updated, TIMEOUT), what
+
+    def new(self, name):
+        """Returns the next message of a topic."""
+        self.last.pop(name, None)
+        self.until(lambda: name in self.last, name)
+        return self.last[name]
+
+    def send(self, name, *values):
+        kind = COMMANDS.get(name, JointState)
+        if kind is JointState:
+            field = "effort" if name.endswith("servo_jf") else "position"
+            message = JointState(Header.now(), **{field: [float(value) for value in values]})
+        elif kind is StringStamped:
+            message = StringStamped(Header.now(), values[0])
+        else:
+            message = kind(*values)
+        self.commands[name].publish(message)
+
+    def position(self):
+        return np.array(self.new("measured_js").position)
+
+    def home(self):
+        self.send("state_command", "enable")
+        self.send("state_command", "home")
+        self.until(lambda: self.reached and self.reached[-1].is_homed, "homed")
+
+
+@outside
+def test_runs_in_a_separate_network(request):
+    run_inside(request)
+
+
+@inside
+def test_client_controls_the_arm(monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    client = Client("mtml", "/MTML")
+    names = list(client.arm.joint_names)
+    message = client.new("measured_js")
+    assert (message.header.nanoseconds, message.name, message.position) == (0, [], []), "not homed: invalid"
+    client.send("servo_jf", *[0.0] * 7)
+    client.home()
+    described = [(state.state, state.is_homed, state.is_busy) for state in client.reached]
+    assert described == [("DISABLED", False, False), ("ENABLED", False, True), ("ENABLED", True, False)]
+    client.until(lambda: client.new("measured_js").header.nanoseconds, "valid")
+    for name in ("measured_js", "setpoint_js"):
+        message = client.new(name)
+        assert message.name == names and {len(message.position), len(message.velocity), len(message.effort)} == {7}
+    assert client.new("gripper/measured_js").position == [0.0]
+
+    goal = np.array([0.1, 0.2, -0.1, 0.1, 0.1, 0.1, 0.1])
+    client.send("move_jp", *goal)
+    client.until(lambda: client.reached[-1].is_busy, "busy")
+    client.until(lambda: not client.reached[-1].is_busy, "not busy")
+    client.until(lambda: np.max(np.abs(client.position() - goal)) < 2e-3, "the arm arrives at the goal")
+    np.testing.assert_allclose(client.new("setpoint_js").position, goal, rtol=0, atol=1e-12)
+    kinematics = CrtkKinematics(client.arm)
+    for name in ("measured_cp", "setpoint_cp"):
+        p = client.new(name).pose.position
+        np.testing.assert_allclose([p.x, p.y, p.z], kinematics.pose(goal).translation(), rtol=0, atol=5e-3)
+
+    # A cartesian target 5 mm away.
+    target = client.new("setpoint_cp")
+    target.pose.position.z += 0.005
+    client.commands["servo_cp"].publish(target)
+    client.until(lambda: abs(client.new("setpoint_cp").pose.position.z - target.pose.position.z) < 1e-6, "servo_cp")
+
+    client.send("use_gravity_compensation", True)
+    client.until(lambda: np.any(client.new("gravity_compensation/setpoint_js").effort), "gravity compensation")
+    client.send("servo_jf", *[0.0] * 7)
+    client.until(lambda: client.new("setpoint_js").effort == client.new("measured_js").effort, "efforts")
+    client.send("use_gravity_compensation", False)
+    before = client.position()
+    client.until(lambda: np.max(np.abs(client.position() - before)) > 0.1, "the arm falls")
+    assert client.new("setpoint_js").effort == [0.0] * 7
+    assert np.any(np.abs(client.new("measured_js").velocity) > 0.01)
+    twist = client.new("measured_cv").twist
+    assert np.all(np.isfinite([twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.x]))
+    client.send("hold")
+    client.until(lambda: np.any(client.new("setpoint_js").effort), "hold")
+    client.send("servo_jf", *[0.0] * 6)
+
+    # A subscription that joins later receives the operating state.
+    late = client.subscribe_operating_state()
+    received = []
+    assert client.domain.wait_until(lambda: received.extend(late.take()) or received, TIMEOUT)
+    assert (received[-1][0].state, received[-1][0].is_homed) == ("ENABLED", True)
+    client.send("state_command", "disable")
+    client.until(lambda: client.reached[-1].state == "DISABLED", "disabled")
+    output = end(client.process, 15)
+    for line in (
+        "simulated MTML on ROS domain 0, topics /MTML/...; press Ctrl-C to end",
+        "servo_jf refused: the arm is DISABLED; allowed: ENABLED, homed",
+        "ENABLED, homed, control mode effort, gravity compensation on",
+        "servo_jf refused: 6 efforts, allowed: 7",
+    ):
+        assert line in output, output
+    assert "late" in output.splitlines()[-1]
+
+
+@inside
+def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    client = Client("psm", "/dvrk/PSM2", "--topic", "/dvrk/PSM2", "--rate", "200", "--effects", "friction")
+    client.home()
+    client.until(lambda: client.new("measured_js").name == list(client.arm.joint_names[:6]), "six joints")
+    assert client.new("jaw/measured_js").name == ["jaw"]
+    client.send("jaw/move_jp", 0.3)
+    client.until(lambda: abs(client.new("jaw/measured_js").position[0] - 0.3) < 0.01, "the jaw opens")
+    client.send("servo_jp", 0.0, 0.0, 0.05, 0.0, 0.0, 0.0)
+    client.until(lambda: abs(client.position()[2] - 0.05) < 2e-3, "insertion")
+    end(client.process, 15)
+
+
+@outside
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--ros", "--lcm-url", "memq://"], "--driver, --lcm-url, --key and --meshcat cannot be used with --ros"),
+        (["--rate", "500"], "--topic, --domain, --rate, --model and --effects require --ros"),
+        (["--ros", "--rate", "5000"], "rate is 5000; allowed: 10..1000 Hz"),
+        (["--ros", "--domain", "300"], "domain is 300; allowed: 0..232"),
+        (["--ros", "--model", "missing.yaml"], "missing.yaml"),
+        (["--ros", "--effects", "magic"], "magic"),
+    ],
+)
+def test_wrong_options_are_refused(options, message, capsys):
+    assert main(["arm", "--arm", "mtml", *options]) == 2
+    assert message in refusal(capsys.readouterr().err)
+
+
+@outside
+def test_package_is_required():
+    code = (
+        "import sys; sys.modules['cyclonedds'] = None; from dvrk_drake.cli import main; "
+        "sys.exit(main(['arm', '--arm', 'mtml', '--ros']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    assert done.returncode == 2
+    assert "ROS 2 needs the package cyclonedds: pip install cyclonedds" in done.stderr

@@ -1,0 +1,115 @@
+"""Cartesian pose, velocity and inverse kinematics of the simulated dVRK arm, against Drake and known positions."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
+
+ARMS = ("mtml", "mtmr", "psm")
+
+
+def numbers(X):
+    """Returns x, y, z and the quaternion x, y, z, w of a pose."""
+    rotation = X.rotation().ToQuaternion()
+    return [*X.translation(), rotation.x(), rotation.y(), rotation.z(), rotation.w()]
+
+
+@pytest.mark.parametrize(
+    ("name", "q", "p"),
+    [
+        # Wrist centre of an MTM at zero, and wrist yaw axis of a PSM for two insertions.
+        ("mtml", np.zeros(7), [0.0, -0.3645, -0.1288]),
+        ("mtmr", np.zeros(7), [0.0, -0.3645, -0.1288]),
+        ("psm", np.zeros(7), [0.0, 0.0, 0.0065]),
+        ("psm", [0, 0, 0.1, 0, 0, 0, 0], [0.0, 0.0, -0.0935]),
+    ],
+)
+def test_known_positions(name, q, p):
+    np.testing.assert_allclose(CrtkKinematics(load_arm(name)).pose(np.array(q, float)).translation(), p, atol=1e-12)
+
+
+def dh(theta, a, alpha, d, modified):
+    """Returns the transform of one row of a DH table, standard or modified (Craig)."""
+    x = RigidTransform(RotationMatrix.MakeXRotation(alpha), [a, 0, 0])
+    z = RigidTransform(RotationMatrix.MakeZRotation(theta), [0, 0, d])
+    return x @ z if modified else z @ x
+
+
+HALF = np.pi / 2
+#: Rows of the dVRK's DH tables: joint type, a [m], alpha, d [m], offset.
+TABLES = {
+    "mtml": [
+        ("r", 0, HALF, 0, -HALF),
+        ("r", 0.2794, 0, 0, -HALF),
+        ("r", 0.3645, -HALF, 0, HALF),
+        ("r", 0, HALF, 0.1506, 0),
+        ("r", 0, -HALF, 0, 0),
+        ("r", 0, HALF, 0, -HALF),
+        ("r", 0, 0, 0, HALF),
+    ],
+    "psm": [
+        ("r", 0, HALF, 0, HALF),
+        ("r", 0, -HALF, 0, -HALF),
+        ("p", 0, HALF, -0.4318, 0),
+        ("r", 0, 0, 0.4162, 0),
+        ("r", 0, -HALF, 0, -HALF),
+        ("r", 0.0091, -HALF, 0, -HALF),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_pose_is_the_product_of_the_dh_table(name):
+    arm = load_arm(name)
+    kinematics = CrtkKinematics(arm)
+    for q in arm.sample_poses(20, np.random.default_rng(0)):
+        X = RigidTransform()
+        for value, (kind, a, alpha, d, offset) in zip(q, TABLES[name], strict=False):
+            turn, slide = (value, 0.0) if kind == "r" else (0.0, value)
+            X = X @ dh(offset + turn, a, alpha, d + slide, modified=name == "psm")
+        np.testing.assert_allclose(kinematics.pose(q).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_pose_is_that_of_drake_and_velocity_is_its_derivative(name):
+    arm, generator = load_arm(name), np.random.default_rng(0)
+    kinematics, plant = CrtkKinematics(arm), make_arm_plant(arm)
+    context, frame = plant.CreateDefaultContext(), plant.GetFrameByName("dh_6" if name == "psm" else "dh_7")
+    for q in arm.sample_poses(20, generator):
+        set_arm_positions(plant, context, arm, q)
+        X = kinematics.pose(q)
+        np.testing.assert_allclose(X.GetAsMatrix4(), frame.CalcPoseInWorld(context).GetAsMatrix4(), rtol=0, atol=1e-15)
+        v, h = generator.normal(size=7), 1e-6
+        ahead, behind = kinematics.pose(q + h * v), kinematics.pose(q - h * v)
+        rotation = ahead.rotation().multiply(behind.rotation().inverse()).ToAngleAxis()
+        V = np.concatenate([rotation.angle() * rotation.axis(), ahead.translation() - behind.translation()]) / (2 * h)
+        np.testing.assert_allclose(kinematics.velocity(q, v), V, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_inverse_finds_near_poses_within_the_limits(name):
+    arm, generator = load_arm(name), np.random.default_rng(2)
+    kinematics = CrtkKinematics(arm)
+    lower, upper = arm.position_lower.copy(), arm.position_upper
+    if name == "psm":
+        lower[2] = 0.03  # at the remote centre of motion, yaw and pitch are not determined
+    for q in generator.uniform(lower, upper, (100, 7)):
+        goal = np.clip(q + 0.1 * generator.uniform(lower - upper, upper - lower), lower, upper)
+        X = kinematics.pose(goal)
+        found = kinematics.inverse(numbers(X), q)
+        assert found is not None and np.all((found >= arm.position_lower) & (found <= upper))
+        np.testing.assert_allclose(kinematics.pose(found).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=2e-7)
+        same = kinematics.inverse(numbers(kinematics.pose(q)), q)
+        np.testing.assert_allclose(same, q, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_unreachable_poses_are_refused(name):
+    arm = load_arm(name)
+    kinematics, q = CrtkKinematics(arm), np.clip(0.1, arm.position_lower, arm.position_upper)
+    pose = numbers(kinematics.pose(q))
+    for far in ([1.0, 1.0, 1.0], [0.0, 0.0, 1e5]):
+        assert kinematics.inverse([*far, *pose[3:]], q) is None
