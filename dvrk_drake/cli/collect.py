@@ -3,20 +3,74 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of, whole_number
 from dvrk_drake.cli.lcm import ControlledArm, ready_controller
-from dvrk_drake.cli.support import check_output, interrupt_ends_process, load_key, print_notes, print_written
+from dvrk_drake.cli.support import (
+    check_output,
+    interrupt_ends_process,
+    load_key,
+    print_notes,
+    print_written,
+    quiet_drake,
+)
 from dvrk_drake.errors import CollectionError, RecordingError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from dvrk_drake.models.arm import Arm as LoadedArm
+    from dvrk_drake.processes.collector import Collector
+    from dvrk_drake.processes.crtk_collector import CrtkCollector
     from dvrk_drake.processes.live_status import LiveLine
+    from dvrk_drake.recordings.pose_file import CollectionFile
 
 _TASK = one_of("Task (one is required)")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RosCollection:
+    """Options of `collect` for a dVRK arm on ROS 2."""
+
+    ros: Annotated[
+        bool,
+        Parameter(
+            show_default=False,
+            help="Use ROS 2 instead of LCM. The dVRK moves the arm (move_jp); needs --output.",
+        ),
+    ] = False
+    topic: Annotated[
+        str | None,
+        Parameter(metavar="TOPIC", help="With --ros: topic measured_js of the arm, or its namespace. Default: /<ARM>."),
+    ] = None
+    domain: Annotated[
+        int | None,
+        Parameter(
+            metavar="N", converter=whole_number, help="With --ros: ROS domain. Default: $ROS_DOMAIN_ID, or else 0."
+        ),
+    ] = None
+    max_effort: Annotated[
+        float | None,
+        Parameter(
+            metavar="SHARE",
+            help="With --ros: stop if an effort differs from the gravity effort of the model by this share of its "
+            "limit, 0.05 to 2. Default: 0.6.",
+        ),
+    ] = None
+    yes: Annotated[
+        bool, Parameter(show_default=False, help="With --ros: move the arm without a question on the terminal.")
+    ] = False
+
+
+_ROS = RosCollection()
 
 
 @app.command(group=HARDWARE)
@@ -85,10 +139,13 @@ def collect(
     seed: Seed = 0,
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
     traverse_time: Seconds = 5.0,
+    ros: RosCollection = _ROS,
 ) -> None:
-    """Collect static poses and their holding torques over LCM.
+    """Collect static poses and their holding torques over LCM or ROS 2.
 
-    After an interruption, run the same command again to continue.
+    After an interruption, run the same command again to continue. With --ros, the messages of each run are also written
+    to a new bag beside the CSV: POSES_1.mcap, POSES_2.mcap, ... Enter pauses the collection, and Ctrl-C ends it. In
+    both cases, the arm holds its pose.
 
     Args:
         poses: Pose file. With --output, the arm moves to the poses in this file. --teach and --random add poses to it.
@@ -99,6 +156,14 @@ def collect(
         both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
         traverse_time: Time to move a joint over its full range, 1 to 60 s. This time defines the speed between poses.
     """
+    if not ros.ros and ros != _ROS:
+        raise CollectionError("--topic, --domain, --max-effort and --yes require --ros")
+    if ros.ros and (controlled.lcm_url or controlled.key or controlled.realtime or controlled.reset):
+        raise CollectionError("--lcm-url, --key, --realtime and --reset cannot be used with --ros")
+    if ros.ros and output is None:
+        raise CollectionError(
+            "--ros requires --output; --random needs no arm, and --teach needs LCM (dvrk-drake bridge)"
+        )
     check_output(poses, overwrite=True)
     if random is not None:
         _add_random_poses(controlled.arm, poses, random, seed)
@@ -106,7 +171,8 @@ def collect(
         _teach(controlled, poses, at_rest)
     else:
         assert output is not None
-        _visit(controlled, poses, output, both_sides, traverse_time)
+        visit = _visit_over_ros if ros.ros else _visit
+        visit(controlled, poses, output, both_sides, traverse_time, ros)
 
 
 def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
@@ -159,26 +225,26 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
 
 
 def _visit(
-    controlled: ControlledArm, poses_file: str, output_file: str, both_sides: bool, traverse_time: float
+    controlled: ControlledArm,
+    poses_file: str,
+    output_file: str,
+    both_sides: bool,
+    traverse_time: float,
+    _: RosCollection,
 ) -> None:
-    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.collector import CollectionSettings, Collector
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 
     settings = CollectionSettings(traverse_time, both_sides)
-    arm = load_arm(controlled.arm)
-    poses = load_poses(poses_file, arm)
-    check_output(output_file, poses_file, controlled.model or "", overwrite=True)
-    output = CollectionFile(output_file, arm, both_sides)
+    arm, poses, output = _files(controlled, poses_file, output_file, both_sides)
     num_done = output.finished(poses).sum()
     if num_done == len(poses):
         print(f"{output_file}: contains all {len(poses)} poses already")
         return
     with interrupt_ends_process():
-        controller, link, _ = ready_controller(controlled, "hold")
+        controller, link, _period = ready_controller(controlled, "hold")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
@@ -195,6 +261,82 @@ def _visit(
         collector.close()
         line.clear()
         print(f"{output_file}: {collector.done.sum()} of {len(poses)} poses", flush=True)
+    _end(collector, stopped)
+
+
+def _visit_over_ros(
+    controlled: ControlledArm,
+    poses_file: str,
+    output_file: str,
+    both_sides: bool,
+    traverse_time: float,
+    options: RosCollection,
+) -> None:
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.processes.crtk_collection import Dialog, bag_path, run_crtk_collection
+    from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings
+    from dvrk_drake.processes.live_status import LiveLine
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.processes.teacher import EnterKey
+
+    quiet_drake()
+    settings = CrtkCollectionSettings(traverse_time, both_sides)
+    if options.max_effort is not None:
+        settings = CrtkCollectionSettings(traverse_time, both_sides, options.max_effort)
+    arm, poses, output = _files(controlled, poses_file, output_file, both_sides)
+    remaining = len(poses) - output.finished(poses).sum()
+    if not remaining:
+        print(f"{output_file}: contains all {len(poses)} poses already")
+        return
+    model = None if controlled.model is None else IdentifiedModel.load(controlled.model, arm)
+    line, bag = LiveLine(sys.stderr), bag_path(output_file)
+    with interrupt_ends_process():
+        stopped = stop_on_signals()
+    has_keys = sys.stdin is not None and sys.stdin.isatty()
+    enter = EnterKey(sys.stdin) if has_keys else lambda: False
+
+    def confirm() -> None:
+        if has_keys and not options.yes:
+            print("Clear the workspace of the arm. Enter starts the motion, Ctrl-C ends the command.", flush=True)
+            while not stopped() and not enter():
+                time.sleep(0.02)
+
+    print(f"{remaining} poses of {arm.name} remain; after Ctrl-C, the same command continues", flush=True)
+    dialog = Dialog(stopped, confirm, enter, _reporter(line), line.show)
+    collector = None
+    try:
+        collector = run_crtk_collection(
+            arm, poses, output, bag, settings, dialog, model=model, topic=options.topic, domain=options.domain
+        )
+    finally:
+        line.clear()
+    if collector is None:
+        raise KeyboardInterrupt
+    print(
+        f"{output_file}: {collector.done.sum()} of {len(poses)} poses; messages: {bag}; hold was published", flush=True
+    )
+    _end(collector, stopped)
+
+
+def _files(
+    controlled: ControlledArm, poses_file: str, output_file: str, both_sides: bool
+) -> tuple[LoadedArm, NDArray[np.float64], CollectionFile]:
+    """Returns the arm, the poses, and the output file, which may contain some of the poses.
+
+    Raises:
+        CollectionError: A file is not valid, or the output file has other poses.
+    """
+    from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
+
+    arm = load_arm(controlled.arm)
+    poses = load_poses(poses_file, arm)
+    check_output(output_file, poses_file, controlled.model or "", overwrite=True)
+    return arm, poses, CollectionFile(output_file, arm, both_sides)
+
+
+def _end(collector: Collector | CrtkCollector, stopped: Callable[[], bool]) -> None:
+    """Raises the error that ended a collection early, if there is one."""
     if collector.problem is not None:
         raise collector.problem
     if stopped():

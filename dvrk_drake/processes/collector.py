@@ -26,17 +26,17 @@ _MAX_STEP = 0.01
 _START = 10.0
 #: Position tolerance [rad], [m] of an arm at rest, to which 1.5 encoder counts are added. Time for which the arm must
 #: stay within the tolerance [s]. Time after which a pose is skipped if the arm has not come to rest [s].
-_REST, _REST_TIME, _SETTLE = (2e-3, 2e-4), 0.5, 10.0
+REST, REST_TIME, SETTLE = (2e-3, 2e-4), 0.5, 10.0
 #: Time over which measurements are averaged [s].
-_MEASURE = 0.25
+MEASURE = 0.25
 #: Duration of braking after a stop during a motion [s].
 _BRAKE = 0.3
 #: Largest allowed tracking error of a joint, as a fraction of the range of the joint.
-_MAX_TRACKING_ERROR = 0.1
+MAX_TRACKING_ERROR = 0.1
 #: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
 #: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
 #: the approach.
-_APPROACH = 0.3
+APPROACH = 0.3
 
 Steps = Generator[None, None, None]
 
@@ -103,8 +103,8 @@ class Collector:
         self._poses, self._controller, self._output = poses, controller, output
         self._settings, self._stopped, self._report = settings, stopped, report
         span = arm.position_upper - arm.position_lower
-        self._speed, self._tracking_tolerance = span / settings.traverse_time, _MAX_TRACKING_ERROR * span
-        self._approach = _APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
+        self._speed, self._tracking_tolerance = span / settings.traverse_time, MAX_TRACKING_ERROR * span
+        self._approach = APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
         self._time, self._status_time = 0.0, 0.0
         self._answers, self._last_applied = AnswerTimes(), lcmt_dvrk_status()
         self._q = self._tau = np.zeros(arm.num_joints)
@@ -212,7 +212,7 @@ class Collector:
             self._activity = f"settling at pose {k + 1}"
             if not (yield from self._settle()):
                 self.unsettled.append(k + 1)
-                self._report(f"pose {k + 1} skipped: the arm did not come to rest within {_SETTLE:.0f} s")
+                self._report(f"pose {k + 1} skipped: the arm did not come to rest within {SETTLE:.0f} s")
                 return
             self._activity = f"measuring pose {k + 1}"
             measured.append((yield from self._measure()))
@@ -233,10 +233,10 @@ class Collector:
         self._desired = trajectory.state(trajectory.duration)
 
     def _settle(self) -> Generator[None, None, bool]:
-        """Waits until the arm is at rest. Returns False if it does not come to rest within `_SETTLE`."""
-        tolerance = self._arm.per_joint(*_REST) + 1.5 * self._arm.encoder_counts()
-        detector = RestDetector(tolerance, _REST_TIME)
-        end = self._time + _SETTLE
+        """Waits until the arm is at rest. Returns False if it does not come to rest within `SETTLE`."""
+        tolerance = self._arm.per_joint(*REST) + 1.5 * self._arm.encoder_counts()
+        detector = RestDetector(tolerance, REST_TIME)
+        end = self._time + SETTLE
         while not detector.is_at_rest(self._time, self._q):
             if self._time > end:
                 return False
@@ -244,8 +244,8 @@ class Collector:
         return True
 
     def _measure(self) -> Generator[None, None, NDArray[np.float64]]:
-        """Returns the means of q (n,) and tau (n,), concatenated, over the next `_MEASURE` seconds."""
-        end = self._time + _MEASURE
+        """Returns the means of q (n,) and tau (n,), concatenated, over the next `MEASURE` seconds."""
+        end = self._time + MEASURE
         samples = []
         while self._time < end:
             samples.append(np.concatenate([self._q, self._tau]))

@@ -6,6 +6,7 @@ The topic names are those of CRTK (Collaborative Robotics Toolkit, https://crtk-
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -270,10 +271,19 @@ class CrtkClient:
         """Waits until the arm has confirmed the last `hold`, at most `seconds`. Returns whether it has."""
         return self._hold.wait_until_received(seconds)
 
-    def unheard_commands(self) -> list[str]:
-        """Returns the command topics servo_jp, servo_jf and hold to which no process subscribes."""
-        publishers: tuple[Publisher, ...] = (self._servo_jp, self._servo_jf, self._hold)
-        return [publisher.topic for publisher in publishers if not publisher.num_subscribers()]
+    def unheard_commands(self, names: Sequence[str] = ("servo_jp", "servo_jf", "hold")) -> list[str]:
+        """Returns the command topics to which no process subscribes.
+
+        Args:
+            names: Names of the commands to check: servo_jp, servo_jf, move_jp or hold.
+        """
+        publishers: dict[str, Publisher] = {
+            "servo_jp": self._servo_jp,
+            "servo_jf": self._servo_jf,
+            "move_jp": self._move_jp,
+            "hold": self._hold,
+        }
+        return [publishers[name].topic for name in names if not publishers[name].num_subscribers()]
 
     def other_publishers(self) -> list[str]:
         """Returns the topics on which another process of the domain could move the arm, see `other_publishers`."""

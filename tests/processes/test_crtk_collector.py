@@ -1,0 +1,189 @@
+"""CrtkCollector with a substitute for the arm, without DDS."""
+
+import numpy as np
+import pytest
+from substitute_crtk_arm import PERIOD, Collection, SubstituteArm
+
+from dvrk_drake.errors import CollectionError
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.processes.crtk_collection import bag_path, summary
+from dvrk_drake.processes.crtk_collector import GOAL_PERIOD, CrtkCollectionSettings, estimated_duration
+from dvrk_drake.recordings.reading import read_recording
+
+pytest.importorskip("cyclonedds", reason="needs cyclonedds")
+
+MTML = load_arm("mtml")
+POSES = MTML.sample_poses(2, np.random.default_rng(0), margin=0.1)
+
+
+@pytest.fixture
+def collection(tmp_path):
+    """Returns a collection of `POSES` with an arm at zero and dry friction."""
+    return Collection(SubstituteArm(MTML, 0.1 * MTML.effort_limits), POSES, tmp_path / "p.csv")
+
+
+def in_motion(collection):
+    """Returns a condition that is true during the motion to the first pose."""
+    return lambda: len(collection.arm.goals) > 3
+
+
+def test_friction_cancels_in_rows_and_approaches_are_from_both_sides(collection, tmp_path):
+    collector = collection.run()
+    assert collector.problem is None and collector.done.all() and not collector.unsettled
+    recording = read_recording(tmp_path / "p.csv")
+    np.testing.assert_allclose(recording.q, POSES, rtol=0, atol=1e-12)
+    gravity = [collection.arm.model.gravity_effort(q) for q in POSES]
+    np.testing.assert_allclose(recording.tau, gravity, rtol=0, atol=1e-12)
+    cells = (tmp_path / "p.csv").read_text().splitlines()
+    friction = np.array([row.split(",")[-7:] for row in cells[1:]], float)
+    np.testing.assert_allclose(friction, [0.1 * MTML.effort_limits] * 2, rtol=0, atol=1e-12)
+    assert collection.arm.commands == ["move_jp"]
+
+
+def test_goals_advance_slowly_on_a_line(collection):
+    collection.run()
+    goals = np.array(collection.arm.goals)
+    speed = (MTML.position_upper - MTML.position_lower) / 1.0
+    steps = np.abs(np.diff(goals, axis=0))
+    assert np.all(steps <= speed * (GOAL_PERIOD + 2 * PERIOD))
+    first = goals[: 1 + int(np.argmax(np.all(goals == goals[np.argmax(np.abs(goals[:, 6]))], axis=1)))]
+    progress = first @ first[-1] / (first[-1] @ first[-1])
+    np.testing.assert_allclose(first, np.outer(progress, first[-1]), rtol=0, atol=1e-9)
+
+
+def test_pause_holds_and_repeats_the_pose(collection):
+    arm = collection.arm
+    collection.run(in_motion(collection))
+    collection.keys = 1
+    collection.run(lambda: collection.collector.paused)
+    assert arm.commands == ["move_jp", "hold"] and "paused" in collection.collector.describe()
+    goals, end = len(arm.goals), arm.time + 5.0
+    arm.extra = 2 * MTML.effort_limits  # an operator may push the arm
+    collection.run(lambda: arm.time > end)
+    arm.extra = np.zeros(7)
+    assert len(arm.goals) == goals and collection.collector.paused
+    collection.keys = 1
+    assert collection.run().done.all() and not collection.collector.paused
+    assert arm.commands == ["move_jp", "hold", "move_jp"]
+    assert collection.lines[:2] == ["paused: the arm holds its pose; Enter continues", "continued"]
+
+
+def test_repeated_enter_does_not_continue(collection):
+    collection.run(in_motion(collection))
+    collection.keys = 10
+    end = collection.arm.time + 0.9
+    collection.run(lambda: collection.arm.time > end)
+    assert collection.collector.paused
+
+
+def test_stop_and_resume(tmp_path):
+    path, arm = tmp_path / "p.csv", SubstituteArm(MTML)
+    collector = Collection(
+        arm, POSES, path, stopped=lambda: path.exists() and path.read_bytes().count(b"\n") == 2
+    ).run()
+    assert collector.problem is None and collector.done.tolist() == [True, False]
+    again = Collection(arm, POSES, path)
+    assert again.collector.done.tolist() == [True, False]
+    assert again.run().done.all() and len(again.lines) == 1
+    with pytest.raises(CollectionError, match="not in the pose file"):
+        Collection(arm, POSES[:1] + 0.01, path)
+
+
+def disturb(arm, **changes):
+    for name, value in changes.items():
+        setattr(arm, name, value)
+
+
+def jump(arm):
+    arm.q = arm.q + np.eye(7)[2] * 0.1 * (MTML.position_upper - MTML.position_lower)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (
+            lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.65 * MTML.effort_limits),
+            "of shoulder_pitch differs from the",
+        ),
+        (lambda arm: disturb(arm, is_blocked=True), "it does not follow. "),
+        (lambda arm: disturb(arm, is_silent=True), "no message on /MTML/measured_js for 1 s"),
+        (lambda arm: disturb(arm, problem="/MTML/measured_js: a position is not finite"), "is not finite"),
+        (jump, "elbow_pitch jumped by 0.1"),
+        (lambda arm: disturb(arm, stamp_offset=-10 * 10**9), "the time stamp changed by -9.9"),
+        (lambda arm: disturb(arm, stamp_offset=10 * 10**9), "the time stamp changed by 10.0"),
+        (lambda arm: disturb(arm, state="DISABLED"), "operating_state is DISABLED"),
+        (lambda arm: disturb(arm, is_homed=False), "operating_state is ENABLED"),
+        (
+            lambda arm: disturb(arm, others=["/MTML/servo_jp"], num_changes=1),
+            "another process publishes /MTML/servo_jp",
+        ),
+        (lambda arm: disturb(arm, unheard=["move_jp"]), "no process subscribes to /MTML/move_jp"),
+    ],
+)
+def test_soft_stops(collection, fault, message):
+    collection.run(in_motion(collection))
+    fault(collection.arm)
+    goals, start = len(collection.arm.goals), collection.arm.time
+    problem = collection.run().problem
+    assert isinstance(problem, CollectionError) and str(problem).startswith("MTML stopped: ")
+    assert message in str(problem) and "\n" not in str(problem)
+    is_slow = "follow" in message or "1 s" in message
+    assert collection.arm.time - start < (3.0 if is_slow else 0.1)
+    # While an arm does not follow, its goal does not move away from it.
+    ahead = np.abs(np.array(collection.arm.goals[goals - 1 :]) - collection.arm.q)
+    span = MTML.position_upper - MTML.position_lower
+    assert np.all(ahead <= 0.1 * span + span * (GOAL_PERIOD + 2 * PERIOD)) or "jumped" in message
+
+
+def test_short_effort_peak_is_accepted(collection):
+    collection.run(in_motion(collection))
+    collection.arm.extra, end = 2 * MTML.effort_limits, collection.arm.time + 3.5 * PERIOD
+    collection.run(lambda: collection.arm.time > end)
+    collection.arm.extra = np.zeros(7)
+    assert collection.run().problem is None
+
+
+def test_pose_without_rest_is_skipped(tmp_path):
+    arm = SubstituteArm(MTML)
+    collection = Collection(arm, POSES[:1], tmp_path / "p.csv", both_sides=False)
+    receive, noise = arm.receive, np.random.default_rng(0)
+
+    def shaking():
+        is_new = receive()
+        arm.measurement.q = arm.measurement.q + noise.uniform(-0.02, 0.02, 7)
+        return is_new
+
+    arm.receive = shaking
+    collector = collection.run()
+    assert collector.unsettled == [1] and not collector.done.any() and collector.problem is None
+    assert "did not come to rest within 10 s" in collection.lines[0]
+
+
+def test_start_outside_the_limits_is_refused(collection):
+    collection.arm.q = MTML.position_upper + 0.1
+    assert "cannot start: outer_yaw = " in str(collection.run().problem)
+    assert not collection.arm.goals
+
+
+def test_estimated_duration(collection):
+    settings = CrtkCollectionSettings(1.0)
+    estimate = estimated_duration(MTML, np.zeros(7), POSES, settings)
+    start = collection.arm.time
+    collection.run()
+    assert 0.5 * estimate < collection.arm.time - start < 1.2 * estimate
+    lines = summary(MTML, np.zeros(7), POSES, settings)
+    assert len(lines) == 9 and lines[-1].startswith("2 poses, each approached from both sides; estimated duration 0.")
+    assert lines[1].startswith("outer_yaw            0.000")
+
+
+@pytest.mark.parametrize("value", [0.0, 2.5, float("nan")])
+def test_settings_are_checked(value):
+    with pytest.raises(CollectionError, match="max_effort"):
+        CrtkCollectionSettings(max_effort=value)
+
+
+def test_bag_path(tmp_path):
+    assert bag_path(tmp_path / "poses.csv") == tmp_path / "poses_1.mcap"
+    (tmp_path / "poses_1.mcap").touch()
+    (tmp_path / "poses_2.mcap").symlink_to("nowhere")
+    assert bag_path(tmp_path / "poses.csv") == tmp_path / "poses_3.mcap"
