@@ -94,6 +94,11 @@ def ros_qos(
         Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
         Policy.History.KeepLast(depth),
     ]
+    if latched:
+        # This history is for subscriptions that join later. By default, it has one message.
+        unlimited = -1
+        history = Policy.History.KeepLast(depth)
+        policies.append(Policy.DurabilityService(0, history, unlimited, unlimited, unlimited))
     if type_hash:
         policies.append(Policy.Userdata(f"typehash={type_hash};".encode()))
     if ignore_own:
@@ -307,7 +312,10 @@ class Publisher(Generic[Message]):
 
     def wait_until_received(self, seconds: float) -> bool:
         """Waits until all subscriptions have confirmed all messages, at most `seconds`. Returns whether they have."""
-        return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+        try:
+            return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+        except AttributeError:  # cyclonedds 11.0.1 raises this error instead of returning False after the time limit
+            return False
 
 
 class Subscription(Generic[Message]):
@@ -316,7 +324,7 @@ class Subscription(Generic[Message]):
     Attributes:
         topic: ROS 2 name of the topic.
         num_lost: Number of messages that DDS reported as lost.
-        num_malformed: Number of messages that are not of the type of this topic.
+        num_malformed: Number of messages with a text that is not UTF-8. DDS itself discards messages of another layout.
     """
 
     def __init__(

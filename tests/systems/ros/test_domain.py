@@ -1,0 +1,247 @@
+"""ROS 2 domain over DDS, with a second process in a network namespace."""
+
+import contextlib
+import itertools
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+
+import pytest
+import ros_arm
+from own_network import inside, outside, run_inside
+from ros_publisher import DOMAIN_FILE
+from waiting import TIMEOUT
+
+module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
+messages = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
+JointState, OperatingState, StringStamped = messages.JointState, messages.OperatingState, messages.StringStamped
+
+#: Numbers of domains. Each test has its own domain, without endpoints of other tests.
+DOMAINS = itertools.count(1)
+#: Time in which the end of a killed process must be detected [s]. The default of Cyclone DDS is 10 s.
+DETECTION = 5.0
+
+
+@outside
+def test_runs_in_a_separate_network(request):
+    run_inside(request)
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    joined = module.RosDomain(next(DOMAINS))
+    yield joined
+    joined.close()
+
+
+@pytest.fixture
+def arm(domain):
+    """Starts an arm in a process of its own."""
+    process = subprocess.Popen(
+        [sys.executable, ros_arm.__file__, domain.name.split()[-1]], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline() == "ready\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate(timeout=TIMEOUT)
+
+
+def joint_state(number):
+    return JointState(messages.Header(messages.Time(number, 0)), ["joint"], [], [], [float(number)])
+
+
+def received(domain, subscription, number):
+    """Waits for `number` messages of a subscription and returns them."""
+    found = []
+    domain.wait_until(lambda: found.extend(m for m, _ in subscription.take()) or len(found) >= number, TIMEOUT)
+    return found
+
+
+@inside
+def test_latched_states_reach_a_late_subscription(domain, arm):
+    volatile = domain.subscribe(ros_arm.STATE, OperatingState, depth=100)
+    assert domain.wait_until(volatile.num_publishers, TIMEOUT)
+    # The answer of the arm arrives after anything that the arm would send to the volatile subscription.
+    command, measured = domain.advertise(ros_arm.COMMAND, JointState), domain.subscribe(ros_arm.MEASURED, JointState)
+    assert domain.wait_until(lambda: command.num_subscribers() and measured.num_publishers(), TIMEOUT)
+    command.publish(joint_state(1))
+    assert received(domain, measured, 1) == [joint_state(1)]
+    assert volatile.take() == []
+    latched = domain.subscribe(ros_arm.STATE, OperatingState, depth=100, latched=True)
+    assert [m.state for m in received(domain, latched, len(ros_arm.STATES))] == ros_arm.STATES
+
+
+@inside
+def test_endpoints_are_discovered(domain, arm):
+    own = domain.advertise("/own", StringStamped)
+    state, joints = messages.type_hash(OperatingState), messages.type_hash(JointState)
+    expected = {
+        module.Endpoint(ros_arm.STATE, "crtk_msgs/msg/OperatingState", True, True, state, False),
+        module.Endpoint(ros_arm.MEASURED, "sensor_msgs/msg/JointState", True, False, joints, False),
+        module.Endpoint(
+            own.topic, "crtk_msgs/msg/StringStamped", True, False, messages.type_hash(StringStamped), is_own=True
+        ),
+    }
+    assert domain.wait_until(lambda: set(domain.publishers()) == expected, TIMEOUT), domain.publishers()
+    command = module.Endpoint(ros_arm.COMMAND, "sensor_msgs/msg/JointState", True, False, joints, False)
+    assert domain.wait_until(lambda: domain.subscribers() == [command], TIMEOUT), domain.subscribers()
+    assert domain.joint_state_topics() == {ros_arm.MEASURED: True}
+    assert own.num_subscribers() == 0
+    reader = domain.subscribe("/own", StringStamped, reliable=False)
+    assert domain.wait_until(lambda: own.num_subscribers() == 1 and reader.num_publishers() == 1, TIMEOUT)
+    best_effort = {(e.topic, e.reliable, e.is_own) for e in domain.subscribers()}
+    assert best_effort == {(ros_arm.COMMAND, True, False), ("/own", False, True)}
+
+
+@inside
+def test_endpoints_of_a_killed_process_vanish(domain, arm):
+    command = domain.advertise(ros_arm.COMMAND, JointState)
+    assert domain.wait_until(lambda: len(domain.publishers()) == 3 and command.num_subscribers() == 1, TIMEOUT)
+    arm.kill()
+    assert domain.wait_until(lambda: len(domain.publishers()) == 1, DETECTION)
+    assert domain.publishers()[0].is_own
+    assert domain.wait_until(lambda: not domain.subscribers() and not command.num_subscribers(), DETECTION)
+
+
+@inside
+def test_a_stopped_subscriber_does_not_stop_the_publisher(domain, arm):
+    command = domain.advertise(ros_arm.COMMAND, JointState)
+    assert domain.wait_until(command.num_subscribers, TIMEOUT)
+    arm.send_signal(signal.SIGSTOP)
+    begin = time.monotonic()
+    for number in range(5000):  # 5 s at 1 kHz, 1 MB
+        command.publish(joint_state(number))
+    # DDS may wait 100 ms for each message that does not fit into the history of the publisher.
+    assert time.monotonic() - begin < 50.0
+    assert not command.wait_until_received(0.01)
+
+
+@inside
+def test_depth_keeps_the_last_messages(domain):
+    subscriptions = [domain.subscribe("/depth", JointState, depth=depth) for depth in (1, 3)]
+    publisher = domain.advertise("/depth", JointState)
+    assert domain.wait_until(lambda: publisher.num_subscribers() == 2, TIMEOUT)
+    before = time.time_ns()
+    for number in range(10):
+        publisher.publish(joint_state(number))
+    after = time.time_ns()
+    assert publisher.wait_until_received(TIMEOUT)
+    for subscription, first in zip(subscriptions, (9, 7), strict=True):
+        samples = subscription.take()
+        assert [message for message, _ in samples] == [joint_state(number) for number in range(first, 10)]
+        assert all(before <= published <= after for _, published in samples)
+        assert subscription.take() == []
+
+
+@inside
+def test_arriving_message_wakes_up(domain):
+    subscription, publisher = domain.subscribe("/wake", JointState), domain.advertise("/wake", JointState)
+    assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
+    domain.clear()
+    assert not domain.wait(0.0)
+    publisher.publish(joint_state(1))
+    assert domain.wait(TIMEOUT)
+    assert not domain.wait(0.0)
+    assert len(subscription.take()) == 1
+    assert not domain.wait_until(lambda: False, 0.01)
+
+
+@inside
+def test_malformed_text_is_counted(domain):
+    from cyclonedds._clayer import ddspy_write
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    subscription = domain.subscribe("/text", StringStamped, depth=10)
+    topic = Topic(domain.participant, module.dds_topic("/text"), StringStamped)
+    writer = DataWriter(domain.participant, topic, qos=module.ros_qos(10))
+    assert domain.wait_until(subscription.num_publishers, TIMEOUT)
+    message = StringStamped(messages.Header(), "abc")
+    encoded = message.serialize(use_version_2=False)
+    for data in (encoded, encoded.replace(b"abc", b"\xff\xfe\xfd"), encoded, b"\xff" * 40, encoded):
+        # DDS itself refuses the last but one, which contains no text.
+        ddspy_write(writer._ref, data + bytes(-len(data) % 4))
+    assert received(domain, subscription, 3) == [message] * 3
+    assert (subscription.num_malformed, subscription.num_lost) == (1, 0)
+
+
+@inside
+def test_publisher_of_another_layout_is_not_received(domain):
+    from cyclonedds.idl import IdlStruct
+    from cyclonedds.idl.types import uint32
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    @dataclass
+    class Other(IdlStruct, typename=messages.dds_type_name(StringStamped)):
+        number: uint32 = 0
+
+    subscription = domain.subscribe("/other", StringStamped, depth=10)
+    topic = Topic(domain.participant, module.dds_topic("/other"), Other)
+    writer = DataWriter(domain.participant, topic, qos=module.ros_qos(10))
+    publisher = domain.advertise("/other", StringStamped)
+    assert domain.wait_until(lambda: len(domain.publishers()) == 2, TIMEOUT)
+    assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
+    writer.write(Other(1))
+    publisher.publish(StringStamped(string="a"))
+    assert received(domain, subscription, 1) == [StringStamped(string="a")]
+    assert subscription.num_publishers() == 1
+
+
+def payloads(frame):
+    """Yields the serialized messages of user topics in an Ethernet frame, see the DDSI-RTPS standard, 9.4."""
+    data_submessage, inline_qos, ipv4, udp = 0x15, 0x02, 0x0800, 17
+    if len(frame) < 42 or frame[12:14] != ipv4.to_bytes(2, "big") or frame[23] != udp:
+        return
+    rtps, position = frame[42:], 20
+    while rtps.startswith(b"RTPS") and position < len(rtps):
+        kind, flags, length = struct.unpack_from("<BBH", rtps, position)
+        begin = position + 4
+        position = begin + length if length else len(rtps)
+        body = rtps[begin:position]
+        if kind == data_submessage and not flags & inline_qos and body[11] & 0xC0 == 0:
+            yield body[4 + struct.unpack_from("<H", body, 2)[0] :]
+
+
+@inside
+def test_bytes_on_the_network_are_the_serialized_message_and_zeros(domain, arm):
+    publisher = domain.advertise(ros_arm.COMMAND, JointState)
+    assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
+    sent = [JointState(messages.Header(messages.Time(1, 2)), ["a" * k], [1.0], [], [2.0] * k) for k in range(9)]
+    sent += [JointState(name=["a" * k]) for k in range(9)]
+    captured = []
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) as network:
+        network.bind(("lo", 0))
+        network.setblocking(False)
+        for message in sent:
+            publisher.publish(message)
+            assert publisher.wait_until_received(TIMEOUT)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    captured += payloads(network.recv(1 << 16))
+    for message in sent:
+        encoded = message.serialize(use_version_2=False)
+        assert encoded + bytes(-len(encoded) % 4) in captured
+        if len(encoded) % 4:
+            assert encoded not in captured
+
+
+@inside
+@pytest.mark.parametrize("value", ["-1", "233", "1.0", "one"])
+def test_invalid_domain_is_refused(value, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", value)
+    with pytest.raises(module.DvrkDrakeError, match=f"ROS domain {value}: allowed: 0 to 232"):
+        module.RosDomain()
+
+
+@inside
+def test_configuration_of_the_user_is_kept(domain):
+    assert os.environ["CYCLONEDDS_URI"] == DOMAIN_FILE
