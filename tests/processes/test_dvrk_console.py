@@ -80,7 +80,7 @@ def test_servo_cp_reaches_a_measured_pose(tmp_path):
         wait_until(at_pose, "pose", console.process)
 
 
-def test_psm_changes_its_control_space_with_each_effort_of_the_jaw(tmp_path):
+def test_jaw_efforts_change_the_control_space(tmp_path):
     with start_console("PSM1", tmp_path, motion=True) as console:
         from dvrk_drake.systems.ros.messages import JointState
 

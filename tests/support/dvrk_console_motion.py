@@ -2,9 +2,9 @@
 
     python dvrk_console_motion.py PEER MTML --events events.log [--rate 1000] [--gravity-compensation gc.json]
 
-Additional topics: setpoint_js, measured_cp and measured_cv, the commands move_jp, servo_cp and move_cp, and the topics of
-the jaw of a PSM. Unlike with `run.py`, the PSM has an instrument, and thus six joints and a jaw. The console
-component sawSocketStreamer exchanges JSON objects with this process over UDP. The process ends with SIGINT or SIGTERM.
+Additional topics: setpoint_js, measured_cp and measured_cv, the commands move_jp, servo_cp and move_cp, and the topics
+of the jaw of a PSM. Unlike with `run.py`, the PSM has an instrument, and thus six joints and a jaw. The console's
+component sawSocketStreamer exchanges JSON objects with this process over UDP. SIGINT and SIGTERM end the process.
 """
 
 import argparse
