@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.processes.bridge import wait_for_arm
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, estimated_duration
 from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
 from dvrk_drake.recordings.pose_file import CollectionFile
@@ -184,12 +183,9 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
     Raises:
         DvrkDrakeError: The arm is not found or not ready, or another process could move it.
     """
-    from dvrk_drake.systems.ros.crtk_bridge import refuse_other_publishers
-    from dvrk_drake.systems.ros.crtk_client import CrtkClient, find_arm
+    from dvrk_drake.systems.ros.crtk_client import connect_client
 
-    client = CrtkClient(ros, arm, find_arm(ros, arm, topic))
-    refuse_other_publishers(client, ros.wait_until)
-    wait_for_arm(ros, client, ("move_jp", "hold"))
+    client = connect_client(ros, arm, topic, ("move_jp", "hold"))
     if reason := client.not_ready_reason:
         raise CollectionError(f"{client.namespace}: {reason}. Enable and home the arm at its console")
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
-from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_state
@@ -19,7 +18,7 @@ from dvrk_drake.systems.lcm.dvrk_command import draw_id
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
-from dvrk_drake.systems.ros.crtk_client import CrtkClient, find_arm, other_publishers
+from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess
 from dvrk_drake.systems.ros.domain import RosDomain
 
@@ -36,9 +35,8 @@ _NO_EFFORT = 1e-9
 #: Change of a command to the separate joint that is sent, as a fraction of the effort limit or of the range of the
 #: joint. Each command to this joint can change the control mode of the arm for a moment.
 _JAW_CHANGE = 0.01
-#: Longest time until the arm has sent its state and a measurement, and until it has confirmed `hold` [s]. Longest time
-#: until DDS detects the end of a killed process [s].
-_FIRST, _ENDED = 5.0, 3.0
+#: Longest time until the arm has confirmed `hold` [s].
+_CONFIRMATION = 5.0
 #: Time after which `hold` is repeated while no joint has a valid measurement, or `disable` in the state OFF [us].
 _REPEAT = 100_000
 #: Shortest time between two reports of problems with measured_js [us].
@@ -142,7 +140,7 @@ class CrtkBridge:
     def close(self) -> None:
         """Commands the arm to hold its present pose, and ends the deadman process."""
         self._client.hold()
-        self._client.wait_until_received(_FIRST)
+        self._client.wait_until_received(_CONFIRMATION)
         if self._deadman is not None:
             self._deadman.close()
 
@@ -324,17 +322,8 @@ def connect_bridge(
     """
     compile_guard(arm, driver)
     ros = RosDomain(domain)
-    namespace = find_arm(ros, arm, topic)
-    # The publishers of a new client would stop a bridge that already runs. So their check comes first. DDS considers a
-    # killed process as present for about a second.
-    if not ros.wait_until(lambda: not other_publishers(ros, arm, namespace), _ENDED):
-        raise ControllerError(
-            f"another process publishes {', '.join(other_publishers(ros, arm, namespace))}. Only one process may "
-            "command an arm: end the other one, e.g. another bridge, teleoperation or a script"
-        )
-    client = CrtkClient(ros, arm, namespace)
-    _wait_for_arm(ros, client)
-    deadman = DeadmanProcess(namespace, domain)
+    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"))
+    deadman = DeadmanProcess(client.namespace, domain)
     report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
     return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)
 
@@ -346,28 +335,3 @@ def compile_guard(arm: Arm, driver: DvrkDriver) -> None:
     zero = np.zeros(arm.num_joints)
     for utime in (1_000, 2_000, 3_000):
         guard.step(utime, utime, np.clip(zero, arm.position_lower, arm.position_upper), zero, zero)
-
-
-def _wait_for_arm(ros: RosDomain, client: CrtkClient) -> None:
-    """Waits for the operating state and the first measurement.
-
-    Raises:
-        ControllerError: A message did not arrive, the joints do not fit, or no process receives the commands.
-    """
-
-    def is_complete() -> bool:
-        client.receive()
-        return bool(client.operating_state and client.measurement and not client.unheard_commands())
-
-    if not ros.wait_until(is_complete, _FIRST):
-        missing = [
-            name
-            for name, message in (("measured_js", client.measurement), ("operating_state", client.operating_state))
-            if message is None
-        ]
-        if missing:
-            raise ControllerError(f"no message on {client.namespace}/{missing[0]} within {_FIRST:g} s")
-        raise ControllerError(f"no process subscribes to {', '.join(client.unheard_commands())}. Is it a dVRK?")
-    measurement = client.measurement
-    if measurement is not None and measurement.stamp and measurement.problem:
-        raise ControllerError(measurement.problem)

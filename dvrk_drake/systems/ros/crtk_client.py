@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
 from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
@@ -21,6 +21,9 @@ from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, Ope
 #: Longest time to wait for the topics of an arm [s]. Time to wait for other topics of the domain after the first one
 #: [s].
 _DISCOVERY, _OTHERS = 10.0, 1.0
+#: Longest time until the arm has sent its state and a measurement [s]. Longest time until DDS detects the end of a
+#: killed process [s].
+_FIRST, _ENDED = 5.0, 3.0
 #: Topics with which a client moves an arm. A second publisher on one of them could move the arm at the same time.
 MOTION_TOPICS = (
     "servo_jp",
@@ -271,7 +274,7 @@ class CrtkClient:
         """Waits until the arm has confirmed the last `hold`, at most `seconds`. Returns whether it has."""
         return self._hold.wait_until_received(seconds)
 
-    def unheard_commands(self, names: Sequence[str] = ("servo_jp", "servo_jf", "hold")) -> list[str]:
+    def unheard_commands(self, names: Sequence[str]) -> list[str]:
         """Returns the command topics to which no process subscribes.
 
         Args:
@@ -358,3 +361,43 @@ def find_arm(domain: RosDomain, arm: Arm, topic: str | None = None, seconds: flo
     domain.wait_until(lambda: False, min(_OTHERS, seconds))
     topics = {name: name for name in domain.joint_state_topics()}
     return choose_topic(domain.name, arm, topic, topics).rpartition("/")[0]
+
+
+def connect_client(domain: RosDomain, arm: Arm, topic: str | None, commands: Sequence[str]) -> CrtkClient:
+    """Finds an arm, and creates a client when the arm is present and no other process could move it.
+
+    Args:
+        domain: ROS domain of the arm.
+        arm: Arm.
+        topic: Topic measured_js of the arm or its namespace; see `find_arm`.
+        commands: Names of the commands to which the arm must subscribe, see `CrtkClient.unheard_commands`.
+
+    Raises:
+        RecordingError: No topic or several topics fit.
+        ControllerError: Another process could move the arm, no operating state or measurement arrives, the joints do
+            not fit, or no process receives the commands.
+    """
+    namespace = find_arm(domain, arm, topic)
+    # The publishers of a new client would stop a bridge that already runs. So their check comes first. DDS considers a
+    # killed process as present for about a second.
+    if not domain.wait_until(lambda: not other_publishers(domain, arm, namespace), _ENDED):
+        raise ControllerError(
+            f"another process publishes {', '.join(other_publishers(domain, arm, namespace))}. Only one process may "
+            "command an arm: end the other one, e.g. another bridge, teleoperation or a script"
+        )
+    client = CrtkClient(domain, arm, namespace)
+
+    def is_complete() -> bool:
+        client.receive()
+        return bool(client.operating_state and client.measurement and not client.unheard_commands(commands))
+
+    if not domain.wait_until(is_complete, _FIRST):
+        messages = {"measured_js": client.measurement, "operating_state": client.operating_state}
+        if missing := [name for name, message in messages.items() if message is None]:
+            raise ControllerError(f"no message on {namespace}/{missing[0]} within {_FIRST:g} s. Is it a dVRK?")
+        unheard = ", ".join(client.unheard_commands(commands))
+        raise ControllerError(f"no process subscribes to {unheard}. Is it a dVRK?")
+    measurement = client.measurement
+    if measurement is not None and measurement.stamp and measurement.problem:
+        raise ControllerError(measurement.problem)
+    return client
