@@ -71,8 +71,8 @@ class CrtkMonitor:
         topic, is_new = f"{client.namespace}/measured_js", client.receive()
         if reason := client.not_ready_reason:
             raise CollectionError(reason)
-        if client.num_changes != self._num_changes:
-            self._num_changes = client.num_changes
+        if client.domain.num_changes != self._num_changes:
+            self._num_changes = client.domain.num_changes
             if others := ", ".join(client.other_publishers()):
                 raise CollectionError(f"another process publishes {others}. End it")
         measurement = client.measurement
