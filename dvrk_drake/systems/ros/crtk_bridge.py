@@ -37,6 +37,8 @@ _NO_EFFORT = 1e-9
 _JAW_CHANGE = 0.01
 #: Time after which `hold` is repeated while no joint has a valid measurement, or `disable` in the state OFF [us].
 _REPEAT = 100_000
+#: Longest time from the reception of a measurement to the command that is published for it [us].
+_LATE = 20_000
 #: Longest time until the publishers of a killed process end [s].
 _ENDED = 3.0
 #: Shortest time between two reports of problems with measured_js [us].
@@ -179,7 +181,8 @@ class CrtkBridge:
         self._last_step = now
         if with_status:
             self._send_status(output)
-        if self._was_ready:
+        # A process that was suspended during this step must not send an old command.
+        if self._was_ready and self._clock.now() < now + _LATE:
             self._publish(output, now)
         self._describe()
 
