@@ -143,7 +143,7 @@ def started(arm: str, console_arm: str, realtime: bool, jaw: float = 0.0) -> Ite
         finally:
             bench.end()
             lines = Path(folder, "bridge.txt").read_text().splitlines()
-            print(*lines[-3:], sep="\n", file=sys.stderr)
+            print(*lines[-6:], sep="\n", file=sys.stderr)
 
 
 def measure(console: Console, bench: Bench, names: tuple[str, ...], number: int, kills: int) -> dict[str, list[float]]:
@@ -204,6 +204,7 @@ def main() -> None:
     """Prints one row per condition."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--kills", type=int, default=20, help="number of signals per condition; default: 20")
+    parser.add_argument("--condition", choices=CONDITIONS, help="measure only this condition")
     parser.add_argument("--realtime", action="store_true", help="use real-time scheduling for all processes")
     parser.add_argument("--jaw-seconds", type=float, default=0.0, help="time with efforts of a jaw [s]; default: 0")
     options = parser.parse_args()
@@ -221,6 +222,8 @@ def main() -> None:
         print("|---|---|---|---|---|---|---|---|")
         with started("mtml", "MTML", options.realtime) as (console, bench):
             for condition, (names, number) in CONDITIONS.items():
+                if options.condition not in (None, condition):
+                    continue
                 found = measure(console, bench, names, number, options.kills)
                 times = [
                     f"{1e3 * value:.1f}"

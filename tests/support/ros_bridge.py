@@ -1,70 +1,53 @@
-"""Bridge process and monitor of its ROS topics, for tests and benchmarks in a network namespace."""
+"""Bridge process, operator and monitor of ROS topics, for tests and benchmarks in a network namespace."""
 
-import subprocess
-import sys
-import threading
-from pathlib import Path
+import effort_controller
+import lcm
+from arm_observer import Observer
+from arm_processes import Forked, dvrk_drake
+from effort_controller import LENIENT_DRIVER, effort_command
+from waiting import wait_until
 
-from effort_controller import LENIENT_DRIVER
-from waiting import TIMEOUT, wait_until
-
-
-class LoggedProcess:
-    """Process whose output lines are stored while it runs.
-
-    Attributes:
-        lines: Lines of its output so far.
-    """
-
-    def __init__(self, *arguments):
-        command = [sys.executable, "-u", *map(str, arguments)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        self.lines = []
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self):
-        for line in self.process.stdout:
-            self.lines.append(line.rstrip("\n"))
-
-    @property
-    def pid(self):
-        return self.process.pid
-
-    def poll(self):
-        return self.process.poll()
-
-    def wait_for(self, text, after=0):
-        """Waits until a line after the first `after` lines contains a text. Returns this line."""
-
-        def find():
-            return next((line for line in self.lines[after:] if text in line), None)
-
-        try:
-            wait_until(find, text, self.process)
-        except AssertionError as error:
-            raise AssertionError(f"{error}; output: {self.lines}") from error
-        return find()
-
-    def wait(self):
-        """Waits until the process ends. Returns its exit code, after its last output is stored."""
-        code = self.process.wait(TIMEOUT)
-        # A deadman process of a killed bridge may still write.
-        self._thread.join(5.0)
-        return code
-
-    def end(self, number):
-        """Sends a signal and waits until the process ends. Returns its exit code."""
-        if self.poll() is None:
-            self.process.send_signal(number)
-        return self.wait()
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.lcm.dvrk_command import draw_id
 
 
 def start_bridge(arm, folder, *options):
     """Starts `dvrk-drake bridge` with a lenient guard; see `LENIENT_DRIVER`."""
-    driver = Path(folder) / "lenient.yaml"
+    driver = folder / "lenient.yaml"
     driver.write_text(LENIENT_DRIVER)
-    return LoggedProcess("-m", "dvrk_drake.cli", "bridge", "--arm", arm, "--driver", driver, *options)
+    return dvrk_drake("bridge", "--arm", arm, "--driver", driver, "--realtime", *options)
+
+
+def start_controller(arm, *options):
+    """Starts a controller that commands efforts of zero; see `effort_controller`."""
+    return Forked(effort_controller.main, arm, *options)
+
+
+def wait_for_line(process, text, after=0):
+    """Waits until the output of a process contains a text after a number of characters. Returns this line."""
+    wait_until(lambda: text in process.output()[after:], f"{text!r} in {process.output()!r}", process)
+    return next(line for line in process.output()[after:].splitlines() if text in line)
+
+
+class Operator(Observer):
+    """Observer that can also reset a fault of an arm."""
+
+    def reset(self, process):
+        """Commands HOLD with a reset until the guard holds the arm without a fault."""
+        network, sender_id, sequence = lcm.LCM(), draw_id(), 0
+        start = len(self.received)
+
+        def is_reset():
+            nonlocal sequence
+            sequence += 1
+            status = self.last
+            command = effort_command(status, [0.0] * status.num_joints, sender_id, sequence)
+            command.control_mode, command.reset_fault = Command.HOLD, sequence % 2 == 0
+            network.publish(f"DVRK_COMMAND_{status.arm_name}", command.encode())
+            return len(self.received) > start and status.guard_state == Status.STATE_HOLD and not status.fault_text
+
+        wait_until(is_reset, f"reset; {process.output()}", process)
 
 
 class CommandMonitor:

@@ -39,6 +39,8 @@ _JAW_CHANGE = 0.01
 _CONFIRMATION = 5.0
 #: Time after which `hold` is repeated while no joint has a valid measurement, or `disable` in the state OFF [us].
 _REPEAT = 100_000
+#: Longest time from the reception of a measurement to the command that is published for it [us].
+_LATE = 20_000
 #: Shortest time between two reports of problems with measured_js [us].
 _REPORT_PERIOD = 1_000_000
 
@@ -185,7 +187,8 @@ class CrtkBridge:
         self._last_step = now
         if with_status:
             self._send_status(output)
-        if self._was_ready:
+        # A process that was suspended during this step must not send an old command.
+        if self._was_ready and self._clock.now() < now + _LATE:
             self._publish(output, now)
         self._describe()
 

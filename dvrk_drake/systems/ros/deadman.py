@@ -30,7 +30,8 @@ _POLL = 0.005
 _CONFIRMATION = 1.0
 #: Longest time until a new deadman process is ready [s].
 _START = 20.0
-_READY = "ready"
+#: Lines with which the process reports whether it receives the commands of the bridge and can hold the arm.
+_READY, _BLIND = "ready", "blind"
 #: Real-time priority, above that of the other processes of this package.
 _PRIORITY = 60
 
@@ -59,24 +60,39 @@ class Deadman:
         self._hold = domain.advertise(f"{namespace}/hold", Empty)
         self._last_command: float | None = None
         self._last_published = 0
+        self._is_held = False
 
-    def run(self, stopped: Callable[[], bool], bridge: int | None = None) -> None:
+    def is_connected(self) -> bool:
+        """Returns whether the arm receives `hold`, and a process publishes the commands."""
+        return bool(self._hold.num_subscribers() and all(command.num_publishers() for command in self._commands))
+
+    def run(
+        self,
+        stopped: Callable[[], bool],
+        bridge: int | None = None,
+        report_connected: Callable[[bool], None] = lambda connected: None,
+    ) -> None:
         """Monitors the commands until `stopped` returns true, or until the bridge process ends.
 
         Args:
             stopped: Function that returns whether to stop.
             bridge: File descriptor of a pipe from the bridge process. The end of this process closes the pipe. None:
                 there is no such pipe.
+            report_connected: Function that is called with each change of `is_connected`.
         """
         pipes = [] if bridge is None else [bridge]
+        connected = False
         while not stopped():
+            if self.is_connected() != connected:
+                connected = not connected
+                report_connected(connected)
             ended = bool(select.select(pipes, [], [], _POLL)[0])
             self._update(time.monotonic())
             silence = 0.0 if self._last_command is None else time.monotonic() - self._last_command
             if silence > TIMEOUT:
                 self._publish_hold(f"no command for {1e3 * silence:.0f} ms")
             if ended:
-                if self._last_command is not None:
+                if not self._is_held:
                     self._publish_hold("the bridge has ended")
                 return
 
@@ -84,10 +100,11 @@ class Deadman:
         for subscription in self._commands:
             for _, published in subscription.take():
                 self._last_command, self._last_published = now, max(published, self._last_published)
+                self._is_held = False
         holds = [published for _, published in self._ends.take()]
         states = [state.state for state, _ in self._state.take()]
         if (holds and max(holds) >= self._last_published) or (states and states[-1] != "ENABLED"):
-            self._last_command = None
+            self._last_command, self._is_held = None, True
 
     def _publish_hold(self, reason: str) -> None:
         self._hold.publish(self._empty)
@@ -117,20 +134,29 @@ class DeadmanProcess:
         command = [sys.executable, "-m", __name__, namespace, "" if domain is None else str(domain)]
         # A session of its own, so that Ctrl-C in a terminal ends only the bridge.
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, text=True
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
         )
-        self.pid = self._process.pid
+        self.pid, self._is_blind = self._process.pid, False
         assert self._process.stdout is not None
         started = select.select([self._process.stdout], [], [], _START)[0]
-        if not started or self._process.stdout.readline().strip() != _READY:
+        if not started or not self._is_ready():
+            self._process.kill()
             self.close()
             raise DvrkDrakeError("the deadman process did not start. Without it, the bridge commands no arm")
 
     def problem(self) -> str:
-        """Returns a text if the process has ended, or "" while it runs."""
-        if self._process.poll() is None:
-            return ""
-        return "the deadman process has ended. Restart the bridge"
+        """Returns a text if the process has ended or receives no commands, or "" while it can hold the arm."""
+        if self._process.poll() is not None:
+            return "the deadman process has ended. Restart the bridge"
+        assert self._process.stdout is not None
+        if select.select([self._process.stdout], [], [], 0.0)[0]:
+            self._is_blind = not self._is_ready()
+        return "the deadman process is not connected to the topics of the arm" if self._is_blind else ""
+
+    def _is_ready(self) -> bool:
+        """Returns whether the last line that the process has written is `_READY`."""
+        assert self._process.stdout is not None
+        return self._process.stdout.read(4096).split()[-1:] == [_READY.encode()]
 
     def close(self) -> None:
         """Ends the process."""
@@ -150,6 +176,12 @@ def _report(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
+def _report_connected(connected: bool) -> None:
+    # The bridge may have ended.
+    with contextlib.suppress(OSError):
+        print(_READY if connected else _BLIND, flush=True)
+
+
 def main(namespace: str, domain: str) -> None:
     """Runs the deadman of a bridge, whose end closes the standard input."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -157,8 +189,9 @@ def main(namespace: str, domain: str) -> None:
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     deadman = Deadman(open_ros_domain(int(domain) if domain else None), namespace, _report)
-    print(_READY, flush=True)
-    deadman.run(lambda: False, sys.stdin.fileno())
+    deadman.run(lambda: False, sys.stdin.fileno(), _report_connected)
+    # Without the destructors of Cyclone DDS, which may wait for ever if another participant ends at the same time.
+    os._exit(0)
 
 
 if __name__ == "__main__":

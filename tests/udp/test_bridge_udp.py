@@ -1,0 +1,229 @@
+"""Bridge to the dVRK console: efforts, kills, failures of the console and of the network. All are real processes.
+
+This file starts itself again inside a network namespace. The console has no dynamics, so its guard is lenient, and the
+controllers command efforts of zero.
+"""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import time
+
+import pytest
+from dvrk_console import find_peer, start_console
+from own_network import NETWORK, inside, outside, run_inside
+from ros_bridge import CommandMonitor, Operator, start_bridge, start_controller, wait_for_line
+from ros_publisher import DOMAIN_FILE
+from waiting import wait_until
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+
+EFFORT, POSITION = "JOINT_SPACE/EFFORT_MODE", "JOINT_SPACE/POSITION_MODE"
+#: Environment of all processes. Each test file has a network of its own, so the number of the domain is free.
+os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
+
+
+@outside
+def test_runs_in_a_separate_network(request):
+    find_peer()
+    run_inside(request)
+
+
+@pytest.fixture(scope="module")
+def console(tmp_path_factory):
+    """Console of an MTML that is enabled and homed."""
+    with start_console("MTML", tmp_path_factory.mktemp("console")) as console:
+        console.enable_and_home()
+        yield console
+
+
+@pytest.fixture(scope="module")
+def operator():
+    operator = Operator("mtml")
+    yield operator
+    operator.end()
+
+
+@contextlib.contextmanager
+def running(*processes):
+    """Ends the processes with the block."""
+    try:
+        yield processes
+    finally:
+        for process in processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.end()
+
+
+def wait_for_mode(console, mode, *processes):
+    text = " ".join(process.output() for process in processes)
+    wait_until(lambda: console.modes()[-1:] == [mode], f"{mode}; {text}", console.process)
+
+
+def start_efforts(arm, folder, console, *options):
+    """Returns a bridge and a controller whose efforts act."""
+    bridge, controller = start_bridge(arm, folder, *options), start_controller(arm)
+    wait_for_line(bridge, "effort, sender")
+    wait_for_mode(console, EFFORT, bridge)
+    return bridge, controller
+
+
+@inside
+def test_wrong_domain_topic_and_arm_end_with_one_line(tmp_path):
+    """No publisher exists in the first case; in the others, another arm is there."""
+    cases = {
+        ("mtml", "--domain", "77"): "error: ROS domain 77: has no topic /MTML/measured_js. Topics with JointState "
+        "messages: none. Choose one with --topic TOPIC (topic= in Python).",
+        ("mtml", "--topic", "/MTMX"): "error: ROS domain 0: has no JointState topic /MTMX. Topics with JointState "
+        "messages: none.",
+        ("mtml", "--domain", "300"): "error: ROS domain 300: allowed: 0 to 232 (--domain, or ROS_DOMAIN_ID)",
+    }
+    start = time.monotonic()
+    processes = {case: start_bridge(case[0], tmp_path, *case[1:]) for case in cases}
+    with running(*processes.values()):
+        for case, process in processes.items():
+            assert process.wait() == 2
+            lines = [line for line in process.output().splitlines() if "warning: " not in line]
+            assert lines[0].startswith("connecting MTML to LCM")
+            assert lines[1:] == [f"dvrk-drake: {cases[case]}"]
+    # Most of this time is the longest time for discovery, 10 s.
+    assert time.monotonic() - start < 60.0
+
+
+@inside
+def test_efforts_act_and_other_bridge_is_refused(console, operator, tmp_path):
+    monitor = CommandMonitor(console.domain, "/MTML")
+    bridge, controller = start_efforts("mtml", tmp_path, console)
+    other, missing = start_bridge("mtml", tmp_path), start_bridge("mtmr", tmp_path)
+    with running(bridge, controller, other, missing):
+        assert "deadman process" in bridge.output()
+        assert "/MTML: switched off the dVRK's own gravity compensation" in bridge.output()
+        assert other.wait() == missing.wait() == 2
+        assert other.output().splitlines()[-1] == (
+            "dvrk-drake: error: another process publishes /MTML/move_jp, /MTML/servo_jf, /MTML/servo_jp. Only one "
+            "process may command an arm: end the other one, e.g. another bridge, teleoperation or a script"
+        )
+        assert "has no topic /MTMR/measured_js. Topics with JointState messages: /MTML/" in missing.output()
+        # The first bridge is not affected.
+        assert "fault" not in bridge.output()
+        assert operator.last.guard_state == Status.STATE_EFFORT
+        controller.end(signal.SIGKILL)
+        wait_for_line(bridge, "hold", after=bridge.output().index("effort, sender"))
+        wait_for_mode(console, POSITION, bridge)
+        before = time.time_ns()
+        assert bridge.end(signal.SIGINT).splitlines()[-1] == "bridge ended; hold was published"
+        assert bridge.poll() == 0
+        wait_until(lambda: monitor.first(["hold"], before), "hold")
+        assert "deadman: " not in bridge.output()[bridge.output().rindex("hold") :]
+    wait_for_mode(console, POSITION)
+
+
+@inside
+@pytest.mark.parametrize("killed", ["bridge", "both"])
+def test_deadman_holds_after_kill(console, tmp_path, killed):
+    bridge, controller = start_efforts("mtml", tmp_path, console)
+    with running(bridge, controller):
+        bridge.send_signal(signal.SIGKILL)
+        if killed == "both":
+            controller.send_signal(signal.SIGKILL)
+        wait_for_mode(console, POSITION, bridge)
+        wait_until(lambda: "deadman: /MTML: the bridge has ended; published hold at" in bridge.output(), "line")
+
+
+@inside
+def test_deadman_holds_while_bridge_is_stopped(console, operator, tmp_path):
+    bridge, controller = start_efforts("mtml", tmp_path, console)
+    with running(bridge, controller):
+        bridge.send_signal(signal.SIGSTOP)
+        wait_for_mode(console, POSITION, bridge)
+        assert re.search(r"deadman: /MTML: no command for \d+ ms; published hold at", bridge.output())
+        controller.end(signal.SIGKILL)
+        bridge.send_signal(signal.SIGCONT)
+        wait_until(lambda: operator.last.guard_state in (Status.STATE_HOLD, Status.STATE_FAULT), "hold", bridge)
+        assert console.modes()[-1] == POSITION
+
+
+@inside
+def test_bridge_without_its_deadman_refuses_efforts(console, operator, tmp_path):
+    bridge, controller = start_efforts("mtml", tmp_path, console)
+    with running(bridge, controller):
+        pid = int(re.search(r"deadman process (\d+)", bridge.output())[1])
+        os.kill(pid, signal.SIGKILL)
+        wait_for_line(bridge, "hold: the deadman process has ended. Restart the bridge")
+        wait_for_mode(console, POSITION, bridge)
+
+
+@inside
+def test_pause_of_console_and_network_loss_lead_to_a_fault(console, operator, tmp_path):
+    bridge, controller = start_efforts("mtml", tmp_path, console)
+    with running(bridge, controller):
+        for lose, restore in (
+            (lambda: console.process.send_signal(signal.SIGSTOP), lambda: console.process.send_signal(signal.SIGCONT)),
+            (lambda: network("ip link set lo down"), lambda: network(NETWORK)),
+        ):
+            length = len(bridge.output())
+            lose()
+            end = time.monotonic() + 1.0
+            wait_until(lambda end=end: time.monotonic() > end, "one second")
+            restore()
+            wait_for_line(bridge, "s old; allowed: 0 to 0.1 s", after=length)
+            operator.until(lambda status: status.guard_state == Status.STATE_FAULT, "status", process=bridge)
+            wait_for_mode(console, POSITION, bridge)
+            operator.reset(bridge)
+            wait_for_mode(console, EFFORT, bridge)
+
+
+def network(command):
+    subprocess.run(["sh", "-c", command], check=True)
+
+
+@inside
+def test_low_rate_is_refused_with_the_option_of_the_console(tmp_path):
+    with start_console("MTMR", tmp_path, rate=100.0) as slow:
+        slow.enable_and_home()
+        bridge, controller = start_bridge("mtmr", tmp_path), start_controller("mtmr")
+        with running(bridge, controller):
+            line = wait_for_line(bridge, "Hz; commands need 500 Hz")
+            assert re.fullmatch(
+                r"hold: /MTMR/measured_js arrives at \d+ Hz; commands need 500 Hz. Start the dVRK's console with a "
+                r"period of 1 ms: dvrk_system -j FILE.json -p 0.001",
+                line,
+            )
+        assert EFFORT not in slow.modes()
+
+
+@inside
+def test_jaw_does_not_change_the_control_space_of_a_psm(tmp_path):
+    with start_console("PSM1", tmp_path, motion=True) as psm:
+        psm.enable_and_home()
+        bridge, controller = start_efforts("psm", tmp_path, psm)
+        with running(bridge, controller):
+            monitor = CommandMonitor(psm.domain, "/PSM1", "jaw/servo_jf")
+            wait_until(lambda: monitor.first(["servo_jf"], 0), "efforts", bridge)
+            num_modes, start = len(psm.modes()), monitor.first(["servo_jf"], 0)
+            wait_until(lambda: monitor.first(["servo_jf"], start + 5 * 10**9), "efforts for 5 s", bridge)
+            assert not [mode for mode in psm.modes()[num_modes:] if "CARTESIAN" in mode]
+            assert "jaw/servo_jf" not in [name for name, *_ in monitor.messages]
+
+
+@inside
+def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
+    with start_console("MTML", tmp_path, domain=9) as console:
+        console.enable_and_home()
+        bridge, controller = start_efforts("mtml", tmp_path, console, "--domain", "9")
+    with running(bridge, controller):
+        wait_for_line(bridge, "fault: ")
+        with start_console("MTML", tmp_path, domain=9) as console:
+            wait_for_line(bridge, "/MTML/measured_js: header stamp 0 marks invalid data. Home the arm")
+            monitor = CommandMonitor(console.domain, "/MTML")
+            console.enable_and_home()
+            count = len(operator.received)
+            wait_until(lambda: len(operator.received) > count + 300, "statuses", bridge)
+            assert operator.last.guard_state == Status.STATE_FAULT
+            assert not [name for name, *_ in monitor.receive() if name != "hold"]
+            operator.reset(bridge)
+            wait_until(lambda: monitor.first(["servo_jp"], 0), "commands after the reset", bridge)
+            wait_for_mode(console, EFFORT, bridge)
