@@ -104,12 +104,12 @@ class CrtkArmState:
 
     @property
     def is_busy(self) -> bool:
-        """Whether the arm moves to the home pose or to the goal of `move_jp`."""
+        """True while the arm moves to the home pose or to the goal of `move_jp`."""
         return any(group.is_moving for group in self.groups)
 
     @property
     def is_powered(self) -> bool:
-        """Whether the motors have power."""
+        """True if the motors have power."""
         return self.state in ("ENABLED", "PAUSED")
 
     @property
@@ -180,7 +180,7 @@ class CrtkArmState:
 
     @property
     def is_ready(self) -> bool:
-        """Whether the arm accepts commands."""
+        """True if the arm accepts commands."""
         return self.state == "ENABLED" and self.is_homed
 
     def _receive(self, command: CrtkCommand, time: float) -> str:

@@ -54,12 +54,12 @@ class JointGroup:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the set-point follows a trajectory."""
+        """True while the set-point follows a trajectory."""
         return self._trajectory is not None
 
     @property
     def is_effort_controlled(self) -> bool:
-        """Whether the commanded effort acts."""
+        """True if the commanded effort acts."""
         return self.mode in ("effort", "free")
 
     def fault(self, values: Sequence[float], unit: str) -> str:

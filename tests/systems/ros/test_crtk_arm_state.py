@@ -120,7 +120,7 @@ def test_lines_on_changes_and_refusals():
     ]
 
 
-def test_efforts_act_without_time_limit_and_gravity_compensation_is_added():
+def test_efforts_act_without_time_limit():
     bench = Bench(MTM)
     assert np.all(bench.effort(9.0, 9.0) == 0)
     bench.home()
@@ -285,7 +285,7 @@ def random_command(generator):
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_random_commands_leave_the_state_finite_and_within_limits(name):
+def test_random_commands_keep_the_limits(name):
     arm, generator = ARMS[name], np.random.default_rng(3)
     bench, seen = Bench(arm), set()
     for _ in range(10_000):

@@ -172,7 +172,7 @@ def test_servo_cp_moves_the_last_frame(name):
     assert "servo_cp refused: the arm cannot reach the pose from the present set-point" in simulated.lines
 
 
-def test_arm_with_friction_stays_with_zero_efforts_on_top_of_gravity_compensation():
+def test_gravity_compensation_with_friction_keeps_the_pose():
     simulated = Simulated("mtml", ["friction"], gravity_compensation=True)
     simulated.home()
     simulated.wait(1.0)
