@@ -227,7 +227,7 @@ def payloads(frame):
 
 
 @inside
-def test_bytes_on_the_network_are_the_serialized_message_and_zeros(domain, arm):
+def test_bytes_on_the_network_end_with_zeros(domain, arm):
     publisher = domain.advertise(ros_arm.COMMAND, JointState)
     assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
     sent = [JointState(messages.Header(messages.Time(1, 2)), ["a" * k], [1.0], [], [2.0] * k) for k in range(9)]
