@@ -323,7 +323,6 @@ class Subscription(Generic[Message]):
 
     Attributes:
         topic: ROS 2 name of the topic.
-        num_lost: Number of messages that DDS reported as lost.
         num_malformed: Number of messages with a text that is not UTF-8. DDS itself discards messages of another layout.
     """
 
@@ -336,12 +335,25 @@ class Subscription(Generic[Message]):
         notify: Callable[[DataReader], None],
     ) -> None:
         """Subscribes to a topic, see `RosDomain.subscribe`."""
-        self.topic, self.num_lost, self.num_malformed = topic, 0, 0
+        self.topic, self.num_malformed = topic, 0
         self._message_type = message_type
-        self._listener = Listener(on_sample_lost=self._count_lost, on_data_available=notify)
+        self._lost = lost = [0]
+
+        def count_lost(reader: DataReader, status: Any) -> None:
+            # Cyclone DDS calls this function in a thread of its own.
+            lost[0] = status.total_count
+
+        # The listener must not refer to this object. In a reference cycle, cyclonedds frees the listener, but does not
+        # delete the reader in DDS, and the next event causes a segmentation fault.
+        listener = Listener(on_sample_lost=count_lost, on_data_available=notify)
         self._reader = DataReader(
-            participant, Topic(participant, dds_topic(topic), message_type), qos=qos, listener=self._listener
+            participant, Topic(participant, dds_topic(topic), message_type), qos=qos, listener=listener
         )
+
+    @property
+    def num_lost(self) -> int:
+        """Returns the number of messages that DDS reported as lost."""
+        return self._lost[0]
 
     def take(self) -> list[tuple[Message, int]]:
         """Returns the messages since the last call, with their times of publication [ns since 1970]."""
@@ -363,7 +375,3 @@ class Subscription(Generic[Message]):
     def num_publishers(self) -> int:
         """Returns the number of publishers whose messages are received."""
         return len(self._reader.get_matched_publications())
-
-    def _count_lost(self, reader: DataReader, status: Any) -> None:
-        # Cyclone DDS calls this function in a thread of its own.
-        self.num_lost = status.total_count
