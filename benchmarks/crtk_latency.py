@@ -1,0 +1,212 @@
+"""Measures the time from a measurement of a dVRK to the effort that answers it, through the bridge.
+
+    python benchmarks/crtk_latency.py [--seconds 20] [--realtime]
+
+This process plays the arm: it publishes `measured_js` at 1 kHz and receives `servo_jf`. The position and the effort of
+the last joint contain the number of the measurement. Three paths are measured in one run, one after the other:
+
+    echo of cyclonedds   a process that answers each JointState message with another one; encoder of cyclonedds
+    echo                 the same with the encoder of this package
+    bridge               `dvrk-drake bridge`, and over LCM a controller that answers each status with an effort
+
+The table lists the round-trip times and the measurements without an answer. The counters of the guard are printed
+below: commands that LCM lost, and commands that the guard refused.
+
+The benchmark requires a network namespace and multicast:
+
+    unshare -n sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
+                      exec python benchmarks/crtk_latency.py --realtime'
+
+Without root, use `unshare -rn`. A root user made by `unshare -r` is not permitted to use real-time scheduling.
+"""
+
+import argparse
+import multiprocessing
+import os
+import select
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
+
+import lcm
+import numpy as np
+from cyclonedds.idl import IdlStruct
+from effort_controller import LENIENT_DRIVER, effort_command
+from ros_publisher import DOMAIN_FILE
+
+from dvrk_drake import cli
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.lcm_messages import command_channel, status_channel
+from dvrk_drake.processes.pace import Pace, make_realtime
+from dvrk_drake.systems.lcm.dvrk_command import draw_id
+from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.messages import Empty, Header, JointState, OperatingState
+
+ARM = load_arm("mtml")
+N, NAMES = ARM.num_joints, list(ARM.joint_names)
+#: Numbers of measurements from 0 to 999 are sent as multiples of this position [rad] and effort [N m].
+UNIT, CYCLE = 1e-6, 1000
+
+
+def number(value: float) -> int:
+    """Returns the number of a measurement that a position or an effort contains."""
+    return round(value / UNIT)
+
+
+def echo(namespace: str, realtime: bool, plain: bool) -> None:
+    """Answers each measurement with an effort."""
+    if realtime:
+        make_realtime()
+    if plain:
+        JointState.serialize, JointState.deserialize = IdlStruct.serialize, classmethod(IdlStruct.deserialize.__func__)
+    domain = RosDomain()
+    measured = domain.subscribe(f"{namespace}/measured_js", JointState, depth=100)
+    answer = domain.advertise(f"{namespace}/servo_jf", JointState)
+    while True:
+        domain.wait(1.0)
+        for message, _ in measured.take():
+            answer.publish(JointState(Header.now(), effort=[0.0] * (N - 1) + message.position[-1:]))
+
+
+def controller(realtime: bool) -> None:
+    """Answers each status with an effort over LCM."""
+    if realtime:
+        make_realtime()
+    network, sender_id, sequence = lcm.LCM(), draw_id(), 0
+
+    def answer(channel: str, data: bytes) -> None:
+        nonlocal sequence
+        sequence += 1
+        status = lcmt_dvrk_status.decode(data)
+        command = effort_command(status, [0.0] * (N - 1) + [status.position[-1]], sender_id, sequence)
+        network.publish(command_channel(ARM), command.encode())
+
+    network.subscribe(status_channel(ARM), answer)
+    while True:
+        network.handle()
+
+
+def bridge(folder: str, realtime: bool) -> None:
+    """Runs the bridge with a guard that tolerates an arm without efforts."""
+    driver = Path(folder, "driver.yaml")
+    driver.write_text(LENIENT_DRIVER)
+    cli.main(["bridge", "--arm", "mtml", "--driver", str(driver), *(["--realtime"] if realtime else [])])
+
+
+class Arm:
+    """Arm at rest on ROS 2, which measures the time until its measurements are answered."""
+
+    def __init__(self, domain: RosDomain, namespace: str) -> None:
+        self._domain = domain
+        self._measured = domain.advertise(f"{namespace}/measured_js", JointState)
+        state = domain.advertise(f"{namespace}/operating_state", OperatingState, latched=True)
+        state.publish(OperatingState(Header.now(), "ENABLED", True, False))
+        self._gravity = domain.advertise(f"{namespace}/gravity_compensation/setpoint_js", JointState)
+        self._effort = domain.subscribe(f"{namespace}/servo_jf", JointState, depth=100)
+        self._others = [
+            domain.subscribe(f"{namespace}/{name}", kind) for name, kind in (("servo_jp", JointState), ("hold", Empty))
+        ]
+        self._keep = state
+        self.sent: list[float] = []
+        self.answered: dict[int, float] = {}
+
+    def run(self, seconds: float, needs_answer: bool) -> None:
+        """Publishes measurements at 1 kHz. The time counts from the first answer if `needs_answer`."""
+        end = time.monotonic() + seconds
+
+        def listen(duration: float) -> None:
+            until = time.monotonic() + duration
+            while (left := until - time.monotonic()) > 0:
+                self._domain.wait(left)
+                self._receive()
+
+        pace = Pace(1e-3, sleep=listen)
+        while time.monotonic() < end:
+            pace.wait()
+            k = len(self.sent)
+            position = [0.0] * (N - 1) + [UNIT * (k % CYCLE)]
+            self.sent.append(time.monotonic())
+            self._measured.publish(JointState(Header.now(), NAMES, position, [0.0] * N, [0.0] * N))
+            if k % 100 == 0:
+                self._gravity.publish(JointState(Header.now(), NAMES, [], [], [0.0] * N))
+                for subscription in self._others:
+                    subscription.take()
+            if needs_answer and not self.answered:
+                end = time.monotonic() + seconds
+
+    def _receive(self) -> None:
+        now, last = time.monotonic(), len(self.sent) - 1
+        for message, _ in self._effort.take():
+            # An answer is at most a few hundred periods old.
+            k = last - (last - number(message.effort[-1])) % CYCLE
+            if k >= 0:
+                self.answered.setdefault(k, now)
+
+    def trips(self) -> np.ndarray:
+        """Returns the round-trip times [s] between the first and the last answer, NaN for no answer."""
+        first, last = min(self.answered), max(self.answered)
+        # During the first second, the bridge starts commands.
+        return np.array([self.answered.get(k, np.nan) - self.sent[k] for k in range(first + 1000, last + 1)])
+
+
+def measure(name: str, seconds: float, realtime: bool, folder: str) -> np.ndarray:
+    """Measures one path."""
+    domain, namespace = RosDomain(), "/MTML" if name == "bridge" else f"/ECHO_{name[-3:].strip().upper()}"
+    arm = Arm(domain, namespace)
+    context = multiprocessing.get_context("spawn")
+    targets = (
+        [(bridge, (folder, realtime)), (controller, (realtime,))]
+        if name == "bridge"
+        else [(echo, (namespace, realtime, name != "echo"))]
+    )
+    processes = [context.Process(target=target, args=arguments) for target, arguments in targets]
+    statuses: list[lcmt_dvrk_status] = []
+    network = lcm.LCM()
+    network.subscribe(status_channel(ARM), lambda channel, data: statuses.append(data))
+    for process in processes:
+        process.start()
+    try:
+        arm.run(seconds, needs_answer=True)
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+    while select.select([network.fileno()], [], [], 0.0)[0]:
+        network.handle()
+    if statuses:
+        last = lcmt_dvrk_status.decode(statuses[-1])
+        counts = f"{last.num_accepted} accepted, {last.num_lost} lost, {last.num_refused} refused"
+        print(f"{name}: commands by the counters of the guard: {counts}", file=sys.stderr, flush=True)
+    return arm.trips()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--realtime", action="store_true")
+    options = parser.parse_args()
+    os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
+    if options.realtime:
+        for warning in make_realtime():
+            print(warning, file=sys.stderr)
+    scheduling = "real-time" if options.realtime else "normal"
+    print(f"| {scheduling} scheduling | p50 [ms] | p99 [ms] | p99.9 [ms] | max [ms] | without answer | p50 / echo |")
+    print("|---|---|---|---|---|---|---|")
+    p50 = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("echo of cyclonedds", "echo", "bridge"):
+            trips = measure(name, options.seconds, options.realtime, folder)
+            valid = 1e3 * trips[np.isfinite(trips)]
+            quantiles = np.quantile(valid, [0.5, 0.99, 0.999, 1.0])
+            p50[name] = quantiles[0]
+            numbers = " | ".join(f"{q:.2f}" for q in quantiles)
+            lost = f"{len(trips) - len(valid)} of {len(trips)}"
+            print(f"| {name} | {numbers} | {lost} | {quantiles[0] / p50['echo of cyclonedds']:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
