@@ -1,0 +1,58 @@
+"""Hardware station over ROS 2: one Diagram controls the simulated arm of another process."""
+
+import numpy as np
+import pytest
+import yaml
+from crtk_conformance import start_simulated_arm
+from effort_controller import LENIENT_DRIVER
+from own_network import inside, outside, run_inside
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from ros_publisher import DOMAIN_FILE
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.station_config import load_station_config, make_arm_station
+
+ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
+
+
+@outside
+def test_runs_in_a_separate_network(request):
+    run_inside(request)
+
+
+@inside
+def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    from dvrk_drake.systems.ros.messages import Empty, JointState
+
+    guard = yaml.safe_load(LENIENT_DRIVER)["guard"]
+    path = tmp_path / "station.yaml"
+    path.write_text(yaml.safe_dump({"arm": "mtml", "ros_driver": {"guard": guard}}))
+    config = load_station_config(path)
+    with start_simulated_arm("mtml", "MTML") as arm:
+        arm.enable_and_home()
+        before = np.array(arm.latest().position)
+        efforts = arm.domain.subscribe("/MTML/servo_jf", JointState, depth=1)
+        holds = arm.domain.subscribe("/MTML/hold", Empty)
+        station = make_arm_station(config, hardware=True)
+        with pytest.raises(ControllerError, match=r"another process publishes /MTML/move_jp, .*Only one process may"):
+            make_arm_station(config, hardware=True)
+        builder = DiagramBuilder()
+        add_closed_loop(builder, station, GravityPidController(IdentifiedModel.from_arm(station.arm)))
+        simulator = Simulator(builder.Build())
+        simulator.set_target_realtime_rate(1.0)
+        while not (applied := efforts.take()):
+            simulator.AdvanceTo(simulator.get_context().get_time() + 0.1)
+            assert simulator.get_context().get_time() < 60.0, "no effort was published"
+        simulator.AdvanceTo(simulator.get_context().get_time() + 0.5)
+        context = station.GetMyContextFromRoot(simulator.get_context())
+        measured = station.GetOutputPort("mtml.position_measured").Eval(context)
+        np.testing.assert_allclose(measured, before, rtol=0, atol=0.03)
+        gravity = IdentifiedModel.from_arm(station.arm).holding_torque(before[None])[0]
+        np.testing.assert_allclose(applied[-1][0].effort, gravity, rtol=0, atol=0.05)
+        # The Diagram no longer advances, so the deadman process holds the arm.
+        assert arm.domain.wait_until(lambda: bool(holds.take()), 20.0)
