@@ -31,6 +31,9 @@ _POLL = 0.01
 _DEPTH = 5000
 #: Longest time until the first valid measurement of a homed arm, and until the arm confirms `hold` [s].
 _FIRST, _CONFIRMATION = 5.0, 1.0
+#: Objects with subscriptions. Cyclone DDS may crash if a subscription is deleted while its listener is called, so none
+#: is deleted before the process ends.
+_KEPT: list[object] = []
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ def run_crtk_collection(
     control_model.gravity_effort(np.zeros(arm.num_joints))  # compiles the function
     remaining = poses[~output.finished(poses)]
     ros = open_ros_domain(domain)
+    _KEPT.append(ros)
     client = _connect(ros, arm, topic)
     assert client.measurement is not None
     for line in summary(arm, client.measurement.q, remaining, settings):
@@ -165,6 +169,7 @@ def run_crtk_collection(
         report=dialog.report,
     )
     recorder = MeasurementBag(ros, arm, client.namespace, bag)
+    _KEPT.append(recorder)
     try:
         while not collector.finished:
             ros.wait(_POLL)
@@ -188,6 +193,7 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
     from dvrk_drake.systems.ros.crtk_client import CrtkClient, find_arm
 
     client = CrtkClient(ros, arm, find_arm(ros, arm, topic))
+    _KEPT.append(client)
     refuse_other_publishers(client, ros.wait_until)
     wait_for_arm(ros, client, ("move_jp", "hold"))
     if reason := client.not_ready_reason:

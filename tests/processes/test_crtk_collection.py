@@ -24,6 +24,8 @@ ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclone
 from dvrk_drake.systems.ros.messages import Empty, Header, JointState, OperatingState, StringStamped  # noqa: E402
 
 MTML = load_arm("mtml")
+#: Domains of ended tests. Cyclone DDS may crash if a subscription is deleted while its listener is called.
+KEPT = []
 #: Poses near each other, so that the arm needs little time, but with different gravity efforts.
 POSES = MTML.sample_poses(6, np.random.default_rng(4), margin=0.3)
 
@@ -46,9 +48,11 @@ def simulated_arm(*options):
     process = start(sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", "mtml", "--ros", "--rate", "100", *options)
     try:
         domain = ros.RosDomain()
+        KEPT.append(domain)
         command = domain.advertise("/MTML/state_command", StringStamped)
         state = domain.subscribe("/MTML/operating_state", OperatingState, depth=100, latched=True)
         last = [OperatingState()]
+        KEPT.append(state)
 
         def wait(condition):
             def met():
@@ -86,9 +90,10 @@ def collect(folder, *options, poses=POSES):
 
 
 @inside
-def test_holding_torques_and_identified_model_of_an_arm_with_friction(tmp_path, capfd):
+def test_holding_torques_and_model_with_friction(tmp_path, capfd):
     with simulated_arm("--effects", "friction") as domain:
         hold = domain.subscribe("/MTML/hold", Empty, depth=10)
+        KEPT.append(hold)
         assert domain.wait_until(hold.num_publishers, 0.0) == 0
         assert collect(tmp_path) == 0
         assert domain.wait_until(lambda: len(hold.take()) > 0, TIMEOUT)
@@ -114,6 +119,7 @@ def test_holding_torques_and_identified_model_of_an_arm_with_friction(tmp_path, 
 def test_interrupted_collection_continues_in_a_second_bag(tmp_path, capfd):
     with simulated_arm() as domain:
         goals = domain.subscribe("/MTML/move_jp", JointState, depth=10)
+        KEPT.append(goals)
         command = [sys.executable, "-m", "dvrk_drake.cli", "collect", "--ros", "--arm", "mtml", "--no-both-sides"]
         process = start(*command, *files(tmp_path, POSES[:1]))
         assert domain.wait_until(lambda: len(goals.take()) > 0, TIMEOUT)
