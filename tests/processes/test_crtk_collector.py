@@ -27,7 +27,7 @@ def in_motion(collection):
     return lambda: len(collection.arm.goals) > 3
 
 
-def test_friction_cancels_in_rows_and_approaches_are_from_both_sides(collection, tmp_path):
+def test_friction_cancels_in_rows(collection, tmp_path):
     collector = collection.run()
     assert collector.problem is None and collector.done.all() and not collector.unsettled
     recording = read_recording(tmp_path / "p.csv")

@@ -211,12 +211,13 @@ class CrtkClient:
 
     def receive(self) -> bool:
         """Receives all messages that have arrived. Returns whether there is a new measurement."""
-        now, is_new = time.monotonic_ns(), False
+        is_new = False
         if self._jaw is not None:
             for message, _ in self._jaw.take():
-                self._reader.read_jaw(message, now)
+                self._reader.read_jaw(message, time.monotonic_ns())
         for message, _ in self._measured.take():
-            self.measurement, is_new = self._reader.read(message, now), True
+            # The time of arrival must not be earlier than the message, also if this process was suspended meanwhile.
+            self.measurement, is_new = self._reader.read(message, time.monotonic_ns()), True
             self.num_received += 1
         for state, _ in self._state.take():
             self.operating_state = state
