@@ -73,10 +73,23 @@ def run_bridge(
     with closing(DeadmanProcess(namespace, domain)) as deadman:
         report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
         network = lcm.LCM(url)
+        channel, problem = status_channel(arm), ""
+
+        def send_status(data: bytes) -> None:
+            # Without statuses, no command arrives, and the guard holds the arm.
+            nonlocal problem
+            try:
+                network.publish(channel, data)
+                problem = ""
+            except OSError as error:
+                if not problem:
+                    problem = f"LCM {url}: the status could not be sent: {error.strerror}"
+                    report(problem)
+
         bridge = CrtkBridge(
             client,
             driver,
-            lambda data: network.publish(status_channel(arm), data),
+            send_status,
             report=report,
             blocked=deadman.problem,
         )

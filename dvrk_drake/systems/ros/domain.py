@@ -298,7 +298,10 @@ class Publisher(Generic[Message]):
 
     def wait_until_received(self, seconds: float) -> bool:
         """Waits until all subscriptions have confirmed all messages, at most `seconds`. Returns whether they have."""
-        return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+        try:
+            return bool(self._writer.wait_for_acks(duration(seconds=seconds)))
+        except AttributeError:  # cyclonedds 11.0.1 raises this error when the time has elapsed
+            return False
 
 
 class Subscription(Generic[Message]):
