@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -104,6 +105,7 @@ def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
     operator, bridge = Operator("mtml"), start_bridge("mtml", tmp_path)
     try:
         wait_until(lambda: arm.monitor.first(["servo_jp"], 0), "first command", bridge)
+        operator.reset(bridge)  # on a busy computer, measurements may be late
         for change, line in BAD:
             length, arm.change = len(bridge.output()), change
             wait_for_line(bridge, line, after=length)
@@ -112,7 +114,8 @@ def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
             wait_until(lambda count=count: len(operator.received) > count + 50, "statuses", bridge)
             operator.reset(bridge)
             # The bridge reports at most one problem per second.
-            wait_until(lambda count=count: len(operator.received) > count + 1000, "statuses", bridge)
+            end = time.monotonic() + 1.1
+            wait_until(lambda end=end: time.monotonic() > end, "time until the next report", bridge)
         send_random_messages(arm)
         arm.set_state("ENABLED")
         count = len(operator.received)

@@ -32,6 +32,15 @@ def test_holds_the_first_pose_with_servo_jp(bench):
     assert bench.lines == [HOME, "hold: the rate of /MTML/measured_js is not known yet", "hold"]
 
 
+def test_nothing_happens_before_the_first_measurement(bench):
+    for _ in range(1000):
+        bench.now += MS
+        bench.bridge.update()
+    assert bench.sent == bench.statuses == bench.lines == []
+    bench.tick()
+    assert bench.status.guard_state == Status.STATE_HOLD
+
+
 def test_efforts_are_published_within_limits(bench):
     bench.started().clear()
     effort = 0.05 * ARMS["mtml"].effort_limits
