@@ -67,13 +67,15 @@ AFTER = 0.5
 LONGEST = 60.0
 #: Amplitude of the effort of the jaw [N m].
 JAW = 0.05
+#: Configuration of the bridge: default times, but the console measures no effort although gravity acts on the model.
+DRIVER = "guard: {resume_automatically: true, plausibility: {start_gravity: 2.0}}\n"
 EFFORT, POSITION = "JOINT_SPACE/EFFORT_MODE", "JOINT_SPACE/POSITION_MODE"
 
 
 def run_bridge(arm: str, folder: str, realtime: bool) -> None:
     """Runs `dvrk-drake bridge`; its output is appended to a file."""
     driver = Path(folder, "lenient.yaml")
-    driver.write_text(effort_controller.LENIENT_DRIVER)
+    driver.write_text(DRIVER)
     with open(Path(folder, "bridge.txt"), "a") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)

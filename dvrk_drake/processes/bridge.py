@@ -53,10 +53,20 @@ def run_bridge(
     # all other processes of its core.
     compile_guard(arm, driver)
     ready()
-    network, channel = lcm.LCM(url), status_channel(arm)
-    bridge = connect_bridge(
-        arm, driver, lambda data: network.publish(channel, data), topic=topic, domain=domain, report=report
-    )
+    network, channel, problem = lcm.LCM(url), status_channel(arm), ""
+
+    def send_status(data: bytes) -> None:
+        # Without statuses, no command arrives, and the guard holds the arm.
+        nonlocal problem
+        try:
+            network.publish(channel, data)
+            problem = ""
+        except OSError as error:
+            if not problem:
+                problem = f"LCM {url}: the status could not be sent: {error.strerror}"
+                report(problem)
+
+    bridge = connect_bridge(arm, driver, send_status, topic=topic, domain=domain, report=report)
     try:
         network.subscribe(command_channel(arm), lambda channel, data: bridge.put(data)).set_queue_capacity(_QUEUE)
         while not stopped():

@@ -34,7 +34,7 @@ class Operator(Observer):
     """Observer that can also reset a fault of an arm."""
 
     def reset(self, process):
-        """Commands HOLD with a reset until the guard holds the arm without a fault."""
+        """Commands HOLD with a reset until the guard has no fault."""
         network, sender_id, sequence = lcm.LCM(), draw_id(), 0
         start = len(self.received)
 
@@ -45,7 +45,7 @@ class Operator(Observer):
             command = effort_command(status, [0.0] * status.num_joints, sender_id, sequence)
             command.control_mode, command.reset_fault = Command.HOLD, sequence % 2 == 0
             network.publish(f"DVRK_COMMAND_{status.arm_name}", command.encode())
-            return len(self.received) > start and status.guard_state == Status.STATE_HOLD and not status.fault_text
+            return len(self.received) > start and status.guard_state not in (0, Status.STATE_FAULT)
 
         wait_until(is_reset, f"reset; {process.output()}", process)
 

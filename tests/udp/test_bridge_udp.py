@@ -140,10 +140,12 @@ def test_deadman_holds_while_bridge_is_stopped(console, operator, tmp_path):
         bridge.send_signal(signal.SIGSTOP)
         wait_for_mode(console, POSITION, bridge)
         assert re.search(r"deadman: /MTML: no command for \d+ ms; published hold at", bridge.output())
-        controller.end(signal.SIGKILL)
+        # All commands expire before the bridge continues.
+        wait_one_second()
+        num_modes = len(console.modes())
         bridge.send_signal(signal.SIGCONT)
-        wait_until(lambda: operator.last.guard_state in (Status.STATE_HOLD, Status.STATE_FAULT), "hold", bridge)
-        assert console.modes()[-1] == POSITION
+        operator.until(lambda status: status.guard_state == Status.STATE_FAULT, "fault", process=bridge)
+        assert EFFORT not in console.modes()[num_modes:]
 
 
 @inside
@@ -160,20 +162,26 @@ def test_bridge_without_its_deadman_refuses_efforts(console, operator, tmp_path)
 def test_pause_of_console_and_network_loss_lead_to_a_fault(console, operator, tmp_path):
     bridge, controller = start_efforts("mtml", tmp_path, console)
     with running(bridge, controller):
-        for lose, restore in (
-            (lambda: console.process.send_signal(signal.SIGSTOP), lambda: console.process.send_signal(signal.SIGCONT)),
-            (lambda: network("ip link set lo down"), lambda: network(NETWORK)),
-        ):
-            length = len(bridge.output())
-            lose()
-            end = time.monotonic() + 1.0
-            wait_until(lambda end=end: time.monotonic() > end, "one second")
-            restore()
-            wait_for_line(bridge, "s old; allowed: 0 to 0.1 s", after=length)
-            operator.until(lambda status: status.guard_state == Status.STATE_FAULT, "status", process=bridge)
-            wait_for_mode(console, POSITION, bridge)
-            operator.reset(bridge)
-            wait_for_mode(console, EFFORT, bridge)
+        console.process.send_signal(signal.SIGSTOP)
+        wait_one_second()
+        console.process.send_signal(signal.SIGCONT)
+        wait_for_line(bridge, "s old; allowed: 0 to 0.1 s")
+        wait_for_mode(console, POSITION, bridge)
+        operator.reset(bridge)
+        wait_for_mode(console, EFFORT, bridge)
+        length = len(bridge.output())
+        network("ip link set lo down")
+        wait_one_second()
+        network(NETWORK)
+        wait_for_line(bridge, "s old; allowed: 0 to 0.1 s", after=length)
+        assert "the status could not be sent: Network is unreachable" in bridge.output()
+        wait_for_mode(console, POSITION, bridge)
+        assert bridge.end(signal.SIGINT).splitlines()[-1] == "bridge ended; hold was published"
+
+
+def wait_one_second():
+    end = time.monotonic() + 1.0
+    wait_until(lambda: time.monotonic() > end, "one second")
 
 
 def network(command):
@@ -205,8 +213,11 @@ def test_jaw_does_not_change_the_control_space_of_a_psm(tmp_path):
             wait_until(lambda: monitor.first(["servo_jf"], 0), "efforts", bridge)
             num_modes, start = len(psm.modes()), monitor.first(["servo_jf"], 0)
             wait_until(lambda: monitor.first(["servo_jf"], start + 5 * 10**9), "efforts for 5 s", bridge)
-            assert not [mode for mode in psm.modes()[num_modes:] if "CARTESIAN" in mode]
-            assert "jaw/servo_jf" not in [name for name, *_ in monitor.messages]
+            names = [name for name, *_ in monitor.messages]
+            # On a busy computer, the guard may hold the arm for a moment. The jaw is then commanded again.
+            assert names.count("jaw/servo_jf") < 0.01 * names.count("servo_jf")
+            changes = sum("CARTESIAN" in mode for mode in psm.modes()[num_modes:])
+            assert changes <= names.count("jaw/servo_jf")
 
 
 @inside

@@ -131,7 +131,7 @@ class CrtkBridge:
         is_answer = not is_new and self._has_commands and not self._answered
         if is_new:
             self._measure(now)
-        elif not is_answer and now < self._last_step + _SILENCE:
+        elif not self._measured_utime or (not is_answer and now < self._last_step + _SILENCE):
             return
         self._answered = is_answer
         if self._has_commands:
