@@ -4,10 +4,12 @@ DDS (Data Distribution Service) is the middleware of ROS 2. The ROS 2 topic `/<A
 `rt/<ARM>/measured_js` (https://design.ros2.org/articles/topic_and_service_names.html).
 """
 
+import atexit
 import contextlib
 import os
 import select
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -32,6 +34,18 @@ from cyclonedds.util import duration
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.systems.ros.messages import JointState, dds_type_name, ros_type_name, type_hash
+
+#: Readers with a listener.
+_READERS: "weakref.WeakSet[DataReader]" = weakref.WeakSet()
+
+
+@atexit.register
+def _remove_listeners() -> None:
+    # At the end of the interpreter, a thread of Cyclone DDS that calls a listener would wait for ever, and the deletion
+    # of the reader would wait for this thread.
+    for reader in list(_READERS):
+        reader.set_listener(None)
+
 
 Message = TypeVar("Message", bound=IdlStruct)
 
@@ -112,7 +126,6 @@ class RosDomain:
     Attributes:
         name: Name of the domain, for messages, e.g. "ROS domain 0".
         participant: DDS participant.
-        num_changes: Number of times that publishers of the domain appeared or ended.
     """
 
     def __init__(self, domain: int | None = None) -> None:
@@ -127,14 +140,20 @@ class RosDomain:
         text = os.environ.get("ROS_DOMAIN_ID", "") or "0" if domain is None else str(domain)
         if not text.isdecimal() or int(text) > MAX_DOMAIN:
             raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
-        self.name, self.num_changes = f"ROS domain {text}", 0
-        self._listener = Listener(on_data_available=self._count_change)
+        self.name = f"ROS domain {text}"
+        self._changes = changes = [0]
+
+        def count_change(reader: DataReader) -> None:
+            # Cyclone DDS calls this function in a thread of its own. It must not refer to this object, see Subscription.
+            changes[0] += 1
+
         try:
             self.participant = _participant(int(text))
             self._publications = BuiltinDataReader(
-                self.participant, BuiltinTopicDcpsPublication, listener=self._listener
+                self.participant, BuiltinTopicDcpsPublication, listener=Listener(on_data_available=count_change)
             )
             self._subscriptions = BuiltinDataReader(self.participant, BuiltinTopicDcpsSubscription)
+            _READERS.add(self._publications)
         except DDSException as error:
             raise DvrkDrakeError(f"{self.name} cannot be used: {error}. Check the network and {_CONFIG}") from error
         self._alive = {
@@ -148,6 +167,11 @@ class RosDomain:
         """Leaves the domain. Publishers and subscriptions of this domain must not be used any more."""
         self.participant = self._publications = self._subscriptions = None
         self._alive = {}
+
+    @property
+    def num_changes(self) -> int:
+        """Number of times that publishers of the domain appeared or ended."""
+        return self._changes[0]
 
     def publishers(self) -> list[Endpoint]:
         """Returns the ROS 2 publishers discovered so far."""
@@ -239,10 +263,6 @@ class RosDomain:
         # Cyclone DDS calls this function in a thread of its own. A full pipe already wakes up the reader.
         with contextlib.suppress(BlockingIOError):
             os.write(self._wake, b"\0")
-
-    def _count_change(self, reader: DataReader) -> None:
-        # Cyclone DDS calls this function in a thread of its own.
-        self.num_changes += 1
 
     def _endpoints(self, reader: BuiltinDataReader) -> list[Endpoint]:
         found = []
@@ -349,6 +369,7 @@ class Subscription(Generic[Message]):
         self._reader = DataReader(
             participant, Topic(participant, dds_topic(topic), message_type), qos=qos, listener=listener
         )
+        _READERS.add(self._reader)
 
     @property
     def num_lost(self) -> int:
