@@ -146,11 +146,24 @@ class Arm:
             if k >= 0:
                 self.answered.setdefault(k, now)
 
+    def num_lost(self) -> int:
+        """Returns the number of efforts that DDS has lost."""
+        return self._effort.num_lost
+
     def trips(self) -> np.ndarray:
         """Returns the round-trip times [s] between the first and the last answer, NaN for no answer."""
         first, last = min(self.answered), max(self.answered)
         # During the first second, the bridge starts commands.
         return np.array([self.answered.get(k, np.nan) - self.sent[k] for k in range(first + 1000, last + 1)])
+
+
+def guard_counters() -> str:
+    """Returns the numbers of commands in the last status of the bridge."""
+    network, found = lcm.LCM(), []
+    network.subscribe(status_channel(ARM), lambda channel, data: found.append(lcmt_dvrk_status.decode(data)))
+    while not found and select.select([network.fileno()], [], [], 5.0)[0]:
+        network.handle()
+    return ", ".join(f"{getattr(found[-1], f'num_{name}')} {name}" for name in ("accepted", "lost", "refused"))
 
 
 def measure(name: str, seconds: float, realtime: bool, folder: str) -> np.ndarray:
@@ -164,23 +177,17 @@ def measure(name: str, seconds: float, realtime: bool, folder: str) -> np.ndarra
         else [(echo, (namespace, realtime, name != "echo"))]
     )
     processes = [context.Process(target=target, args=arguments) for target, arguments in targets]
-    statuses: list[lcmt_dvrk_status] = []
-    network = lcm.LCM()
-    network.subscribe(status_channel(ARM), lambda channel, data: statuses.append(data))
     for process in processes:
         process.start()
     try:
         arm.run(seconds, needs_answer=True)
+        if name == "bridge":
+            lost = f"lost on DDS: {arm.num_lost()} efforts; guard: {guard_counters()} commands"
+            print(lost, file=sys.stderr, flush=True)
     finally:
         for process in processes:
             process.kill()
             process.join()
-    while select.select([network.fileno()], [], [], 0.0)[0]:
-        network.handle()
-    if statuses:
-        last = lcmt_dvrk_status.decode(statuses[-1])
-        counts = f"{last.num_accepted} accepted, {last.num_lost} lost, {last.num_refused} refused"
-        print(f"{name}: commands by the counters of the guard: {counts}", file=sys.stderr, flush=True)
     return arm.trips()
 
 

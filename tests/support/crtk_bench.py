@@ -31,11 +31,13 @@ class SubstituteClient:
         #: Effort of the dVRK's own gravity compensation after it was switched off; None: no message arrives.
         self.gravity_after_switch = 0.0
 
-    def receive(self):
+    def receive_measurement(self):
         is_new, self.is_new = self.is_new, False
+        return is_new
+
+    def receive_state(self):
         if self.gravity_compensation is None:
             self.gravity_compensation = self.gravity_after_switch
-        return is_new
 
     def other_publishers(self):
         return self.others

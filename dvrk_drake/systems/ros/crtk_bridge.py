@@ -50,7 +50,8 @@ class CrtkBridge:
 
     Commands are LCM messages (lcmt_dvrk_command), which the caller passes to `put`. The bridge steps the guard once per
     measurement, and once more when a command that answers this measurement arrives. It publishes the output of the
-    guard on the ROS topics of the arm: efforts on `servo_jf`, positions on `servo_jp`.
+    guard on the ROS topics of the arm: efforts on `servo_jf`, positions on `servo_jp`. While each measurement is
+    answered, efforts are published only in the second step.
 
     The guard refuses POSITION and EFFORT, and ends them, in these cases:
 
@@ -95,7 +96,7 @@ class CrtkBridge:
             arm, draw_id(), ControlModel(checked), driver.guard, driver.accepted_modes(), self._clock.now
         )
         self._inbox = CommandInbox(self.guard, self._key)
-        self._has_commands = self._answered = False
+        self._has_commands = self._awaits_answer = self._was_answered = False
         self._status = lcmt_dvrk_status()
         self._status.arm_name, self._status.num_joints = arm.name, arm.num_joints
         self._measured_utime, self._last_step = 0, 0
@@ -125,19 +126,15 @@ class CrtkBridge:
         Raises:
             DvrkDrakeError: DDS cannot send a command to the arm.
         """
+        if self._has_commands and self._awaits_answer:
+            self._answer(self._clock.now())
         self._client.domain.clear()
-        is_new = self._client.receive()
+        is_new = self._client.receive_measurement()
         now = self._clock.now()
-        is_answer = not is_new and self._has_commands and not self._answered
         if is_new:
             self._measure(now)
-        elif not self._measured_utime or (not is_answer and now < self._last_step + _SILENCE):
-            return
-        self._answered = is_answer
-        if self._has_commands:
-            self._inbox.deliver(self.guard, now)
-            self._has_commands = False
-        self._step(now, with_status=not is_answer)
+        if is_new or (self._measured_utime and now >= self._last_step + _SILENCE):
+            self._step(now)
 
     def close(self) -> None:
         """Commands the arm to hold its present pose, and ends the deadman process."""
@@ -171,8 +168,14 @@ class CrtkBridge:
         is_valid = not problem
         self._measured = (measurement.q, measurement.v, measurement.effort) if is_valid else (self._nan,) * 3
 
-    def _step(self, now: int, *, with_status: bool) -> None:
+    def _step(self, now: int) -> None:
+        """Steps the guard after a measurement, or after a silence, and sends a status."""
         guard, client = self.guard, self._client
+        acts = guard.state in (lcmt_dvrk_status.STATE_POSITION, lcmt_dvrk_status.STATE_EFFORT)
+        if acts:
+            # The controller computes its answer during this step. The status has the guard's state after the last step.
+            self._send_status(guard.output)
+        client.receive_state()
         not_ready = client.not_ready_reason
         if not_ready:
             guard.report_fault(f"{client.namespace}: {not_ready}", has_power=False)
@@ -183,18 +186,36 @@ class CrtkBridge:
             guard.report_fault(others)
         self._blocked = self._block_reason()
         guard.block(self._blocked)
-        output = guard.step(now, self._measured_utime, *self._measured)
-        self._last_step = now
-        if with_status:
+        output = self._step_guard(now)
+        if not acts:
             self._send_status(output)
-        # A process that was suspended during this step must not send an old command.
-        if self._was_ready and self._clock.now() < now + _LATE:
+        # If the last measurement was answered, the efforts are published with the answer to this measurement. Without
+        # an answer, they are published in the next step.
+        is_effort = output.control_mode == lcmt_dvrk_command.EFFORT
+        if not (self._was_answered and is_effort and not self._blocked):
             self._publish(output, now)
+        self._awaits_answer, self._was_answered = True, False
         self._describe()
 
+    def _answer(self, now: int) -> None:
+        """Steps the guard after the command that answers the last measurement."""
+        self._publish(self._step_guard(now), now)
+        self._awaits_answer, self._was_answered = False, True
+
+    def _step_guard(self, now: int) -> GuardOutput:
+        """Passes the commands to the guard, and returns its output."""
+        if self._has_commands:
+            self._inbox.deliver(self.guard, now)
+            self._has_commands = False
+        self._last_step = now
+        return self.guard.step(now, self._measured_utime, *self._measured)
+
     def _publish(self, output: GuardOutput, now: int) -> None:
-        """Publishes the output of the guard on the topics of the arm."""
+        """Publishes the output of the guard on the topics of the arm, if the arm executes commands."""
         client = self._client
+        # A process that was suspended during this step must not send an old command.
+        if not self._was_ready or self._clock.now() >= now + _LATE:
+            return
         is_effort = output.control_mode == lcmt_dvrk_command.EFFORT
         all_implausible = np.all(output.joint_flags & lcmt_dvrk_status.FLAG_IMPLAUSIBLE)
         if all_implausible or (is_effort and self._blocked):

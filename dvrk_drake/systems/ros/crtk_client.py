@@ -84,7 +84,7 @@ class JointStateReader:
             arm: Arm with n joints.
             topic: Topic of the messages, for texts.
         """
-        self._arm, self._topic = arm, topic
+        self._arm, self._topic, self._names = arm, topic, list(arm.joint_names)
         self._main = [joint for joint in arm.joint_names if joint != arm.separate_joint]
         self._columns = np.array([arm.joint_names.index(joint) for joint in self._main])
         self._order: tuple[list[str] | None, list[int]] = (None, [])
@@ -101,11 +101,13 @@ class JointStateReader:
         blocks = np.full((3, self._arm.num_joints), np.nan)
         problem, stamp = self._problem(message), message.header.nanoseconds
         if not problem:
-            order = self._order[1]
             values = np.array([message.position, message.velocity, message.effort])
-            blocks[:, self._columns] = values[:, order]
-            if len(self._main) < self._arm.num_joints:
-                problem = self._add_jaw(blocks, arrival)
+            if message.name == self._names:
+                blocks = values
+            else:
+                blocks[:, self._columns] = values[:, self._order[1]]
+                if len(self._main) < self._arm.num_joints:
+                    problem = self._add_jaw(blocks, arrival)
         if not problem and not np.isfinite(blocks).all():
             problem = f"{self._topic}: a position, velocity or effort is not finite"
         if problem:
@@ -211,6 +213,12 @@ class CrtkClient:
 
     def receive(self) -> bool:
         """Receives all messages that have arrived. Returns whether there is a new measurement."""
+        is_new = self.receive_measurement()
+        self.receive_state()
+        return is_new
+
+    def receive_measurement(self) -> bool:
+        """Receives the measurements that have arrived. Returns whether there is a new one."""
         is_new = False
         if self._jaw is not None:
             for message, _ in self._jaw.take():
@@ -219,6 +227,10 @@ class CrtkClient:
             # The time of arrival must not be earlier than the message, also if this process was suspended meanwhile.
             self.measurement, is_new = self._reader.read(message, time.monotonic_ns()), True
             self.num_received += 1
+        return is_new
+
+    def receive_state(self) -> None:
+        """Receives the operating state and the efforts of the dVRK's own gravity compensation."""
         for state, _ in self._state.take():
             self.operating_state = state
         for message, _ in self._gravity.take():
@@ -226,7 +238,6 @@ class CrtkClient:
             is_complete = len(message.effort) == self.arm.num_joints and np.isfinite(message.effort).all()
             if message.header.nanoseconds and is_complete:
                 self.gravity_compensation = float(np.max(np.abs(message.effort)))
-        return is_new
 
     def take_other_hold(self) -> bool:
         """Returns whether another process has published `hold` since the last call."""

@@ -54,7 +54,9 @@ class Deadman:
         from dvrk_drake.systems.ros.messages import Empty, JointState, OperatingState
 
         self._namespace, self._report, self._empty = namespace, report, Empty()
-        self._commands = [domain.subscribe(f"{namespace}/{name}", JointState) for name in ("servo_jf", "servo_jp")]
+        self._commands = [
+            domain.subscribe(f"{namespace}/{name}", JointState, wakes=False) for name in ("servo_jf", "servo_jp")
+        ]
         self._ends = domain.subscribe(f"{namespace}/hold", Empty, ignore_own=True)
         self._state = domain.subscribe(f"{namespace}/operating_state", OperatingState, depth=100, latched=True)
         self._hold = domain.advertise(f"{namespace}/hold", Empty)

@@ -144,7 +144,7 @@ class RosDomain:
         self._changes = changes = [0]
 
         def count_change(reader: DataReader) -> None:
-            # Cyclone DDS calls this function in a thread of its own. It must not refer to this object, see Subscription.
+            # Cyclone DDS calls this function in a thread of its own. It must not refer to this object.
             changes[0] += 1
 
         try:
@@ -211,6 +211,7 @@ class RosDomain:
         reliable: bool = True,
         latched: bool = False,
         ignore_own: bool = False,
+        wakes: bool = True,
     ) -> "Subscription[Message]":
         """Subscribes to a topic.
 
@@ -221,11 +222,12 @@ class RosDomain:
             reliable: Whether lost messages are sent again. Must be False if a publisher is best-effort.
             latched: Whether earlier messages of a latched topic are received.
             ignore_own: Whether to ignore the publishers of this object.
+            wakes: Whether a message makes the file descriptor readable. If not, receiving needs less computing time.
         """
         qos = ros_qos(
             depth, reliable=reliable, latched=latched, type_hash=type_hash(message_type), ignore_own=ignore_own
         )
-        return Subscription(self.participant, topic, message_type, qos, self._notify)
+        return Subscription(self.participant, topic, message_type, qos, self._notify if wakes else None)
 
     def fileno(self) -> int:
         """Returns a file descriptor that is readable after a message of a subscription has arrived."""
@@ -352,7 +354,7 @@ class Subscription(Generic[Message]):
         topic: str,
         message_type: type[Message],
         qos: Qos,
-        notify: Callable[[DataReader], None],
+        notify: Callable[[DataReader], None] | None,
     ) -> None:
         """Subscribes to a topic, see `RosDomain.subscribe`."""
         self.topic, self.num_malformed = topic, 0
@@ -365,7 +367,9 @@ class Subscription(Generic[Message]):
 
         # The listener must not refer to this object. In a reference cycle, cyclonedds frees the listener, but does not
         # delete the reader in DDS, and the next event causes a segmentation fault.
-        listener = Listener(on_sample_lost=count_lost, on_data_available=notify)
+        listener = Listener(on_sample_lost=count_lost)
+        if notify is not None:
+            listener.set_on_data_available(notify)
         self._reader = DataReader(
             participant, Topic(participant, dds_topic(topic), message_type), qos=qos, listener=listener
         )

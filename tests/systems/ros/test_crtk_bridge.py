@@ -80,12 +80,29 @@ def test_answer_is_stepped_at_most_once_per_measurement(bench):
         bench.now += MS // 20
         bench.bridge.put(bench.command())
         bench.bridge.update()
-    assert bench.names() == ["servo_jf", "servo_jf"]
+    assert bench.names() == ["servo_jf"]
     assert len(bench.statuses) == num_statuses + 1
     # The other answers were not lost.
     before = bench.status.num_accepted
     bench.tick()
     assert bench.status.num_accepted + bench.status.num_refused >= before + 4
+
+
+def test_efforts_without_an_answer_are_published_one_period_later(bench):
+    bench.started().clear()
+    bench.tick()
+    assert bench.names() == []
+    bench.tick(3)
+    assert bench.names() == ["servo_jf"] * 3
+
+
+def test_hold_of_another_process_ends_efforts(bench):
+    bench.started().clear()
+    bench.client.other_hold = True
+    bench.tick(2)
+    assert bench.status.guard_state == Status.STATE_HOLD
+    assert bench.status.fault_text.startswith("another process published hold")
+    assert set(bench.names()) == {"servo_jp"}
 
 
 def test_update_without_message_acts_after_five_ms(bench):
