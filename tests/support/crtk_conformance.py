@@ -1,6 +1,7 @@
 """Conformance checks of the ROS 2 topics of an arm: the same checks for the dVRK console and for the simulated arm.
 
-`observe` returns one short text per check. Two arms conform to each other if all texts are equal.
+Each check is one short text. Two arms conform to each other if all texts are equal. Set-points are compared where
+possible, because they are exact for both arms.
 """
 
 import contextlib
@@ -14,57 +15,40 @@ from pathlib import Path
 
 import numpy as np
 from dvrk_console import Console, start_console
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform
 from waiting import TIMEOUT, wait_until
 
-#: Time after which a command that was not executed counts as refused [s].
-REFUSED = 0.5
-#: Longest duration of a motion or of homing [s].
-MOTION = 20.0
-
-
-class SimulatedArm(Console):
-    """Simulated arm `dvrk-drake arm --ros`, with the methods of the console."""
-
-    def enable_and_home(self):
-        self.state_command("enable")
-        wait_until(lambda: self.state() == ("ENABLED", False, False), "enabled", self.process)
-        self.state_command("home")
-        wait_until(lambda: self.state() == ("ENABLED", True, False), "homed", self.process)
+#: Rate of the topics [Hz].
+RATE = 200
+#: Time after which a command without effect counts as refused [s].
+REFUSED = 0.3
+#: Longest duration of a motion, of homing or of a change of state [s].
+LONGEST = 20.0
 
 
 @contextlib.contextmanager
-def start_simulated_arm(arm, name, *options):
-    """Context in which a simulated arm runs.
+def start_simulated_arm(arm, name):
+    """Context in which a simulated arm runs. It is in the state DISABLED.
 
     Args:
         arm: Name of the arm for --arm, e.g. "mtml".
         name: Name of the arm in its topics, e.g. "MTML".
-        *options: Further options of `dvrk-drake arm`.
     """
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    command = [sys.executable, "-u", "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    subject = SimulatedArm(name, process, process.pid, Path(os.devnull), RosDomain())
+    command = [sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", "--rate", str(RATE)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    subject = Console(name, process, process.pid, Path(os.devnull), RosDomain())
     try:
         wait_until(subject.state, "operating state", process)
         yield subject
     finally:
         process.send_signal(signal.SIGINT)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.communicate(timeout=TIMEOUT)
+            process.wait(TIMEOUT)
         process.kill()
-
-
-@contextlib.contextmanager
-def start(kind, arm, folder, *, motion=False):
-    """Context in which a "console" or a "simulated" arm runs, by the name of the arm in its topics."""
-    if kind == "console":
-        with start_console(arm, folder, motion=motion) as subject:
-            yield subject
-    else:
-        with start_simulated_arm(arm.rstrip("0123456789").lower(), arm) as subject:
-            yield subject
+        process.wait()
 
 
 class Observer:
@@ -74,153 +58,255 @@ class Observer:
         found: Mapping from each check to the observed text.
     """
 
-    def __init__(self, subject):
+    def __init__(self, subject, arm):
         from dvrk_drake.systems.ros import messages
+        from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 
-        self.subject, self.m, self.found = subject, messages, {}
+        self.subject, self.arm, self.m, self.found = subject, arm, messages, {}
+        self.kinematics = CrtkKinematics(arm)
 
-    def endpoints(self, names):
-        """Observes type and quality of service of topics, from DDS discovery."""
+    def wait_for(self, condition, seconds=LONGEST):
+        """Waits at most some seconds for a condition. Returns whether it holds."""
+        return self.subject.domain.wait_until(condition, seconds, poll=0.01)
+
+    def endpoints(self):
+        """Observes types and qualities of service, from DDS discovery, of the topics of the console's `run.py`."""
         domain, namespace = self.subject.domain, f"/{self.subject.arm}/"
-        for name, is_published in names.items():
-            discovered = domain.publishers if is_published else domain.subscribers
+        published = ["measured_js", "operating_state"]
+        received = ["servo_jp", "servo_jf", "hold", "free", "state_command", "use_gravity_compensation"]
+        if self.arm.separate_joint:
+            received.append(f"{self.arm.separate_joint}/servo_jf")
+        else:
+            published.append("gravity_compensation/setpoint_js")
+        for name in published + received:
+            discovered = domain.publishers if name in published else domain.subscribers
 
             def matching(name=name, discovered=discovered):
                 return [e for e in discovered() if e.topic == namespace + name and not e.is_own]
 
-            domain.wait_until(matching, 2.0)
-            for e in matching()[:1]:
-                quality = f"{'reliable' if e.reliable else 'best effort'}, {'latched' if e.latched else 'volatile'}"
-                self.found[f"{name}: type, quality of service"] = f"{e.type_name}, {quality}"
+            self.wait_for(matching)
+            e = matching()[0]
+            quality = f"{'reliable' if e.reliable else 'best effort'}, {'latched' if e.latched else 'volatile'}"
+            self.found[f"{name}: type, quality of service"] = f"{e.type_name}, {quality}"
 
-    def state_after(self, label, words, goal):
-        """Observes the operating state after state commands. Waits at most for a motion if `goal` is not reached."""
-        for word in words[:-1]:
+    def state_after(self, label, words, goal=None, seconds=LONGEST):
+        """Observes the operating state after state commands.
+
+        Args:
+            label: Name of the check.
+            words: State commands, sent one after the other.
+            goal: State (state, is_homed) that ends the wait. None: the state after `REFUSED`.
+            seconds: Longest time to wait for `goal` [s].
+        """
+        for word in words:
             self.subject.state_command(word)
-            self.settle(REFUSED)
-        self.subject.state_command(words[-1])
-        self.subject.domain.wait_until(lambda: self.subject.state() == goal, MOTION if goal else REFUSED)
+            self.pause()
+        if goal is not None:
+            self.wait_for(lambda: self.subject.state() == (*goal, False), seconds)
         state, homed, busy = self.subject.state()
         self.found[label] = f"{state}, {'homed' if homed else 'not homed'}{', busy' if busy else ''}"
 
-    def settle(self, seconds):
-        """Receives messages for some seconds."""
-        self.subject.domain.wait_until(lambda: bool(self.subject.state()) and False, seconds)
+    def pause(self):
+        """Waits for the effects of a command."""
+        end = time.monotonic() + REFUSED
+        wait_until(lambda: time.monotonic() > end, "effects", self.subject.process)
 
-    def position(self):
-        return np.array(self.subject.latest().position)
+    def setpoint(self):
+        return np.array(self.subject.latest("setpoint_js").position)
 
-    def moved(self, label, name, message, wait=MOTION, goal=None, tolerance=0.02):
-        """Observes whether a command moves the arm, by the joint positions [rad, m] that it reaches."""
-        before = self.position()
+    def command(self, label, name, message, goal=None):
+        """Observes the set-point after a command.
+
+        Args:
+            label: Name of the check.
+            name: Name of the command topic.
+            message: Message of the command.
+            goal: Expected set-point [rad, m]. None: the set-point before the command.
+        """
+
+        def is_at(q):
+            return np.allclose(self.setpoint(), q, rtol=0, atol=1e-4)
+
+        before = self.setpoint()
         self.subject.command(name, message)
-        if goal is not None:
-            self.subject.domain.wait_until(
-                lambda: np.allclose(self.position(), goal, rtol=0, atol=tolerance), wait, poll=0.05
-            )
-        else:
-            self.settle(REFUSED)
-        after = self.position()
-        if goal is not None and np.allclose(after, goal, rtol=0, atol=tolerance):
-            self.found[label] = "reached"
-        elif np.allclose(after, before, rtol=0, atol=tolerance):
-            self.found[label] = "not moved"
-        else:
-            self.found[label] = f"moved to {np.round(after, 2).tolist()}"
+        if goal is None:
+            self.pause()
+        elif self.wait_for(lambda: is_at(goal)):
+            self.found[label] = "set-point reached"
+            return
+        moved = np.round(self.setpoint(), 2) + 0.0
+        self.found[label] = "set-point unchanged" if is_at(before) else f"set-point {moved.tolist()}"
+
+    def pose_of(self, q):
+        """Returns the pose of the arm's kinematics at the joint positions of a message."""
+        return self.kinematics.pose(np.append(q, np.zeros(self.arm.num_joints - len(q))))
+
+    def measured_pose(self):
+        pose = self.subject.latest("measured_cp", self.m.PoseStamped).pose
+        p, o = pose.position, pose.orientation
+        return RigidTransform(Quaternion(wxyz=np.array([o.w, o.x, o.y, o.z])), [p.x, p.y, p.z])
+
+    def pose(self, label):
+        """Observes whether measured_cp is the pose at the joint positions in measured_js."""
+
+        def agrees():
+            error = self.pose_of(self.subject.latest().position).inverse() @ self.measured_pose()
+            return np.linalg.norm(error.translation()) < 1e-3 and error.rotation().ToAngleAxis().angle() < 5e-3
+
+        # The messages differ while a simulated arm still moves to its set-point.
+        self.found[label] = "equal" if self.wait_for(agrees, 5.0) else "different"
 
 
-def observe(subject, arm, *, motion):
-    """Returns a mapping from each check to the observed text.
+def observe_endpoints(subject, arm):
+    """Returns a mapping from each topic of the console's `run.py` to its type and quality of service."""
+    look = Observer(subject, arm)
+    look.endpoints()
+    return look.found
+
+
+def observe(subject, arm):
+    """Returns a mapping from each check of states, commands and measurements to the observed text.
 
     Args:
-        subject: Console or simulated arm in the state DISABLED.
+        subject: Console with the topics for motions, or simulated arm, in the state DISABLED.
         arm: The `Arm`.
-        motion: Whether to observe move_jp, servo_cp and the Cartesian topics.
     """
-    look = Observer(subject)
+    look = Observer(subject, arm)
     m, found = look.m, look.found
     n = arm.num_joints - bool(arm.separate_joint)
-    published = ["measured_js", "operating_state"]
-    received = ["servo_jp", "servo_jf", "hold", "free", "state_command", "use_gravity_compensation"]
-    if arm.console_gravity_compensation:
-        published.append("gravity_compensation/setpoint_js")
-    if motion:
-        published += ["setpoint_js", "measured_cp", "measured_cv"]
-        received += ["move_jp", "servo_cp"]
-    look.endpoints(dict.fromkeys(published, True))
-    look.endpoints(dict.fromkeys(received, False))
+
+    def joints(values):
+        return m.JointState(m.Header.now(), position=list(map(float, values)))
+
+    # Early publishers, so that the first messages are not lost.
+    for name in ("servo_jp", "move_jp", "servo_jf"):
+        subject.advertise(name, m.JointState)
+    subject.advertise("servo_cp", m.PoseStamped)
+    subject.advertise("hold", m.Empty)
     late = subject.domain.subscribe(f"/{subject.arm}/operating_state", m.OperatingState, depth=100, latched=True)
-    found["operating_state for a late subscription"] = (
-        "received" if subject.domain.wait_until(lambda: bool(late.take()), 5.0) else "not received"
+    found["operating_state for a late subscription"] = "received" if look.wait_for(late.take) else "not received"
+
+    for name, kind in {"measured_js": m.JointState, "setpoint_js": m.JointState, "measured_cp": m.PoseStamped}.items():
+        found[f"{name} before homing: header stamp"] = str(subject.latest(name, kind).header.nanoseconds)
+    found["measured_js before homing: names, positions"] = (
+        f"{len(subject.latest().name)}, {len(subject.latest().position)}"
     )
-    first = subject.latest()
-    found["measured_js before home: header stamp"] = "0" if first.header.nanoseconds == 0 else "valid"
-    look.state_after("DISABLED, then pause", ["pause"], None)
-    look.state_after("DISABLED, then home", ["home"], None)
-    look.state_after("DISABLED, then an unknown word", ["dance"], None)
-    look.state_after("enable", ["enable"], ("ENABLED", False, False))
-    look.settle(2.0)  # the console cannot home an arm immediately after its start
-    look.state_after("home", ["home"], ("ENABLED", True, False))
-    look.settle(1.0)
+    for word in ("pause", "home", "resume", "dance"):
+        look.state_after(f"DISABLED, then {word}", [word])
+    look.state_after("enable", ["enable"], ("ENABLED", False))
+    for word in ("resume", "enable"):
+        look.state_after(f"ENABLED, not homed, then {word}", [word])
+    before = len(subject.states)
+    look.state_after("home", ["home"], ("ENABLED", True))
+    found["is_busy while homing"] = str(any(busy for *_, busy in subject.states[before:]))
+    look.wait_for(lambda: len(subject.latest().name) == n)
+
     message = subject.latest()
-    found["measured_js after home: names"] = ", ".join(message.name)
-    sizes = [len(message.position), len(message.velocity), len(message.effort)]
-    found["measured_js after home: numbers"] = ", ".join(map(str, sizes))
-    found["measured_js after home: header stamp"] = (
-        "time of day" if abs(message.header.nanoseconds - time.time_ns()) < 5e9 else "other"
+    found["measured_js: names"] = ", ".join(message.name)
+    found["measured_js: positions, velocities, efforts"] = ", ".join(
+        str(len(values)) for values in (message.position, message.velocity, message.effort)
     )
-    look.state_after("pause", ["pause"], ("PAUSED", True, False))
-    q = look.position()
-    goal = q + 0.05 * np.where(arm.prismatic[:n], 0.1, 1.0)
-    look.moved("servo_jp while PAUSED", "servo_jp", m.JointState(m.Header.now(), position=goal.tolist()))
-    look.state_after("resume", ["resume"], ("ENABLED", True, False))
-    look.moved("servo_jp", "servo_jp", m.JointState(m.Header.now(), position=goal.tolist()), goal=goal)
-    look.moved("hold", "hold", m.Empty())
+    is_now = abs(message.header.nanoseconds - time.time_ns()) < 5e9
+    found["measured_js: header stamp"] = "time of day" if is_now else "other"
+    stamps = [subject.latest().header.nanoseconds for _ in range(50)]
+    found["measured_js: header stamps increase"] = str(bool(np.all(np.diff(stamps) > 0)))
+    found["measured_cp: header frame"] = subject.latest("measured_cp", m.PoseStamped).header.frame_id
+    found["measured_cv: header frame"] = subject.latest("measured_cv", m.TwistStamped).header.frame_id
+    look.pose("measured_cp and measured_js at the home pose")
+
+    home = look.setpoint()
+    near = home + np.where(arm.prismatic[:n], 0.005, 0.05)
+    look.state_after("pause", ["pause"], ("PAUSED", True))
+    look.command("servo_jp while PAUSED", "servo_jp", joints(near))
+    look.state_after("resume", ["resume"], ("ENABLED", True))
+    look.command("servo_jp", "servo_jp", joints(near), near)
+    look.command("hold", "hold", m.Empty())
     for label, values in {
-        "servo_jp with a number too few": q[:-1].tolist(),
-        "servo_jp with a number too many": [*q.tolist(), 0.0],
-        "servo_jp with NaN": [math.nan, *q[1:].tolist()],
+        "servo_jp with a number too few": home[:-1],
+        "servo_jp with a number too many": [*home, 0.0],
+        "servo_jp with NaN": [math.nan, *home[1:]],
         "servo_jp without numbers": [],
     }.items():
-        look.moved(label, "servo_jp", m.JointState(m.Header.now(), position=values), tolerance=0.02)
-        subject.command("hold", m.Empty())
-    over = look.position()
-    over[0] = arm.position_upper[0] + 0.3
-    limit = over.copy()
+        look.command(label, "servo_jp", joints(values))
+    far = near + np.array([0.1, -0.1, 0.02, 0.2, 0.2, -0.1, 0.3])[:n]
+    before = len(subject.states)
+    look.command("move_jp", "move_jp", joints(far), far)
+    look.wait_for(lambda: not subject.state()[2])
+    found["is_busy during move_jp"] = str(any(busy for *_, busy in subject.states[before:]))
+    look.pose("measured_cp and measured_js at a second pose")
+    look.command("move_jp with a number too few", "move_jp", joints(near[:-1]))
+    limit = far.copy()
     limit[0] = arm.position_upper[0]
-    look.moved(
-        "servo_jp beyond a limit: joint at its limit",
-        "servo_jp",
-        m.JointState(m.Header.now(), position=over.tolist()),
-        goal=limit,
-        tolerance=0.05,
+    look.command("move_jp beyond a limit, goal at the limit", "move_jp", joints(limit + [0.3, *[0.0] * (n - 1)]), limit)
+    look.wait_for(lambda: not subject.state()[2])
+    look.command("servo_jp beyond a limit, goal at the limit", "servo_jp", joints(limit + [0.3, *[0.0] * (n - 1)]), limit)
+    look.command("move_jp to a third pose", "move_jp", joints(near), near)
+    look.pose("measured_cp and measured_js at a third pose")
+
+    X = look.pose_of(look.setpoint())
+    p, o = X.translation() + [0, 0, 0.005], X.rotation().ToQuaternion()
+    goal = m.PoseStamped(m.Header.now(), m.Pose(m.Point(*p), m.Quaternion(o.x(), o.y(), o.z(), o.w())))
+    subject.command("servo_cp", goal)
+
+    def distance():
+        return np.linalg.norm(look.pose_of(look.setpoint()).translation() - p)
+
+    found["servo_cp, 5 mm along z"] = (
+        "set-point reached" if look.wait_for(lambda: distance() < 1e-4) else f"{1e3 * distance():.1f} mm away"
     )
-    subject.command("servo_jp", m.JointState(m.Header.now(), position=goal.tolist()))
-    subject.wait_for_position(goal, 0.02)
-    if arm.console_gravity_compensation:
+
+    effort = np.round(0.01 * arm.effort_limits[:n], 4)
+    subject.command("servo_jf", m.JointState(m.Header.now(), effort=effort.tolist()))
+
+    def is_applied():
+        return np.allclose(subject.latest("setpoint_js").effort, effort, rtol=0, atol=1e-6)
+
+    found["servo_jf: setpoint_js.effort is the command"] = str(look.wait_for(is_applied, 5.0))
+    subject.command("hold", m.Empty())
+    found["hold after servo_jf: setpoint_js.effort is the command"] = str(not look.wait_for(lambda: not is_applied(), 5.0))
+    if not arm.separate_joint:
         subject.command("use_gravity_compensation", m.Bool(False))
-        look.settle(REFUSED)
-        effort = subject.latest("gravity_compensation/setpoint_js").effort
-        found["gravity_compensation/setpoint_js after false"] = (
-            f"{len(effort)} efforts, largest {max(map(abs, effort))}"
-        )
-    if motion:
-        busy = []
-        subject.command("move_jp", m.JointState(m.Header.now(), position=(goal + 0.2 * (q - goal)).tolist()))
-        subject.domain.wait_until(lambda: busy.append(subject.state()) or subject.state()[2], 2.0, poll=0.001)
-        found["is_busy during move_jp"] = str(any(state[2] for state in busy))
-        look.moved("move_jp", "move_jp", m.JointState(m.Header.now(), position=q.tolist()), goal=q)
-        pose = subject.latest("measured_cp", m.PoseStamped).pose
-        p, o = pose.position, pose.orientation
-        found["measured_cp: orientation is a unit quaternion"] = str(abs(math.hypot(o.x, o.y, o.z, o.w) - 1.0) < 1e-6)
-        found["measured_cp: distance from the origin [m]"] = f"{math.hypot(p.x, p.y, p.z):.2f}"
-        above = m.PoseStamped(m.Header.now(), m.Pose(m.Point(p.x, p.y, p.z + 0.01), o))
-        subject.command("servo_cp", above)
-        subject.domain.wait_until(
-            lambda: subject.latest("measured_cp", m.PoseStamped).pose.position.z > p.z + 0.008, 5.0, poll=0.05
-        )
-        rise = subject.latest("measured_cp", m.PoseStamped).pose.position.z - p.z
-        found["servo_cp 10 mm along z: rise [mm]"] = f"{1e3 * rise:.0f}"
-    look.state_after("disable", ["disable"], ("DISABLED", True, False))
-    look.state_after("enable after disable", ["enable"], ("ENABLED", False, False))
+        name = "gravity_compensation/setpoint_js"
+        is_off = look.wait_for(lambda: subject.latest(name).effort == [0.0] * n, 5.0)
+        found["gravity compensation off: efforts are 0"] = str(is_off)
+        found["gravity_compensation/setpoint_js: names"] = ", ".join(subject.latest(name).name)
+    else:
+        subject.command("jaw/move_jp", joints([0.2]))
+        opens = look.wait_for(lambda: abs(subject.latest("jaw/setpoint_js").position[0] - 0.2) < 1e-4)
+        found["jaw/move_jp"] = "set-point reached" if opens else "not reached"
+        found["jaw/measured_js: names"] = ", ".join(subject.latest("jaw/measured_js").name)
+
+    look.state_after("disable", ["disable"], ("DISABLED", True))
+    look.state_after("enable after disable", ["enable"], ("ENABLED", False))
+    look.state_after("home again", ["home"], ("ENABLED", True))
+    look.state_after("pause, pause, resume", ["pause", "pause", "resume"], ("ENABLED", True), 2.0)
+    subject.state_command("disable")
+    look.pause()
+    subject.state_command("enable")
+    look.wait_for(lambda: subject.state() == ("ENABLED", False, False))
+    subject.state_command("home")
+    look.wait_for(lambda: subject.state() == ("ENABLED", True, False))
+    look.state_after("unhome", ["unhome"])
+    look.state_after("unhome, then home", ["home"], ("ENABLED", True), 5.0)
     return found
+
+
+def compare(name, folder):
+    """Returns the observations of both arms: a mapping from each check to the pair (console, simulated arm).
+
+    Args:
+        name: Name of the arm in its topics, e.g. "MTML".
+        folder: Existing folder for temporary files.
+    """
+    from dvrk_drake.models.arm_files import load_arm
+
+    file = name.rstrip("1").lower()
+    arm = load_arm(file)
+    with start_console(name, folder, rate=RATE) as console:
+        expected = observe_endpoints(console, arm)
+    with start_console(name, folder, rate=RATE, motion=True) as console:
+        expected |= observe(console, arm)
+    with start_simulated_arm(file, name) as simulated:
+        found = observe_endpoints(simulated, arm) | observe(simulated, arm)
+    assert found.keys() == expected.keys()
+    return {check: (text, found[check]) for check, text in expected.items()}

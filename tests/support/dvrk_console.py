@@ -100,12 +100,16 @@ class Console:
             ends = r"current state TOOL_ENGAGED.*current state HOMED|tool type requested from user"
             wait_until(lambda: re.search(ends, " ".join(self.events())), "instrument", self.process)
 
-    def command(self, name, message):
-        """Publishes one message on a command topic, e.g. "servo_jp", as soon as the console is subscribed to it."""
+    def advertise(self, name, message_type):
+        """Creates the publisher of a command topic, and waits until the console is subscribed to it."""
         if name not in self._publishers:
-            publisher = self.domain.advertise(f"/{self.arm}/{name}", type(message))
+            publisher = self.domain.advertise(f"/{self.arm}/{name}", message_type)
             wait_until(publisher.num_subscribers, f"a subscription of {name}", self.process)
             self._publishers[name] = publisher
+
+    def command(self, name, message):
+        """Publishes one message on a command topic, e.g. "servo_jp", as soon as the console is subscribed to it."""
+        self.advertise(name, type(message))
         self._publishers[name].publish(message)
 
     def latest(self, name="measured_js", message_type=None):

@@ -75,6 +75,7 @@ class CrtkArmTopics:
             kinematics: Kinematics of the arm.
         """
         self._kinematics = kinematics
+        self._base = f"{namespace.rpartition('/')[2]}_base"
         jaw = arm.separate_joint
         self._main = [i for i, name in enumerate(arm.joint_names) if name != jaw]
         self._jaw = [i for i, name in enumerate(arm.joint_names) if name == jaw]
@@ -137,11 +138,11 @@ class CrtkArmTopics:
         if (now := time.monotonic()) >= self._next_check:
             self._next_check = now + _SUBSCRIBERS_PERIOD
             self._wanted = {name for name, publisher in self._publishers.items() if publisher.num_subscribers()}
-        header = Header.now() if is_valid else Header()
         for name in self._wanted:
-            self._publishers[name].publish(self._message(name, values, header) if is_valid else self._empty(name))
+            self._publishers[name].publish(self._message(name, values) if is_valid else self._empty(name))
 
-    def _message(self, name: str, values: ArmValues, header: Header) -> Any:
+    def _message(self, name: str, values: ArmValues) -> Any:
+        header = Header.now("" if name.endswith("js") else self._base)
         if name == "measured_js":
             return self._joint_state(header, self._main, values.q, values.v, values.effort)
         if name == "setpoint_js":

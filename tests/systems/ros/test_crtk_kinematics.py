@@ -61,16 +61,21 @@ TABLES = {
 }
 
 
+#: Pose of the tool frame in the last frame of the table: `tooltip_offset` of LARGE_NEEDLE_DRIVER_400006.json for a PSM.
+TOOL = {"psm": RigidTransform(RotationMatrix(np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])), [0, 0, 0])}
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_pose_is_the_product_of_the_dh_table(name):
     arm = load_arm(name)
     kinematics = CrtkKinematics(arm)
     for q in arm.sample_poses(20, np.random.default_rng(0)):
         X = RigidTransform()
+        tool = TOOL.get(name, RigidTransform())
         for value, (kind, a, alpha, d, offset) in zip(q, TABLES[name], strict=False):
             turn, slide = (value, 0.0) if kind == "r" else (0.0, value)
             X = X @ dh(offset + turn, a, alpha, d + slide, modified=name == "psm")
-        np.testing.assert_allclose(kinematics.pose(q).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(kinematics.pose(q).GetAsMatrix4(), (X @ tool).GetAsMatrix4(), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -80,8 +85,8 @@ def test_pose_is_that_of_drake_and_velocity_is_its_derivative(name):
     context, frame = plant.CreateDefaultContext(), plant.GetFrameByName("dh_6" if name == "psm" else "dh_7")
     for q in arm.sample_poses(20, generator):
         set_arm_positions(plant, context, arm, q)
-        X = kinematics.pose(q)
-        np.testing.assert_allclose(X.GetAsMatrix4(), frame.CalcPoseInWorld(context).GetAsMatrix4(), rtol=0, atol=1e-15)
+        X = frame.CalcPoseInWorld(context) @ TOOL.get(name, RigidTransform())
+        np.testing.assert_allclose(kinematics.pose(q).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=1e-15)
         v, h = generator.normal(size=7), 1e-6
         ahead, behind = kinematics.pose(q + h * v), kinematics.pose(q - h * v)
         rotation = ahead.rotation().multiply(behind.rotation().inverse()).ToAngleAxis()
