@@ -237,14 +237,14 @@ def observe(subject, arm):
     look.command("move_jp with a number too few", "move_jp", joints(near[:-1]))
     limit = far.copy()
     limit[0] = arm.position_upper[0]
-    look.command("move_jp beyond a limit, goal at the limit", "move_jp", joints(limit + [0.3, *[0.0] * (n - 1)]), limit)
+    look.command("move_jp beyond a limit, goal at the limit", "move_jp", joints(beyond), limit)
     look.wait_for(lambda: not subject.state()[2])
-    look.command("servo_jp beyond a limit, goal at the limit", "servo_jp", joints(limit + [0.3, *[0.0] * (n - 1)]), limit)
+    look.command("servo_jp beyond a limit, goal at the limit", "servo_jp", joints(beyond), limit)
     look.command("move_jp to a third pose", "move_jp", joints(near), near)
     look.pose("measured_cp and measured_js at a third pose")
 
     X = look.pose_of(look.setpoint())
-    p, o = X.translation() + [0, 0, 0.005], X.rotation().ToQuaternion()
+    p, o = [*X.translation(), 0, 0, 0.005], X.rotation().ToQuaternion()
     goal = m.PoseStamped(m.Header.now(), m.Pose(m.Point(*p), m.Quaternion(o.x(), o.y(), o.z(), o.w())))
     subject.command("servo_cp", goal)
 
@@ -263,7 +263,9 @@ def observe(subject, arm):
 
     found["servo_jf: setpoint_js.effort is the command"] = str(look.wait_for(is_applied, 5.0))
     subject.command("hold", m.Empty())
-    found["hold after servo_jf: setpoint_js.effort is the command"] = str(not look.wait_for(lambda: not is_applied(), 5.0))
+    found["hold after servo_jf: setpoint_js.effort is the command"] = str(
+        not look.wait_for(lambda: not is_applied(), 5.0)
+    )
     if not arm.separate_joint:
         subject.command("use_gravity_compensation", m.Bool(False))
         name = "gravity_compensation/setpoint_js"

@@ -40,7 +40,8 @@ class SubstituteArm:
             False,
             np.zeros(n),
         )
-        self.problem, self.others, self.unheard, self.num_changes, self.num_received = "", [], [], 0, 0
+        self.problem, self.others, self.unheard, self.num_received = "", [], [], 0
+        self.domain = SimpleNamespace(num_changes=0)
         self.stamp_offset = 0
         self._target, self._direction = self.q, np.ones(n)
         self._speed = arm.position_upper - arm.position_lower

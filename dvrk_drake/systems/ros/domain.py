@@ -141,37 +141,31 @@ class RosDomain:
         if not text.isdecimal() or int(text) > MAX_DOMAIN:
             raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
         self.name = f"ROS domain {text}"
-        self._changes = changes = [0]
-
-        def count_change(reader: DataReader) -> None:
-            # Cyclone DDS calls this function in a thread of its own. It must not refer to this object.
-            changes[0] += 1
-
         try:
             self.participant = _participant(int(text))
-            self._publications = BuiltinDataReader(
-                self.participant, BuiltinTopicDcpsPublication, listener=Listener(on_data_available=count_change)
-            )
+            self._publications = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
             self._subscriptions = BuiltinDataReader(self.participant, BuiltinTopicDcpsSubscription)
-            _READERS.add(self._publications)
         except DDSException as error:
             raise DvrkDrakeError(f"{self.name} cannot be used: {error}. Check the network and {_CONFIG}") from error
         self._alive = {
             reader: ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Alive)
             for reader in (self._publications, self._subscriptions)
         }
+        self._unread = ReadCondition(self._publications, SampleState.NotRead | ViewState.Any | InstanceState.Any)
+        self._num_changes = 0
         # Cyclone DDS has no file descriptor for arriving messages. Its listeners write to this pipe.
         self._readable, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def close(self) -> None:
         """Leaves the domain. Publishers and subscriptions of this domain must not be used any more."""
         self.participant = self._publications = self._subscriptions = None
-        self._alive = {}
+        self._alive, self._unread = {}, None
 
     @property
     def num_changes(self) -> int:
-        """Number of times that publishers of the domain appeared or ended."""
-        return self._changes[0]
+        """Number of times that publishers of the domain appeared or ended, as far as this property was evaluated."""
+        self._num_changes += bool(self._publications.read(_MAX_ENDPOINTS, condition=self._unread))
+        return self._num_changes
 
     def publishers(self) -> list[Endpoint]:
         """Returns the ROS 2 publishers discovered so far."""

@@ -125,19 +125,19 @@ def test_efforts_act_without_time_limit():
     assert np.all(bench.effort(9.0, 9.0) == 0)
     bench.home()
     limits = MTM.effort_limits
-    np.testing.assert_array_equal(bench.effort(0.01, 9.0), 0.01)
+    np.testing.assert_allclose(bench.effort(0.01, 9.0), 0.01, rtol=0, atol=1e-12)
     command = 0.5 * limits * [1, -1, 1, -1, 1, -1, 1]
     bench.step(CrtkCommand("servo_jf", command))
     for gravity_compensation in (False, True):
         bench.step(CrtkCommand("use_gravity_compensation", is_on=gravity_compensation))
         bench.wait(3600.0)
         np.testing.assert_allclose(
-            bench.effort(9.0, 0.01), np.clip(command + 0.01 * gravity_compensation, -limits, limits), rtol=0, atol=1e-15
+            bench.effort(9.0, 0.01), np.clip(command + 0.01 * gravity_compensation, -limits, limits), rtol=0, atol=1e-12
         )
     bench.step(CrtkCommand("servo_jf", 1e3 * limits))
-    np.testing.assert_array_equal(bench.effort(0.0, 0.0), limits)
+    np.testing.assert_allclose(bench.effort(0.0, 0.0), limits, rtol=0, atol=1e-12)
     bench.step(CrtkCommand("free"))
-    np.testing.assert_array_equal(bench.effort(9.0, 0.01), 0.01)
+    np.testing.assert_allclose(bench.effort(9.0, 0.01), 0.01, rtol=0, atol=1e-12)
     bench.say("disable")
     assert np.all(bench.effort(9.0, 9.0) == 0)
 
@@ -151,7 +151,7 @@ def test_hold_after_effort_regulates_the_measured_pose():
     bench.q = bench.q + 0.1
     bench.step(steps=10)
     np.testing.assert_array_equal(bench.machine.desired_state, [0.3, -0.2, 0.1, 0.4, 0.5, -0.6, 0.7, *[0.0] * 7])
-    np.testing.assert_array_equal(bench.effort(0.01, 9.0), 0.01)
+    np.testing.assert_allclose(bench.effort(0.01, 9.0), 0.01, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -211,7 +211,7 @@ def test_invalid_numbers_change_nothing(name, values):
         bench.step(CrtkCommand(name, values), steps=50)
         assert bench.machine.describe() == described and not bench.machine.is_busy
         np.testing.assert_array_equal(bench.machine.desired_state, before)
-        np.testing.assert_array_equal(bench.effort(0.01, 9.0), 0.01 if mode == "hold" else 0.0)
+        np.testing.assert_allclose(bench.effort(0.01, 9.0), 0.01 if mode == "hold" else 0.0, rtol=0, atol=1e-12)
 
 
 def test_servo_cp_uses_the_inverse_kinematics():

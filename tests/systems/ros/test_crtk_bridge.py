@@ -46,8 +46,8 @@ def test_efforts_are_published_within_limits(bench):
     effort = 0.05 * ARMS["mtml"].effort_limits
     bench.run(100, effort=effort.tolist())
     assert set(bench.names()) == {"servo_jf"}
-    np.testing.assert_allclose(bench.sent[-1][1], effort)
-    np.testing.assert_allclose(bench.status.effort_commanded, effort)
+    np.testing.assert_allclose(bench.sent[-1][1], effort, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(bench.status.effort_commanded, effort, rtol=0, atol=1e-12)
     bench.run(5, effort=[1e9] * 7)
     assert all(np.all(np.abs(values) <= ARMS["mtml"].effort_limits) for _, values in bench.sent)
 
@@ -57,7 +57,7 @@ def test_positions_are_published_on_servo_jp(bench):
     goal = bench.q + 0.002
     bench.run(50, Command.POSITION, position=goal.tolist())
     assert set(bench.names()) == {"servo_jp"}
-    np.testing.assert_allclose(bench.sent[-1][1], goal)
+    np.testing.assert_allclose(bench.sent[-1][1], goal, rtol=0, atol=1e-12)
 
 
 def test_silent_controller_leads_to_hold(bench):
@@ -84,11 +84,11 @@ def test_answer_is_stepped_at_most_once_per_measurement(bench):
     assert len(bench.statuses) == num_statuses + 1
     # The other answers were not lost.
     before = bench.status.num_accepted
-    bench.tick()
+    bench.tick(2)
     assert bench.status.num_accepted + bench.status.num_refused >= before + 4
 
 
-def test_efforts_without_an_answer_are_published_one_period_later(bench):
+def test_unanswered_efforts_are_published_one_period_later(bench):
     bench.started().clear()
     bench.tick()
     assert bench.names() == []

@@ -86,7 +86,7 @@ def test_pose_is_that_of_drake_and_velocity_is_its_derivative(name):
     for q in arm.sample_poses(20, generator):
         set_arm_positions(plant, context, arm, q)
         X = frame.CalcPoseInWorld(context) @ TOOL.get(name, RigidTransform())
-        np.testing.assert_allclose(kinematics.pose(q).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(kinematics.pose(q).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=1e-12)
         v, h = generator.normal(size=7), 1e-6
         ahead, behind = kinematics.pose(q + h * v), kinematics.pose(q - h * v)
         rotation = ahead.rotation().multiply(behind.rotation().inverse()).ToAngleAxis()

@@ -83,7 +83,7 @@ def test_jaw_has_messages_of_its_own():
     reader = JointStateReader(PSM, "/PSM1/measured_js")
     reader.read_jaw(jaw(), 100 * MS)
     found = reader.read(psm_message(), 101 * MS)
-    np.testing.assert_allclose([found.q[6], found.v[6], found.effort[6]], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose([found.q[6], found.v[6], found.effort[6]], [0.1, 0.2, 0.3], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(found.q[:6], ROWS[0, :6])
     # The age of the jaw does not change the time of arrival, from which the difference of the clocks is determined.
     assert (found.arrival, found.problem) == (101 * MS, "")
