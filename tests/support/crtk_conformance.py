@@ -89,6 +89,16 @@ class Observer:
             quality = f"{'reliable' if e.reliable else 'best effort'}, {'latched' if e.latched else 'volatile'}"
             self.found[f"{name}: type, quality of service"] = f"{e.type_name}, {quality}"
 
+    def rate(self):
+        """Observes the rate of measured_js."""
+        times = []
+        topic = self.subject.domain.subscribe(f"/{self.subject.arm}/measured_js", self.m.JointState, depth=1000)
+        self.wait_for(lambda: times.extend(published for _, published in topic.take()) or len(times) > 2 * RATE)
+        rate = 1e9 * (len(times) - 1) / (times[-1] - times[0])
+        self.found[f"measured_js: rate, {RATE} Hz requested"] = (
+            "within 25 %" if abs(rate / RATE - 1.0) < 0.25 else f"{rate:.0f} Hz"
+        )
+
     def state_after(self, label, words, goal=None, seconds=LONGEST):
         """Observes the operating state after state commands.
 
@@ -102,9 +112,30 @@ class Observer:
             self.subject.state_command(word)
             self.pause()
         if goal is not None:
-            self.wait_for(lambda: self.subject.state() == (*goal, False), seconds)
+            self.wait_for_state(*goal, seconds)
         state, homed, busy = self.subject.state()
         self.found[label] = f"{state}, {'homed' if homed else 'not homed'}{', busy' if busy else ''}"
+
+    def wait_for_state(self, state, is_homed, seconds=LONGEST):
+        """Waits until an arm is in a state and not busy for `REFUSED`. A PSM engages its instrument after homing."""
+        reached = None
+
+        def is_steady():
+            nonlocal reached
+            if self.subject.state() != (state, is_homed, False):
+                reached = None
+            elif reached is None:
+                reached = time.monotonic()
+            return reached is not None and time.monotonic() > reached + REFUSED
+
+        return self.wait_for(is_steady, seconds)
+
+    def home_again(self):
+        """Disables, enables and homes the arm."""
+        for word, state in {"disable": "DISABLED", "enable": "ENABLED", "home": "ENABLED"}.items():
+            self.subject.state_command(word)
+            wait_until(lambda state=state: self.subject.state()[0] == state, word, self.subject.process)
+            self.wait_for_state("ENABLED", word == "home") if state == "ENABLED" else self.pause()
 
     def pause(self):
         """Waits for the effects of a command."""
@@ -158,9 +189,10 @@ class Observer:
 
 
 def observe_endpoints(subject, arm):
-    """Returns a mapping from each topic of the console's `run.py` to its type and quality of service."""
+    """Returns the observations of the topics of the console's `run.py`: types, qualities of service and rate."""
     look = Observer(subject, arm)
     look.endpoints()
+    look.rate()
     return look.found
 
 
@@ -236,15 +268,15 @@ def observe(subject, arm):
     look.pose("measured_cp and measured_js at a second pose")
     look.command("move_jp with a number too few", "move_jp", joints(near[:-1]))
     limit = far.copy()
-    limit[0] = arm.position_upper[0]
-    look.command("move_jp beyond a limit, goal at the limit", "move_jp", joints(beyond), limit)
+    limit[0], beyond = arm.position_upper[0], 0.3 * np.eye(n)[0]
+    look.command("move_jp beyond a limit, goal at the limit", "move_jp", joints(limit + beyond), limit)
     look.wait_for(lambda: not subject.state()[2])
-    look.command("servo_jp beyond a limit, goal at the limit", "servo_jp", joints(beyond), limit)
+    look.command("servo_jp beyond a limit, goal at the limit", "servo_jp", joints(limit + beyond), limit)
     look.command("move_jp to a third pose", "move_jp", joints(near), near)
     look.pose("measured_cp and measured_js at a third pose")
 
     X = look.pose_of(look.setpoint())
-    p, o = [*X.translation(), 0, 0, 0.005], X.rotation().ToQuaternion()
+    p, o = X.translation() + np.array([0, 0, 0.005]), X.rotation().ToQuaternion()
     goal = m.PoseStamped(m.Header.now(), m.Pose(m.Point(*p), m.Quaternion(o.x(), o.y(), o.z(), o.w())))
     subject.command("servo_cp", goal)
 
@@ -279,16 +311,18 @@ def observe(subject, arm):
         found["jaw/measured_js: names"] = ", ".join(subject.latest("jaw/measured_js").name)
 
     look.state_after("disable", ["disable"], ("DISABLED", True))
+    found["measured_js after disable: positions"] = str(len(subject.latest().position))
     look.state_after("enable after disable", ["enable"], ("ENABLED", False))
     look.state_after("home again", ["home"], ("ENABLED", True))
     look.state_after("pause, pause, resume", ["pause", "pause", "resume"], ("ENABLED", True), 2.0)
-    subject.state_command("disable")
-    look.pause()
-    subject.state_command("enable")
-    look.wait_for(lambda: subject.state() == ("ENABLED", False, False))
-    subject.state_command("home")
-    look.wait_for(lambda: subject.state() == ("ENABLED", True, False))
+    look.home_again()
+    if arm.separate_joint:
+        jump = look.setpoint() + np.array([0, 0, 0.07, 0, 0, 0])
+        subject.command("servo_jp", joints(jump))
+        look.state_after("servo_jp with a jump of 70 mm", [], ("FAULT", True), 2.0)
+        look.home_again()
     look.state_after("unhome", ["unhome"])
+    found["measured_js after unhome: header stamp"] = "0" if subject.latest().header.nanoseconds == 0 else "time of day"
     look.state_after("unhome, then home", ["home"], ("ENABLED", True), 5.0)
     return found
 

@@ -26,9 +26,9 @@ _R_FT = RotationMatrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 
 class CrtkKinematics:
     """Kinematics of the tool frame T in the base frame B, as in a dVRK.
 
-    For an MTM, T is the last frame of the DH table, dh_7. For a PSM, T has the origin of dh_6 and the orientation of
-    the dVRK's instrument files. The origin of B is the shoulder of an MTM, or the remote centre of motion of a PSM. A
-    dVRK can add the pose of the base on its cart. An instrument can add an offset of the tool tip.
+    For an MTM, T is the last DH frame, dh_7. For a PSM, T has the origin of dh_6 and the orientation in the
+    dVRK's instrument files. The origin of B is the shoulder of an MTM, or the remote centre of motion of a PSM. A dVRK
+    can add the pose of the base on its cart. An instrument can add an offset of the tool tip.
     """
 
     def __init__(self, arm: Arm) -> None:
