@@ -1,5 +1,7 @@
 """CrtkCollector with a substitute for the arm, without DDS."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from substitute_crtk_arm import PERIOD, Collection, SubstituteArm
@@ -114,7 +116,7 @@ def jump(arm):
         (lambda arm: disturb(arm, state="DISABLED"), "operating_state is DISABLED"),
         (lambda arm: disturb(arm, is_homed=False), "operating_state is ENABLED"),
         (
-            lambda arm: disturb(arm, others=["/MTML/servo_jp"], num_changes=1),
+            lambda arm: disturb(arm, others=["/MTML/servo_jp"], domain=SimpleNamespace(num_changes=1)),
             "another process publishes /MTML/servo_jp",
         ),
         (lambda arm: disturb(arm, unheard=["move_jp"]), "no process subscribes to /MTML/move_jp"),

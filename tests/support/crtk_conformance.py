@@ -28,16 +28,17 @@ LONGEST = 20.0
 
 
 @contextlib.contextmanager
-def start_simulated_arm(arm, name):
+def start_simulated_arm(arm, name, rate=RATE):
     """Context in which a simulated arm runs. It is in the state DISABLED.
 
     Args:
         arm: Name of the arm for --arm, e.g. "mtml".
         name: Name of the arm in its topics, e.g. "MTML".
+        rate: Rate of the measurements [Hz].
     """
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    command = [sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", "--rate", str(RATE)]
+    command = [sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", "--rate", str(rate)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     subject = Console(name, process, process.pid, Path(os.devnull), RosDomain())
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
@@ -21,7 +22,7 @@ class CrtkBridgeSystem(LeafSystem):
     """Runs a `CrtkBridge` every millisecond. It has no ports, because it uses LCM messages in memory.
 
     The Simulator must run in real time (`set_target_realtime_rate(1.0)`). If it stops, the arm holds its pose after 50
-    ms, because the deadman process publishes `hold`.
+    ms, because the deadman process publishes `hold`. Changes of the guard's state are logged as warnings.
     """
 
     def __init__(self, arm: Arm, driver: CrtkDriver, lcm: DrakeLcm) -> None:
@@ -42,6 +43,7 @@ class CrtkBridgeSystem(LeafSystem):
             lambda data: lcm.Publish(status_channel(arm), data),
             topic=driver.namespace or None,
             domain=driver.domain,
+            report=logging.getLogger(__name__).warning,
         )
         atexit.register(self._bridge.close)
         lcm.Subscribe(command_channel(arm), self._bridge.put)
