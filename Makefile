@@ -12,7 +12,7 @@ RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/u
 MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-busy test-fast test-udp test-recordings mutants lint benchmark clean
+.PHONY: demo test test-busy test-fast test-udp test-ros test-recordings mutants lint benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --folder demo_output --overwrite
@@ -29,7 +29,12 @@ test-fast: $(VENV)/.installed-test
 
 # Tests run one after the other, since each runs several processes at 1 kHz and needs all cores.
 test-udp: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/udp/test_lcm_udp.py
+	$(BIN)/python -m pytest tests/udp/test_lcm_udp.py tests/udp/test_crtk_station_udp.py \
+	  tests/udp/test_bridge_bad_messages_udp.py
+
+# Bridge and simulated arm beside the dVRK console, which is not part of the repository. They take minutes.
+test-ros: $(VENV)/.installed-test
+	$(BIN)/python -m pytest tests/udp/test_bridge_udp.py tests/udp/test_crtk_conformance_udp.py
 
 # Recordings over UDP and complete collections of both arms. They take minutes.
 test-recordings: $(VENV)/.installed-test
