@@ -32,9 +32,10 @@ test-udp: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/udp/test_lcm_udp.py tests/udp/test_crtk_station_udp.py \
 	  tests/udp/test_bridge_bad_messages_udp.py
 
-# Bridge and simulated arm beside the dVRK console, which is not part of the repository. They take minutes.
+# Bridge, collection and simulated arm beside the dVRK console, which is not part of the repository. They take minutes.
 test-ros: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/udp/test_bridge_udp.py tests/udp/test_crtk_conformance_udp.py
+	$(BIN)/python -m pytest tests/udp/test_bridge_udp.py tests/udp/test_crtk_conformance_udp.py \
+	  tests/udp/test_crtk_collection_udp.py
 
 # Recordings over UDP and complete collections of both arms. They take minutes.
 test-recordings: $(VENV)/.installed-test
