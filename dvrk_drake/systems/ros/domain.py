@@ -35,6 +35,8 @@ from cyclonedds.util import duration
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.systems.ros.messages import JointState, dds_type_name, ros_type_name, type_hash
 
+#: Listeners of all readers. DDS may call a listener after its reader was deleted in Python, so none is deleted.
+_LISTENERS: list[Listener] = []
 #: Readers with a listener.
 _READERS: "weakref.WeakSet[DataReader]" = weakref.WeakSet()
 
@@ -368,6 +370,7 @@ class Subscription(Generic[Message]):
             participant, Topic(participant, dds_topic(topic), message_type), qos=qos, listener=listener
         )
         _READERS.add(self._reader)
+        _LISTENERS.append(listener)
 
     @property
     def num_lost(self) -> int:
