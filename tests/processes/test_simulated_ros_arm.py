@@ -177,11 +177,16 @@ def test_client_controls_the_arm(monkeypatch):
     client.send("hold")
     client.until(lambda: np.any(client.new("setpoint_js").effort), "hold")
 
-    # A subscription that joins later receives the operating state.
+    # A subscription that joins later receives all operating states, the oldest first.
     late = client.subscribe_operating_state()
     received = []
-    assert client.domain.wait_until(lambda: received.extend(late.take()) or received, TIMEOUT)
-    assert (received[-1][0].state, received[-1][0].is_homed) == ("ENABLED", True)
+
+    def has_present_state():
+        received.extend((state.state, state.is_homed) for state, _ in late.take())
+        return received[-1:] == [("ENABLED", True)]
+
+    assert client.domain.wait_until(has_present_state, TIMEOUT), received
+    assert received[0] == ("DISABLED", False)
     client.send("state_command", "disable")
     client.until(lambda: client.reached[-1].state == "DISABLED", "disabled")
     output = end(client.process, 15)
