@@ -39,9 +39,8 @@ DOMAIN = 11
 #: Longest time until the efforts act, and longest mean time per effort [s].
 START, PERIOD = 20.0, 0.005
 INSIDE = "DVRK_DRAKE_OWN_NETWORK"
-CONFIGURATION = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>
-<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+CONFIGURATION = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces>
+</General></Domain></CycloneDDS>"""
 NETWORK = "ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo"
 
 
