@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -49,6 +50,9 @@ TEXTS = {"hold": m.Empty, "free": m.Empty, "state_command": m.StringStamped, "us
 PERIOD = 0.001
 #: Largest number of objects that are read before the next command is read.
 MAX_OBJECTS = 100
+#: Time between two requests of the operating state [s]. The JSON objects of its changes are lost before the component
+#: has started, and may be lost while this process is busy.
+STATE_PERIOD = 0.05
 
 
 def output_message(kind, value):
@@ -81,6 +85,16 @@ def text_command(name, message):
     if name == "use_gravity_compensation":
         return f"{name} {int(message.data)}"
     return f"{name} {message.string}" if name == "state_command" else name
+
+
+def received_states(control):
+    """Returns the operating states in the answers of the console, each (state, is_homed, is_busy)."""
+    states = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            if found := re.fullmatch(r"(\w+) ([01]) ([01])", control.recv(512).decode().strip()):
+                states.append((found[1], found[2] == "1", found[3] == "1"))
+    return states
 
 
 def udp_socket():
@@ -135,7 +149,15 @@ def exchange(console, stream, control, control_port, arm, rate, outputs, motions
     state = domain.advertise(f"/{arm}/operating_state", m.OperatingState, latched=True)
     kinds = {name: kind for name, (_, kind) in motions.items()} | TEXTS
     inputs = {name: domain.subscribe(f"/{arm}/{name}", kind) for name, kind in kinds.items()}
-    address, last_state, due = None, None, dict.fromkeys(outputs, 0.0)
+    address, last_state, last_answer, due = None, None, None, dict.fromkeys(outputs, 0.0)
+    next_request = 0.0
+
+    def publish_state(published):
+        nonlocal last_state
+        if published != last_state:
+            state.publish(m.OperatingState(m.Header.now(), *published))
+            last_state = published
+
     while console.poll() is None:
         ready, _, _ = select.select([stream, domain], [], [], 0.1)
         if domain in ready:
@@ -146,9 +168,14 @@ def exchange(console, stream, control, control_port, arm, rate, outputs, motions
                         control.sendto(text_command(name, message).encode(), ("127.0.0.1", control_port))
                     elif address:
                         stream.sendto(json.dumps(motion_object(name, message)).encode(), address)
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                control.recv(512)
+        for answer in received_states(control):
+            # A state that has just changed may be newer than the objects that have arrived so far.
+            if answer == last_answer:
+                publish_state(answer)
+            last_answer = answer
+        if time.monotonic() >= next_request:
+            control.sendto(b"operating_state", ("127.0.0.1", control_port))
+            next_request = time.monotonic() + STATE_PERIOD
         # Objects that arrived while this process was busy are dropped, so that commands are not delayed.
         latest = {}
         with contextlib.suppress(BlockingIOError):
@@ -159,10 +186,7 @@ def exchange(console, stream, control, control_port, arm, rate, outputs, motions
             now = time.monotonic()
             if name == "operating_state":
                 value = json.loads(data)[name]
-                published = (value["State"], value["IsHomed"], value["IsBusy"])
-                if published != last_state:
-                    state.publish(m.OperatingState(m.Header.now(), *published))
-                    last_state = published
+                publish_state((value["State"], value["IsHomed"], value["IsBusy"]))
             elif now >= due[name]:
                 due[name] = max(due[name] + 1 / rate, now - 1 / rate)
                 publishers[name].publish(output_message(outputs[name][1], json.loads(data)[name]))

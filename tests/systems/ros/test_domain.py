@@ -113,6 +113,25 @@ def test_endpoints_of_a_killed_process_vanish(domain, arm):
 
 
 @inside
+def test_messages_continue_after_a_suspension(domain, arm):
+    command, measured = domain.advertise(ros_arm.COMMAND, JointState), domain.subscribe(ros_arm.MEASURED, JointState)
+
+    def answers():
+        command.publish(joint_state(1))
+        return bool(measured.take())
+
+    assert domain.wait_until(answers, TIMEOUT)
+    # In some of the suspensions, only one of the processes considers the other one as ended.
+    for _ in range(6):
+        arm.send_signal(signal.SIGSTOP)
+        os.waitpid(arm.pid, os.WUNTRACED)
+        assert domain.wait_until(lambda: not measured.num_publishers(), DETECTION)
+        measured.take()
+        arm.send_signal(signal.SIGCONT)
+        assert domain.wait_until(answers, DETECTION)
+
+
+@inside
 def test_a_stopped_subscriber_does_not_stop_the_publisher(domain, arm):
     command = domain.advertise(ros_arm.COMMAND, JointState)
     assert domain.wait_until(command.num_subscribers, TIMEOUT)
