@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 _POLL = 0.01
 #: Messages of one topic that may arrive between two updates. Older messages are lost.
 _DEPTH = 5000
-#: Longest time until the first valid measurement of a homed arm, and until the arm confirms `hold` [s].
-_FIRST, _CONFIRMATION = 5.0, 1.0
+#: Longest time until the first valid measurement of a homed arm, until the arm confirms `hold`, and until it is
+#: discovered again [s].
+_FIRST, _CONFIRMATION, _DISCOVERY = 5.0, 1.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -200,6 +201,14 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
 
 
 def _hold(client: CrtkClient, report: Callable[[str], None]) -> None:
+    """Publishes `hold`, and reports if the arm does not confirm it."""
     client.hold()
-    if not client.wait_until_received(_CONFIRMATION):
+
+    def is_heard() -> bool:
+        return not client.unheard_commands(("hold",))
+
+    # After an interruption of the network or of this process, DDS first has to discover the arm again.
+    if not is_heard() and client.domain.wait_until(is_heard, _DISCOVERY):
+        client.hold()
+    if not (is_heard() and client.wait_until_received(_CONFIRMATION)):
         report(f"{client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")

@@ -54,7 +54,7 @@ _PAUSE = 1.0
 #: Largest time step of a motion [s]. It prevents a distant goal after this process was suspended.
 _MAX_STEP = 0.05
 #: Typical delay of an arm behind the goal [s], for the estimated duration.
-_DELAY = 0.5
+DELAY = 0.5
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class CrtkCollector:
         self._monitor = CrtkMonitor(client, model, settings.max_effort)
         self._span = arm.position_upper - arm.position_lower
         self._tolerance = MAX_TRACKING_ERROR * self._span
-        self._now = self._time = self._paused_at = 0.0
+        self._now = self._time = self._pose_end = self._paused_at = 0.0
         self._goal = np.zeros(arm.num_joints)
         self._num_before = np.count_nonzero(self.done)
         self._activity = "starting"
@@ -171,9 +171,10 @@ class CrtkCollector:
 
     def _time_left(self) -> str:
         count = np.count_nonzero(self.done) - self._num_before
-        if not count:
+        if not count or self.done.all():
             return ""
-        return f"; about {self._time / count * np.count_nonzero(~self.done) / 60:.1f} min left"
+        left = self._pose_end * (1 + np.count_nonzero(~self.done) / count) - self._time
+        return f"; about {max(left, 0.0) / 60:.1f} min left"
 
     def _pause_or_continue(self) -> None:
         if not self.paused:
@@ -217,7 +218,7 @@ class CrtkCollector:
         if self._settings.both_sides:
             row.append((measured[0] - measured[1])[self._arm.num_joints :] / 2)
         self._output.append(pose, *row)
-        self.done[k] = True
+        self.done[k], self._pose_end = True, self._time
         self._report(f"pose {k + 1} measured, {np.count_nonzero(self.done)} of {len(self.done)}{self._time_left()}")
 
     def _move_to(self, q_end: NDArray[np.float64]) -> Steps:
@@ -296,11 +297,11 @@ def estimated_duration(
     speed, total = (arm.position_upper - arm.position_lower) / settings.traverse_time, 0.0
     for pose in poses:
         for begin in approaches(arm, pose, settings):
-            total += REST_TIME + MEASURE + _DELAY
+            total += REST_TIME + MEASURE + DELAY
             for goal in (begin, pose):
                 if goal is not None:
                     total += CubicTrajectory.rest_to_rest(q, goal, speed).duration
                     q = goal
             if begin is not None:
-                total += APPROACH_REST + _DELAY
+                total += APPROACH_REST + DELAY
     return total
