@@ -23,7 +23,6 @@ from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.collector import (
-    APPROACH,
     MAX_TRACKING_ERROR,
     MEASURE,
     REST,
@@ -43,8 +42,12 @@ if TYPE_CHECKING:
 
 #: Time between two goals of a motion [s].
 GOAL_PERIOD = 0.1
-#: Time without progress after which a motion is stopped [s].
-STALL = 2.0
+#: Time without progress towards the goal after which a motion is stopped [s]. Smallest progress, as a fraction of the
+#: range of the joint.
+STALL, _PROGRESS = 2.0, 0.005
+#: Length of an approach, as a fraction of the range of the joint. Dry friction is elastic at first, so a short approach
+#: does not reverse it completely. Random poses have at least a tenth of the range on both sides.
+_APPROACH = 0.08
 #: Time for which the arm must be at rest at the start of an approach [s].
 APPROACH_REST = 0.2
 #: Distance [rad, m] outside the limits that is accepted at the start, because the limits of two arms differ.
@@ -225,11 +228,15 @@ class CrtkCollector:
         """Publishes goals on a line to `q_end`. The goals wait while the measured pose is too far behind."""
         path = CubicTrajectory.rest_to_rest(self._goal, q_end, self._span / self._settings.traverse_time)
         elapsed = waited = 0.0
+        least = np.inf
         before = next_goal = self._time
         while elapsed < path.duration:
             step, before = self._time - before, self._time
-            if np.all(np.abs(self._goal - self._monitor.q) <= self._tolerance):
-                elapsed, waited = elapsed + step, 0.0
+            behind = float(np.max(np.abs(self._goal - self._monitor.q) / self._span))
+            if behind <= MAX_TRACKING_ERROR:
+                elapsed, waited, least = elapsed + step, 0.0, np.inf
+            elif behind < least - _PROGRESS:
+                waited, least = 0.0, behind
             elif (waited := waited + step) > STALL:
                 raise self._does_not_follow()
             if self._time >= next_goal:
@@ -286,7 +293,7 @@ def approaches(arm: Arm, pose: NDArray[np.float64], settings: CollectionSettings
     """Returns the pose (n,) at which each approach to `pose` begins, or None for an approach from anywhere."""
     if not settings.both_sides:
         return [None]
-    offset = APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
+    offset = _APPROACH * (arm.position_upper - arm.position_lower)
     return [offset_pose(arm, pose, side * offset) for side in (-1, 1)]
 
 

@@ -104,7 +104,7 @@ def jump(arm):
     ("fault", "message"),
     [
         (
-            lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.65 * MTML.effort_limits),
+            lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.75 * MTML.effort_limits),
             "of shoulder_pitch differs from the",
         ),
         (lambda arm: disturb(arm, is_blocked=True), "it does not follow. "),
