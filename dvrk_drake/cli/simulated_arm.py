@@ -51,6 +51,9 @@ class SimulatedRos:
             help="With --ros: simulated effects, e.g. friction, or all (docs/simulated_effects.md). Default: none.",
         ),
     ] = None
+    enabled: Annotated[
+        bool, Parameter(show_default=False, help="With --ros: enable and home the arm at the start.")
+    ] = False
 
 
 _ROS = SimulatedRos()
@@ -92,7 +95,7 @@ def arm(
         _run_ros_arm(simulated_arm, ros, pose, realtime)
         return
     if ros != _ROS:
-        raise StationError("--topic, --domain, --rate, --model and --effects require --ros")
+        raise StationError("--topic, --domain, --rate, --model, --effects and --enabled require --ros")
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
     start = start_pose(simulated_arm, pose)
@@ -133,7 +136,7 @@ def _run_ros_arm(arm: LoadedArm, options: SimulatedRos, pose: list[float] | None
         for warning in make_realtime():
             print_warning(warning)
     with interrupt_ends_process():
-        simulated = SimulatedRosArm(arm, driver, start, effects)
+        simulated = SimulatedRosArm(arm, driver, start, effects, enabled=options.enabled)
         stopped = stop_on_signals()
     settle_memory()
     print(f"simulated {arm.name} on {simulated.source}; press Ctrl-C to end", flush=True)

@@ -37,7 +37,8 @@ class CompensationOptions:
         dead_band, saturation: Speeds (7,) [rad/s], see `GravityCompensationFile`. The default values come from
             gravity-compensation files of the dVRK.
         tolerance: Largest accepted difference between the torques of the file and of the model on any joint [N m].
-            None: the dry friction of each joint, see `gravity_compensation_loss.accepted_differences`.
+            None: the dry friction of each joint, see `gravity_compensation_loss.accepted_differences`, and no limit at
+            joint 7, because the controller applies no torque there.
     """
 
     coulomb: tuple[float, ...] = (0.0,) * NUM_JOINTS
@@ -73,6 +74,9 @@ def compensation_from_model(
             f"{arm.name} is not an MTM. The format dvrk-gc supports only an MTM; for a PSM, use dvrk-kinematic-gc"
         )
     tolerance = accepted_differences(arm, options.tolerance)
+    if options.tolerance is None:
+        # The controller applies no torque at joint 7, with or without a file.
+        tolerance[-1] = np.inf
     poses = _poses(arm)
     parameters = sum((part.parameters for part in model_parts(model, poses)), np.zeros(NUM_PARAMETERS))
     coulomb = _checked_values("coulomb", options.coulomb)

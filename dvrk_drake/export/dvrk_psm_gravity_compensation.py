@@ -7,7 +7,8 @@ torques t1..t7 of the chain, and applies [t1, t3 - t4 + t5, t7] to yaw, pitch an
 Link 3 is the back crank, link 4 is the bottom bar and link 5 is the end link. The chain has no links for the other bars
 of the parallelograms and for the counterweight. The first moments of links 1, 3, 4 and 5 therefore include these parts.
 The mass of link 7 is the mass that moves with the insertion joint, minus the mass that the counterweight balances.
-Link 6 has no mass, because it moves at half of the insertion speed and t7 does not include its weight.
+Link 6 moves at half of the insertion speed, and t7 does not include its weight. It has a mass only if the feedforward
+of insertion is disabled. Link 7 then has none, so the torque of insertion is 0.
 """
 
 from __future__ import annotations
@@ -124,20 +125,26 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     q = arm.sample_poses(600, np.random.default_rng(0))
     straight = np.where(np.arange(arm.num_joints) < 3, q, 0.0)
     beta = np.array([p.value for p in model.base_parameters])
-    tau = (model.feedforward_scale * (model.static_model.regressor(straight)[:, :, : len(beta)] @ beta))[:, :3]
+    gravity = (model.static_model.regressor(straight)[:, :, : len(beta)] @ beta)[:, :3]
+    tau = model.feedforward_scale[:3] * gravity
     # (m, 3, 7, 4): torque of yaw, pitch and insertion per unit of the mass and of the first moments of each link.
     frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
     Y = np.array([_regressor(X, arm.gravity) for X in frames])
     mass, moment = _initial_links(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
     mass_column = Y[:, 2, _LAST, 0]
-    mass_7 = float(mass_column @ tau[:, 2] / (mass_column @ mass_column))
-    if not mass_7 > 0:
+    is_off = model.feedforward_scale[2] == 0
+    net = float(mass_column @ (gravity if is_off else tau)[:, 2] / (mass_column @ mass_column))
+    if not net > 0 and not is_off:
         raise ModelError(
-            f"{arm.name}: the net mass on the insertion joint is {mass_7:.3g} kg because of the counterweight. The "
+            f"{arm.name}: the net mass on the insertion joint is {net:.3g} kg because of the counterweight. The "
             "controller's file requires a positive mass; check the base parameters of the model"
         )
-    moment[_LAST] *= mass_7 / mass[_LAST]
-    mass[_LAST] = mass_7
+    if is_off:
+        # Link 6 moves at half of the insertion speed, and its weight does not act on the insertion joint of the file.
+        mass[_LAST], mass[_LAST - 1], moment[_LAST] = 0.0, 2 * max(net, 0.0), 0.0
+    else:
+        moment[_LAST] *= net / mass[_LAST]
+        mass[_LAST] = net
     known = np.concatenate([mass[:, None], moment], axis=1)
     unknown = Y[:, :, _FITTED, 1:].reshape(tau.size, -1)
     step = np.linalg.lstsq(unknown, (tau - np.einsum("mjlk,lk->mj", Y, known)).ravel(), rcond=1e-9)[0]
@@ -153,11 +160,12 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
 
 
 def _refuse_disabled_joints(model: IdentifiedModel) -> None:
-    scale = model.feedforward_scale[: len(ARM_JOINTS)]
-    if off := [name for name, s in zip(ARM_JOINTS, scale, strict=True) if s == 0]:
+    """Raises ModelError if yaw or pitch has no feedforward. The file can omit the torque of insertion only."""
+    scale = model.feedforward_scale[:2]
+    if off := [name for name, s in zip(ARM_JOINTS, scale, strict=False) if s == 0]:
         raise ModelError(
-            f"{model.arm.name}: the feedforward is disabled for {', '.join(off)}, but the controller's file "
-            "compensates gravity on yaw, pitch and insertion. Identify a model from a recording in which they move"
+            f"{model.arm.name}: the feedforward is disabled for {', '.join(off)}, but the controller's file always "
+            "compensates gravity on yaw and pitch. Identify a model from a recording in which they move"
         )
 
 

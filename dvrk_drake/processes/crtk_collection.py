@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, estimated_duration
+from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, approaches, estimated_duration
 from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 _POLL = 0.01
 #: Messages of one topic that may arrive between two updates. Older messages are lost.
 _DEPTH = 5000
-#: Longest time until the first valid measurement of a homed arm, and until the arm confirms `hold` [s].
-_FIRST, _CONFIRMATION = 5.0, 1.0
+#: Longest time until the first valid measurement of a homed arm, until the arm confirms `hold`, and until it is
+#: discovered again [s].
+_FIRST, _CONFIRMATION, _DISCOVERY = 5.0, 1.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -100,11 +101,12 @@ def bag_path(output: str | Path) -> Path:
 def summary(
     arm: Arm, q: NDArray[np.float64], poses: NDArray[np.float64], settings: CrtkCollectionSettings
 ) -> list[str]:
-    """Returns lines on the poses (m, n) of a collection that begins at q (n,): ranges of the joints, and duration."""
+    """Returns lines on the poses (m, n) of a collection that begins at q (n,): ranges of the goals, and duration."""
     width = max(map(len, arm.joint_names))
-    lines = [f"{'':{width}}     present        poses [{'rad, m' if arm.prismatic.any() else 'rad'}]"]
+    goals = np.array([goal for pose in poses for goal in (pose, *approaches(arm, pose, settings)) if goal is not None])
+    lines = [f"{'':{width}}     present        goals [{'rad, m' if arm.prismatic.any() else 'rad'}]"]
     for j, name in enumerate(arm.joint_names):
-        lines.append(f"{name:{width}}  {q[j]:10.3f}  {poses[:, j].min():10.3f} to {poses[:, j].max():.3f}")
+        lines.append(f"{name:{width}}  {q[j]:10.3f}  {goals[:, j].min():10.3f} to {goals[:, j].max():.3f}")
     sides = "both sides" if settings.both_sides else "one side"
     minutes = estimated_duration(arm, q, poses, settings) / 60
     lines.append(f"{len(poses)} poses, each approached from {sides}; estimated duration {minutes:.1f} min")
@@ -200,6 +202,14 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
 
 
 def _hold(client: CrtkClient, report: Callable[[str], None]) -> None:
+    """Publishes `hold`, and reports if the arm does not confirm it."""
     client.hold()
-    if not client.wait_until_received(_CONFIRMATION):
+
+    def is_heard() -> bool:
+        return not client.unheard_commands(("hold",))
+
+    # After an interruption of the network or of this process, DDS first has to discover the arm again.
+    if not is_heard() and client.domain.wait_until(is_heard, _DISCOVERY):
+        client.hold()
+    if not (is_heard() and client.wait_until_received(_CONFIRMATION)):
         report(f"{client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")

@@ -23,7 +23,6 @@ from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.collector import (
-    APPROACH,
     MAX_TRACKING_ERROR,
     MEASURE,
     REST,
@@ -43,8 +42,12 @@ if TYPE_CHECKING:
 
 #: Time between two goals of a motion [s].
 GOAL_PERIOD = 0.1
-#: Time without progress after which a motion is stopped [s].
-STALL = 2.0
+#: Time without progress towards the goal after which a motion is stopped [s]. Smallest progress, as a fraction of the
+#: range of the joint.
+STALL, _PROGRESS = 2.0, 0.005
+#: Length of an approach, as a fraction of the range of the joint. Dry friction is elastic at first, so a short approach
+#: does not reverse it completely. Random poses have at least a tenth of the range on both sides.
+_APPROACH = 0.08
 #: Time for which the arm must be at rest at the start of an approach [s].
 APPROACH_REST = 0.2
 #: Distance [rad, m] outside the limits that is accepted at the start, because the limits of two arms differ.
@@ -54,7 +57,7 @@ _PAUSE = 1.0
 #: Largest time step of a motion [s]. It prevents a distant goal after this process was suspended.
 _MAX_STEP = 0.05
 #: Typical delay of an arm behind the goal [s], for the estimated duration.
-_DELAY = 0.5
+DELAY = 0.5
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ class CrtkCollector:
         self._monitor = CrtkMonitor(client, model, settings.max_effort)
         self._span = arm.position_upper - arm.position_lower
         self._tolerance = MAX_TRACKING_ERROR * self._span
-        self._now = self._time = self._paused_at = 0.0
+        self._now = self._time = self._pose_end = self._paused_at = 0.0
         self._goal = np.zeros(arm.num_joints)
         self._num_before = np.count_nonzero(self.done)
         self._activity = "starting"
@@ -171,9 +174,10 @@ class CrtkCollector:
 
     def _time_left(self) -> str:
         count = np.count_nonzero(self.done) - self._num_before
-        if not count:
+        if not count or self.done.all():
             return ""
-        return f"; about {self._time / count * np.count_nonzero(~self.done) / 60:.1f} min left"
+        left = self._pose_end * (1 + np.count_nonzero(~self.done) / count) - self._time
+        return f"; about {max(left, 0.0) / 60:.1f} min left"
 
     def _pause_or_continue(self) -> None:
         if not self.paused:
@@ -217,18 +221,22 @@ class CrtkCollector:
         if self._settings.both_sides:
             row.append((measured[0] - measured[1])[self._arm.num_joints :] / 2)
         self._output.append(pose, *row)
-        self.done[k] = True
+        self.done[k], self._pose_end = True, self._time
         self._report(f"pose {k + 1} measured, {np.count_nonzero(self.done)} of {len(self.done)}{self._time_left()}")
 
     def _move_to(self, q_end: NDArray[np.float64]) -> Steps:
         """Publishes goals on a line to `q_end`. The goals wait while the measured pose is too far behind."""
         path = CubicTrajectory.rest_to_rest(self._goal, q_end, self._span / self._settings.traverse_time)
         elapsed = waited = 0.0
+        least = np.inf
         before = next_goal = self._time
         while elapsed < path.duration:
             step, before = self._time - before, self._time
-            if np.all(np.abs(self._goal - self._monitor.q) <= self._tolerance):
-                elapsed, waited = elapsed + step, 0.0
+            behind = float(np.max(np.abs(self._goal - self._monitor.q) / self._span))
+            if behind <= MAX_TRACKING_ERROR:
+                elapsed, waited, least = elapsed + step, 0.0, np.inf
+            elif behind < least - _PROGRESS:
+                waited, least = 0.0, behind
             elif (waited := waited + step) > STALL:
                 raise self._does_not_follow()
             if self._time >= next_goal:
@@ -285,7 +293,7 @@ def approaches(arm: Arm, pose: NDArray[np.float64], settings: CollectionSettings
     """Returns the pose (n,) at which each approach to `pose` begins, or None for an approach from anywhere."""
     if not settings.both_sides:
         return [None]
-    offset = APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
+    offset = _APPROACH * (arm.position_upper - arm.position_lower)
     return [offset_pose(arm, pose, side * offset) for side in (-1, 1)]
 
 
@@ -296,11 +304,11 @@ def estimated_duration(
     speed, total = (arm.position_upper - arm.position_lower) / settings.traverse_time, 0.0
     for pose in poses:
         for begin in approaches(arm, pose, settings):
-            total += REST_TIME + MEASURE + _DELAY
+            total += REST_TIME + MEASURE + DELAY
             for goal in (begin, pose):
                 if goal is not None:
                     total += CubicTrajectory.rest_to_rest(q, goal, speed).duration
                     q = goal
             if begin is not None:
-                total += APPROACH_REST + _DELAY
+                total += APPROACH_REST + DELAY
     return total

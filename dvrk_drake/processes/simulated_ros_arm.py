@@ -12,6 +12,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 from dvrk_drake.systems.ros.sim_crtk_driver import PERIOD, apply_crtk_driver_config
@@ -24,7 +25,15 @@ class SimulatedRosArm:
         source: ROS domain and namespace of the topics, for messages.
     """
 
-    def __init__(self, arm: Arm, driver: CrtkDriver, q: ArrayLike, effects: ArmEffects | None = None) -> None:
+    def __init__(
+        self,
+        arm: Arm,
+        driver: CrtkDriver,
+        q: ArrayLike,
+        effects: ArmEffects | None = None,
+        *,
+        enabled: bool = False,
+    ) -> None:
         """Creates the arm at rest, DISABLED and not homed.
 
         Args:
@@ -32,6 +41,7 @@ class SimulatedRosArm:
             driver: Configuration of the driver.
             q: Initial pose (n,) [rad, m].
             effects: Simulated effects of the real arm. None: no effects.
+            enabled: Whether to enable and home the arm in the first step.
 
         Raises:
             DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
@@ -42,7 +52,9 @@ class SimulatedRosArm:
         self.source = f"{domain.name}, topics {driver.arm_namespace(arm)}/..."
         builder = DiagramBuilder()
         station = builder.AddSystem(ArmStation(arm, effects=effects))
-        apply_crtk_driver_config(driver, station, builder, domain=domain, report=self._report_with_time)
+        sim_driver = apply_crtk_driver_config(driver, station, builder, domain=domain, report=self._report_with_time)
+        for text in ("enable", "home") if enabled else ():
+            sim_driver.Receive(CrtkCommand("state_command", text=text))
         self._simulator = Simulator(builder.Build())
         context = self._simulator.get_mutable_context()
         station.SetPositions(station.GetMyMutableContextFromRoot(context), q)

@@ -66,7 +66,10 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
     if is_headerless:
         time_notes = (f"no header: columns read as {', '.join(f'{name}1..{name}{n}' for name in blocks)}", *time_notes)
     used = {column for columns in blocks.values() for column in columns}
-    if t is None and (ignored := [name for column, name in enumerate(header) if name and column not in used]):
+    # `collect` writes files without a column t.
+    is_pose_file = {"pose1", "utime"} <= set(header)
+    ignored = [name for column, name in enumerate(header) if name and column not in used]
+    if t is None and ignored and not is_pose_file:
         time_notes = (f"no column t, read as static poses; ignored columns: {', '.join(ignored)}",)
     recording = Recording(
         found.blocks["q"],

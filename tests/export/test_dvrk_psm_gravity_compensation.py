@@ -101,8 +101,8 @@ def test_rejects_a_model_that_the_file_cannot_represent():
     model.effects[0].coefficient = 0.3
     with pytest.raises(ModelError, match=r"pitch 0\.3 N m \(9\.0 % of the effort limit, allowed: 0\.285 N m"):
         kinematic_compensation(model)
-    model.joints[2].feedforward_scale = 0.0
-    with pytest.raises(ModelError, match="feedforward is disabled for insertion"):
+    model.joints[1].feedforward_scale = 0.0
+    with pytest.raises(ModelError, match="feedforward is disabled for pitch"):
         kinematic_compensation(model)
     heavy = perturbed_psm()
     (net,) = (p for p in heavy.base_parameters if "- m_counterweight" in p.name and p.name.startswith("(m3"))
@@ -111,6 +111,16 @@ def test_rejects_a_model_that_the_file_cannot_represent():
         kinematic_compensation(heavy)
     with pytest.raises(ModelError, match="is not a PSM"):
         kinematic_compensation(IdentifiedModel.from_arm(load_arm("mtml")))
+
+
+def test_insertion_without_feedforward_has_no_torque():
+    model = perturbed_psm()
+    before = kinematic_compensation(model)
+    model.joints[2].feedforward_scale = 0.0
+    file = kinematic_compensation(model)
+    np.testing.assert_allclose(file.loss.difference, 0.0, atol=1e-9)
+    assert before.mass[6] > 0 and file.mass[6] == 0
+    assert file.mass[5] == pytest.approx(2 * before.mass[6], rel=1e-9)
 
 
 def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):

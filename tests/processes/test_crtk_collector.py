@@ -9,7 +9,7 @@ from substitute_crtk_arm import PERIOD, Collection, SubstituteArm
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.crtk_collection import bag_path, summary
-from dvrk_drake.processes.crtk_collector import GOAL_PERIOD, CrtkCollectionSettings, estimated_duration
+from dvrk_drake.processes.crtk_collector import DELAY, GOAL_PERIOD, CrtkCollectionSettings, estimated_duration
 from dvrk_drake.recordings.reading import read_recording
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
@@ -104,7 +104,7 @@ def jump(arm):
     ("fault", "message"),
     [
         (
-            lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.65 * MTML.effort_limits),
+            lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.75 * MTML.effort_limits),
             "of shoulder_pitch differs from the",
         ),
         (lambda arm: disturb(arm, is_blocked=True), "it does not follow. "),
@@ -172,7 +172,9 @@ def test_estimated_duration(collection):
     estimate = estimated_duration(MTML, np.zeros(7), POSES, settings)
     start = collection.arm.time
     collection.run()
-    assert 0.5 * estimate < collection.arm.time - start < 1.2 * estimate
+    # The substitute follows without delay. Each of the 8 motions takes at most the period of the goals longer.
+    stops = 4 * len(POSES)
+    assert 0 <= collection.arm.time - start - (estimate - stops * DELAY) < stops * GOAL_PERIOD
     lines = summary(MTML, np.zeros(7), POSES, settings)
     assert len(lines) == 9 and lines[-1].startswith("2 poses, each approached from both sides; estimated duration 0.")
     assert lines[1].startswith("outer_yaw            0.000")

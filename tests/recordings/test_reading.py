@@ -7,6 +7,8 @@ import pytest
 import scipy.io
 from public_files import assert_refused, team_array, wpi_rows, write_mat, write_text, write_wpi
 
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.reading import detect_format, read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording
 
@@ -72,3 +74,11 @@ def test_ignored_columns_are_noted_if_there_is_no_time(tmp_path):
     header = "time,q1,q2,q3,q4,q5,q6,q7,temperature"
     path = write_text(tmp_path, f"{header}\n0,1,2,3,4,5,6,7,40\n1,2,3,4,5,6,7,8,41\n")
     assert read_recording(path).notes == ("no column t, read as static poses; ignored columns: time, temperature",)
+
+
+def test_poses_of_a_collection_have_no_note(tmp_path):
+    file = CollectionFile(tmp_path / "poses.csv", load_arm("mtml"), both_sides=True)
+    file.append(np.zeros(7), np.zeros(7), np.ones(7), np.ones(7))
+    file.close()
+    recording = read_recording(tmp_path / "poses.csv")
+    assert recording.t is None and recording.notes == ()

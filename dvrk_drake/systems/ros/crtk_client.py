@@ -44,8 +44,9 @@ MOTION_TOPICS = (
 )
 #: Topics with which a client moves the separate joint.
 _SEPARATE_TOPICS = ("servo_jp", "servo_jf", "move_jp")
-#: Time after which a measurement of the separate joint is out of date [s].
-_JAW_AGE = 0.02
+#: Time [s] and number of measurements of the arm after which a measurement of the separate joint is out of date. It is
+#: out of date if both are exceeded, because a dVRK publishes at 100 Hz by default, and not in real time.
+_JAW_AGE, _JAW_COUNT = 0.02, 2
 #: Largest number of characters of a received text that is shown.
 _SHOWN = 40
 
@@ -89,7 +90,7 @@ class JointStateReader:
         self._columns = np.array([arm.joint_names.index(joint) for joint in self._main])
         self._order: tuple[list[str] | None, list[int]] = (None, [])
         self._jaw: tuple[float, float, float] | None = None
-        self._jaw_arrival = 0
+        self._jaw_arrival = self._num_since_jaw = 0
 
     def read(self, message: JointState, arrival: int) -> JointMeasurement:
         """Converts a message of the arm.
@@ -98,6 +99,7 @@ class JointStateReader:
             message: Message.
             arrival: Time of arrival on the monotonic clock [ns].
         """
+        self._num_since_jaw += 1
         blocks = np.full((3, self._arm.num_joints), np.nan)
         problem, stamp = self._problem(message), message.header.nanoseconds
         if not problem:
@@ -120,7 +122,7 @@ class JointStateReader:
         parts = (message.position, message.velocity, message.effort)
         usable = message.header.nanoseconds and all(len(part) == 1 for part in parts)
         self._jaw = (parts[0][0], parts[1][0], parts[2][0]) if usable else None
-        self._jaw_arrival = arrival
+        self._jaw_arrival, self._num_since_jaw = arrival, 0
 
     def _problem(self, message: JointState) -> str:
         """Returns the reason why a message cannot be used, or ""."""
@@ -142,7 +144,8 @@ class JointStateReader:
     def _add_jaw(self, blocks: NDArray[np.float64], arrival: int) -> str:
         """Adds the separate joint to `blocks` (3, n). Returns a problem or ""."""
         name = self._arm.separate_joint
-        if self._jaw is None or arrival - self._jaw_arrival > 1e9 * _JAW_AGE:
+        is_old = arrival - self._jaw_arrival > 1e9 * _JAW_AGE and self._num_since_jaw > _JAW_COUNT
+        if self._jaw is None or is_old:
             return f"no valid message on {self._topic.rpartition('/')[0]}/{name}/measured_js"
         blocks[:, self._arm.joint_names.index(name)] = self._jaw
         return ""
@@ -401,15 +404,17 @@ def connect_client(domain: RosDomain, arm: Arm, topic: str | None, commands: Seq
 
     def is_complete() -> bool:
         client.receive()
-        return bool(client.operating_state and client.measurement and not client.unheard_commands(commands))
+        measurement = client.measurement
+        # The separate joint may be discovered later than the arm. An arm that is not homed has no measurements.
+        is_measured = measurement is not None and not (measurement.stamp and measurement.problem)
+        return bool(client.operating_state and is_measured and not client.unheard_commands(commands))
 
     if not domain.wait_until(is_complete, _FIRST):
         messages = {"measured_js": client.measurement, "operating_state": client.operating_state}
         if missing := [name for name, message in messages.items() if message is None]:
             raise ControllerError(f"no message on {namespace}/{missing[0]} within {_FIRST:g} s. Is it a dVRK?")
+        if client.measurement is not None and client.measurement.stamp and client.measurement.problem:
+            raise ControllerError(client.measurement.problem)
         unheard = ", ".join(client.unheard_commands(commands))
         raise ControllerError(f"no process subscribes to {unheard}. Is it a dVRK?")
-    measurement = client.measurement
-    if measurement is not None and measurement.stamp and measurement.problem:
-        raise ControllerError(measurement.problem)
     return client
