@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
+from dvrk_drake.systems.ros.confirmation import repeat_until_received
 from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
 
@@ -283,8 +284,12 @@ class CrtkClient:
         self._state_command.publish(StringStamped(Header.now(), command))
 
     def wait_until_received(self, seconds: float) -> bool:
-        """Waits until the arm has confirmed the last `hold`, at most `seconds`. Returns whether it has."""
-        return self._hold.wait_until_received(seconds)
+        """Repeats the last `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the message.
+        """
+        return repeat_until_received(self._hold, Empty(), self._state.num_publishers, seconds)
 
     def unheard_commands(self, names: Sequence[str]) -> list[str]:
         """Returns the command topics to which no process subscribes.
