@@ -70,10 +70,11 @@ def run_bridge(
     try:
         network.subscribe(command_channel(arm), lambda channel, data: bridge.put(data)).set_queue_capacity(_QUEUE)
         while not stopped():
-            select.select([bridge.fileno(), network.fileno()], [], [], _POLL)
-            for _ in range(_MESSAGES_PER_STEP):
-                if not handle_message(network, 0.0):
-                    break
+            readable, _, _ = select.select([bridge.fileno(), network.fileno()], [], [], _POLL)
+            if network.fileno() in readable:
+                for _ in range(_MESSAGES_PER_STEP):
+                    if not handle_message(network, 0.0):
+                        break
             bridge.update()
     finally:
         bridge.close()

@@ -182,8 +182,10 @@ class CrtkBridge:
         elif not self._was_ready:
             self._switch_gravity_compensation_off()
         self._was_ready = not not_ready
-        if others := self._others():
-            guard.report_fault(others)
+        if not self._was_answered:
+            self._find_other_publishers()
+        if self._other_publishers:
+            guard.report_fault(f"another process publishes {self._other_publishers}. End it")
         self._blocked = self._block_reason()
         guard.block(self._blocked)
         output = self._step_guard(now)
@@ -201,6 +203,8 @@ class CrtkBridge:
         """Steps the guard after the command that answers the last measurement."""
         self._publish(self._step_guard(now), now)
         self._awaits_answer, self._was_answered = False, True
+        # This check needs more computing time than the others. After the answer, it does not delay it.
+        self._find_other_publishers()
 
     def _step_guard(self, now: int) -> GuardOutput:
         """Passes the commands to the guard, and returns its output."""
@@ -302,12 +306,11 @@ class CrtkBridge:
             "period of 1 ms: dvrk_system -j FILE.json -p 0.001"
         )
 
-    def _others(self) -> str:
-        """Returns a text about other processes that could move the arm, or ""."""
+    def _find_other_publishers(self) -> None:
+        """Finds the topics on which another process could move the arm, after publishers have appeared or ended."""
         if self._client.domain.num_changes != self._num_changes:
             self._num_changes = self._client.domain.num_changes
             self._other_publishers = ", ".join(self._client.other_publishers())
-        return f"another process publishes {self._other_publishers}. End it" if self._other_publishers else ""
 
     def _describe(self) -> None:
         """Reports a change of the state of the guard."""
