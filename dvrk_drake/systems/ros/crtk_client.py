@@ -98,12 +98,6 @@ class CrtkClient:
         self._state_command = domain.advertise(self._topic("state_command"), StringStamped)
 
     @property
-    def state(self) -> str:
-        """Operating state of the arm in one word, e.g. "ENABLED", or "unknown" before the first message."""
-        state = self.operating_state
-        return "unknown" if state is None else state.state
-
-    @property
     def not_ready_reason(self) -> str:
         """Reason why the arm does not execute commands, or "" if it is enabled and homed."""
         state = self.operating_state

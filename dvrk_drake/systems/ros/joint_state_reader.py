@@ -82,7 +82,12 @@ class JointStateReader:
         return JointMeasurement(q, v, effort, stamp, arrival, problem)
 
     def read_jaw(self, message: JointState, arrival: int) -> None:
-        """Stores a message of the separate joint. It becomes part of the next measurement."""
+        """Stores a message of the separate joint. It becomes part of the next measurements for 20 ms.
+
+        Args:
+            message: Message.
+            arrival: Time of arrival on the monotonic clock [ns].
+        """
         parts = (message.position, message.velocity, message.effort)
         usable = message.header.nanoseconds and all(len(part) == 1 for part in parts)
         self._jaw = (parts[0][0], parts[1][0], parts[2][0]) if usable else None
