@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_station import station_ports
 from dvrk_drake.systems.lcm.arm_connection import connect_arm
@@ -51,15 +52,19 @@ class HardwareArmStation(Diagram):
             driver: Configuration of the driver: `DvrkDriver` for LCM, `CrtkDriver` for ROS 2. None: `DvrkDriver()`.
             lcm: LCM interface whose `HandleSubscriptions` the caller calls, for loops that are driven by messages.
                 None: the station creates an interface at `driver.lcm_url`, and the Simulator handles its messages.
+                Not allowed with a `CrtkDriver`.
 
         Raises:
             KeyFileError: The driver's key cannot be used.
+            StationError: `lcm` is given together with a `CrtkDriver`.
             DvrkDrakeError: With a `CrtkDriver`: the arm is not found, or another process could move it.
         """
         super().__init__()
         self._arm = arm
         builder = DiagramBuilder()
         if isinstance(driver, CrtkDriver):
+            if lcm is not None:
+                raise StationError("lcm cannot be used with a driver over ROS 2, whose messages stay in memory")
             require_cyclonedds()
             from dvrk_drake.systems.ros.crtk_connection import add_crtk_bridge
 

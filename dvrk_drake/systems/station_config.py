@@ -22,7 +22,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.schema_fault import formerly, number_fault, with_current_keys, within
+from dvrk_drake.models.schema_fault import formerly, number_fault, schema_fault, with_current_keys, within
 from dvrk_drake.models.typed_yaml import load_yaml
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, plant_config_fault
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
@@ -134,6 +134,11 @@ def load_station_config(path: str | Path) -> StationConfig:
         ArmError: The arm cannot be loaded.
     """
     content = with_current_keys(StationConfig, load_yaml(path, StationError), str(path))
+    for key, schema in (("driver", DvrkDriver), ("ros_driver", CrtkDriver)):
+        section = content.get(key) if isinstance(content, dict) else None
+        # Drake's messages name neither the section nor the accepted values.
+        if section is not None and (fault := schema_fault(schema, section, key)):
+            raise StationError(f"{path}: {key}: {fault}")
     try:
         config: StationConfig = yaml_load_typed(schema=StationConfig, data=yaml.safe_dump(content))
         config.check()

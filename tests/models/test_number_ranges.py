@@ -42,10 +42,11 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.hand import Grip
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.station_config import load_station_config
 
 #: Schemas of files.
-FILES = (ArmDescription, Mechanism, Instrument, Gains, DvrkDriver, Scenario, Study, PoseFile, ModelFile)
+FILES = (ArmDescription, Mechanism, Instrument, Gains, DvrkDriver, CrtkDriver, Scenario, Study, PoseFile, ModelFile)
 #: Dataclasses with arrays, created by Python code.
 OBJECTS = (Arm, GravityCompensationFile, CollectionSettings, Grip)
 

@@ -217,6 +217,7 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--ros", "--meshcat"], "--driver, --lcm-url, --key and --meshcat cannot be used with --ros"),
         (["--ros", "--lcm-url", "memq://"], "--driver, --lcm-url, --key and --meshcat cannot be used with --ros"),
         (["--rate", "500"], "--topic, --domain, --rate, --model, --effects and --enabled require --ros"),
         (["--ros", "--rate", "5000"], "rate is 5000; allowed: 10..1000 Hz"),

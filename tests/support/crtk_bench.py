@@ -12,7 +12,7 @@ from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySetting
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.ros import arrival_clock
 from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge
-from dvrk_drake.systems.ros.crtk_client import JointMeasurement
+from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement
 
 MS = 1_000_000
 START = 1_795_257_600 * 10**9

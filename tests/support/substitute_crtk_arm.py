@@ -21,7 +21,6 @@ class SubstituteArm:
         q: Measured positions (n,) [rad, m].
         friction: Dry friction (n,) [N m, N]. Its sign is that of the last motion.
         goals: Goals of `move_jp` so far.
-        holds: Number of `hold` so far.
         commands: Names of the commands so far, without repetitions.
         ticks: Number of periods so far.
     """
@@ -32,14 +31,9 @@ class SubstituteArm:
         n = arm.num_joints
         self.arm, self.model = arm, ControlModel(IdentifiedModel.from_arm(arm))
         self.q, self.friction = np.zeros(n), np.zeros(n) if friction is None else friction
-        self.goals, self.holds, self.commands, self.ticks = [], 0, [], 0
-        self.state, self.is_homed, self.is_blocked, self.is_silent, self.extra = (
-            "ENABLED",
-            True,
-            False,
-            False,
-            np.zeros(n),
-        )
+        self.goals, self.commands, self.ticks = [], [], 0
+        self.state, self.is_homed, self.is_blocked, self.is_silent = "ENABLED", True, False, False
+        self.extra = np.zeros(n)
         self.problem, self.others, self.unheard, self.num_received = "", [], [], 0
         self.domain = SimpleNamespace(num_changes=0)
         self.stamp_offset = 0
@@ -86,7 +80,6 @@ class SubstituteArm:
         self._command("move_jp")
 
     def hold(self):
-        self.holds += 1
         self._target = self.q
         self._command("hold")
 

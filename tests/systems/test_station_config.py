@@ -14,6 +14,7 @@ from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
+from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.station_config import ArmConfig, StationConfig, load_station_config, make_arm_station
 
 FILE = """
@@ -106,6 +107,33 @@ def test_invalid_values_are_reported(path, old, new, message):
     with pytest.raises((StationError, ArmError), match=message) as error:
         load_station_config(path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({"rate": 5}, r"ros_driver: rate is 5; allowed: 10\.\.1000 Hz"),
+        ({"domain": "x"}, r'ros_driver: domain is "x"; allowed: an integer'),
+        ({"ratte": 500}, r'ros_driver: key "ratte" is unknown; did you mean "rate"\? allowed in ros_driver: domain, '),
+        ({"guard": {"expiry": 9.0}}, r"ros_driver: guard\.expiry is 9; allowed: "),
+        ({"control_modes": ["jump"]}, r"control_modes contains an unknown mode: \['jump'\]; allowed: position, "),
+        ({"namespace": "MTM L"}, 'namespace is "MTM L"; allowed: '),
+        ([1], r"ros_driver: must have keys and values, not \[1\]; allowed in ros_driver: domain, "),
+    ],
+)
+def test_mistakes_in_the_driver_over_ros_are_reported(path, section, message):
+    path.write_text(f"{FILE}ros_driver: {section}\n")
+    with pytest.raises(StationError, match=rf"station\.yaml: {message}") as error:
+        load_station_config(path)
+    assert "\n" not in str(error.value)
+
+
+def test_driver_over_ros_is_chosen_and_has_no_lcm_interface(path):
+    path.write_text(f"{FILE}ros_driver: {{domain: 3, model: ros.yaml}}\n")
+    config = load_station_config(path)
+    assert config.ros_driver == CrtkDriver(domain=3, model=str(path.parent / "ros.yaml"))
+    with pytest.raises(StationError, match="lcm cannot be used with a driver over ROS 2"):
+        make_arm_station(config, hardware=True, lcm=DrakeLcm("memq://"))
 
 
 def test_documentation_example_runs(monkeypatch):

@@ -49,6 +49,26 @@ class CrtkCommand:
     is_on: bool = False
 
 
+@dataclass(frozen=True)
+class ArmValues:
+    """Values that an arm publishes, in the arm's order of joints [rad, rad/s, N m; m, m/s, N].
+
+    Attributes:
+        q, v, effort: Measured values (n,).
+        setpoint_q, setpoint_v: Set-point (n,).
+        setpoint_effort: Commanded motor efforts (n,).
+        gravity_effort: Gravity compensation (n,) that is added to commanded efforts.
+    """
+
+    q: NDArray[np.float64]
+    v: NDArray[np.float64]
+    effort: NDArray[np.float64]
+    setpoint_q: NDArray[np.float64]
+    setpoint_v: NDArray[np.float64]
+    setpoint_effort: NDArray[np.float64]
+    gravity_effort: NDArray[np.float64]
+
+
 class CrtkArmState:
     """Operating state and control modes of a simulated dVRK arm, without ROS.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.ros.crtk_arm_state import CrtkArmState, CrtkCommand
+from dvrk_drake.systems.ros.crtk_arm_state import ArmValues, CrtkArmState, CrtkCommand
 from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
 from dvrk_drake.systems.ros.messages import (
@@ -35,26 +34,6 @@ from dvrk_drake.systems.ros.messages import (
 _SUBSCRIBERS_PERIOD = 0.1
 #: Messages of `state_command` between two ticks, e.g. "enable" and "home". Other topics keep the newest message.
 _STATE_COMMANDS = 10
-
-
-@dataclass(frozen=True)
-class ArmValues:
-    """Values that an arm publishes, in the arm's order of joints [rad, rad/s, N m; m, m/s, N].
-
-    Attributes:
-        q, v, effort: Measured values (n,).
-        setpoint_q, setpoint_v: Set-point (n,).
-        setpoint_effort: Commanded motor efforts (n,).
-        gravity_effort: Gravity compensation (n,) that is added to commanded efforts.
-    """
-
-    q: NDArray[np.float64]
-    v: NDArray[np.float64]
-    effort: NDArray[np.float64]
-    setpoint_q: NDArray[np.float64]
-    setpoint_v: NDArray[np.float64]
-    setpoint_effort: NDArray[np.float64]
-    gravity_effort: NDArray[np.float64]
 
 
 class CrtkArmTopics:
@@ -122,7 +101,11 @@ class CrtkArmTopics:
         return [command for _, command in sorted(received, key=lambda item: item[0])]
 
     def publish_state(self, machine: CrtkArmState) -> None:
-        """Publishes the operating state if it has changed."""
+        """Publishes the operating state if it has changed.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the message.
+        """
         state = (machine.state, machine.is_homed, machine.is_busy)
         if state != self._published_state:
             self._published_state = state
@@ -134,6 +117,9 @@ class CrtkArmTopics:
         Args:
             values: Values to publish.
             is_valid: Whether the values are valid. If not, the messages have the time stamp 0 and no values.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send a message.
         """
         if (now := time.monotonic()) >= self._next_check:
             self._next_check = now + _SUBSCRIBERS_PERIOD

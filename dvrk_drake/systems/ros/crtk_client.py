@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
+from dvrk_drake.systems.ros.confirmation import repeat_until_received
 from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
+from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement, JointStateReader, shown
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
 
 #: Longest time to wait for the topics of an arm [s]. Time to wait for other topics of the domain after the first one
@@ -25,7 +26,7 @@ _DISCOVERY, _OTHERS = 10.0, 1.0
 #: killed process [s].
 _FIRST, _ENDED = 5.0, 3.0
 #: Topics with which a client moves an arm. A second publisher on one of them could move the arm at the same time.
-MOTION_TOPICS = (
+_MOTION_TOPICS = (
     "servo_jp",
     "servo_jr",
     "servo_jv",
@@ -44,111 +45,6 @@ MOTION_TOPICS = (
 )
 #: Topics with which a client moves the separate joint.
 _SEPARATE_TOPICS = ("servo_jp", "servo_jf", "move_jp")
-#: Time [s] and number of measurements of the arm after which a measurement of the separate joint is out of date. It is
-#: out of date if both are exceeded, because a dVRK publishes at 100 Hz by default, and not in real time.
-_JAW_AGE, _JAW_COUNT = 0.02, 2
-#: Largest number of characters of a received text that is shown.
-_SHOWN = 40
-
-
-@dataclass(frozen=True)
-class JointMeasurement:
-    """Measured joint state of an arm with n joints, or the reason why a message cannot be used.
-
-    Attributes:
-        q: Positions (n,) [rad, m]. NaN if the message cannot be used.
-        v: Velocities (n,) [rad/s, m/s].
-        effort: Efforts of the motors (n,) [N m, N].
-        stamp: Time of the measurement on the clock of the dVRK's computer [ns since 1970]; 0 for invalid data.
-        arrival: Time of arrival on the monotonic clock of this computer [ns].
-        problem: Reason why the message cannot be used, or "".
-    """
-
-    q: NDArray[np.float64]
-    v: NDArray[np.float64]
-    effort: NDArray[np.float64]
-    stamp: int
-    arrival: int
-    problem: str = ""
-
-
-class JointStateReader:
-    """Converts JointState messages to measurements of an arm. Joints may be in any order.
-
-    The joint `Arm.separate_joint`, e.g. the jaw, has messages of its own.
-    """
-
-    def __init__(self, arm: Arm, topic: str) -> None:
-        """Creates a reader.
-
-        Args:
-            arm: Arm with n joints.
-            topic: Topic of the messages, for texts.
-        """
-        self._arm, self._topic, self._names = arm, topic, list(arm.joint_names)
-        self._main = [joint for joint in arm.joint_names if joint != arm.separate_joint]
-        self._columns = np.array([arm.joint_names.index(joint) for joint in self._main])
-        self._order: tuple[list[str] | None, list[int]] = (None, [])
-        self._jaw: tuple[float, float, float] | None = None
-        self._jaw_arrival = self._num_since_jaw = 0
-
-    def read(self, message: JointState, arrival: int) -> JointMeasurement:
-        """Converts a message of the arm.
-
-        Args:
-            message: Message.
-            arrival: Time of arrival on the monotonic clock [ns].
-        """
-        self._num_since_jaw += 1
-        blocks = np.full((3, self._arm.num_joints), np.nan)
-        problem, stamp = self._problem(message), message.header.nanoseconds
-        if not problem:
-            values = np.array([message.position, message.velocity, message.effort])
-            if message.name == self._names:
-                blocks = values
-            else:
-                blocks[:, self._columns] = values[:, self._order[1]]
-                if len(self._main) < self._arm.num_joints:
-                    problem = self._add_jaw(blocks, arrival)
-        if not problem and not np.isfinite(blocks).all():
-            problem = f"{self._topic}: a position, velocity or effort is not finite"
-        if problem:
-            blocks[:] = np.nan
-        q, v, effort = blocks
-        return JointMeasurement(q, v, effort, stamp, arrival, problem)
-
-    def read_jaw(self, message: JointState, arrival: int) -> None:
-        """Stores a message of the separate joint. It becomes part of the next measurement."""
-        parts = (message.position, message.velocity, message.effort)
-        usable = message.header.nanoseconds and all(len(part) == 1 for part in parts)
-        self._jaw = (parts[0][0], parts[1][0], parts[2][0]) if usable else None
-        self._jaw_arrival, self._num_since_jaw = arrival, 0
-
-    def _problem(self, message: JointState) -> str:
-        """Returns the reason why a message cannot be used, or ""."""
-        if message.header.nanoseconds == 0:
-            return f"{self._topic}: header stamp 0 marks invalid data. Home the arm"
-        if message.name != self._order[0]:
-            if missing := [joint for joint in self._main if joint not in message.name]:
-                found = ", ".join(shown(name) for name in message.name[: 2 * self._arm.num_joints]) or "none"
-                return f"{self._topic} has the joints {found}; {self._arm.name} also needs {', '.join(missing)}"
-            self._order = (list(message.name), [message.name.index(joint) for joint in self._main])
-        sizes = [len(part) for part in (message.position, message.velocity, message.effort)]
-        if sizes != [len(message.name)] * 3:
-            return (
-                f"{self._topic} has {sizes[0]} positions, {sizes[1]} velocities and {sizes[2]} efforts; "
-                f"required: {len(message.name)} each"
-            )
-        return ""
-
-    def _add_jaw(self, blocks: NDArray[np.float64], arrival: int) -> str:
-        """Adds the separate joint to `blocks` (3, n). Returns a problem or ""."""
-        name = self._arm.separate_joint
-        is_old = arrival - self._jaw_arrival > 1e9 * _JAW_AGE and self._num_since_jaw > _JAW_COUNT
-        if self._jaw is None or is_old:
-            return f"no valid message on {self._topic.rpartition('/')[0]}/{name}/measured_js"
-        blocks[:, self._arm.joint_names.index(name)] = self._jaw
-        return ""
 
 
 class CrtkClient:
@@ -172,6 +68,9 @@ class CrtkClient:
             domain: ROS domain of the arm.
             arm: Arm with n joints.
             namespace: Namespace of the topics, e.g. "/MTML". `find_arm` returns it.
+
+        Raises:
+            ArmError: The arm has locked joints.
         """
         arm.refuse_locked_joints("a client of a dVRK")
         self.arm, self.namespace, self.domain = arm, namespace, domain
@@ -197,12 +96,6 @@ class CrtkClient:
         self._hold = domain.advertise(self._topic("hold"), Empty)
         self._use_gravity_compensation = domain.advertise(self._topic("use_gravity_compensation"), Bool)
         self._state_command = domain.advertise(self._topic("state_command"), StringStamped)
-
-    @property
-    def state(self) -> str:
-        """Operating state of the arm in one word, e.g. "ENABLED", or "unknown" before the first message."""
-        state = self.operating_state
-        return "unknown" if state is None else state.state
 
     @property
     def not_ready_reason(self) -> str:
@@ -247,15 +140,29 @@ class CrtkClient:
         return bool(self._other_hold.take())
 
     def servo_jf(self, effort: ArrayLike) -> None:
-        """Commands efforts (n,) [N m, N]. The separate joint is not included; see `servo_separate`."""
+        """Commands efforts (n,) [N m, N]. The separate joint is not included; see `servo_separate`.
+
+        Raises:
+            DvrkDrakeError: There are not n finite efforts, or DDS cannot send the message.
+        """
         self._servo_jf.publish(JointState(Header.now(), effort=self._main(self._checked("servo_jf", effort))))
 
     def servo_jp(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
-        """Commands positions q (n,) [rad, m] and feedforward velocities v (n,) [rad/s, m/s], without a trajectory."""
+        """Commands positions q (n,) [rad, m] and feedforward velocities v (n,) [rad/s, m/s], without a trajectory.
+
+        The separate joint is not included; see `servo_separate`.
+
+        Raises:
+            DvrkDrakeError: There are not n finite numbers each, or DDS cannot send the message.
+        """
         self._servo_jp.publish(self._position_command("servo_jp", q, v))
 
     def move_jp(self, q: ArrayLike) -> None:
-        """Commands a motion to q (n,) [rad, m]. The arm computes the trajectory."""
+        """Commands a motion to q (n,) [rad, m], with the separate joint. The arm computes the trajectory.
+
+        Raises:
+            DvrkDrakeError: There are not n finite positions, or DDS cannot send a message.
+        """
         self._move_jp.publish(self._position_command("move_jp", q, None))
         if self._separate is not None:
             self.servo_separate("move_jp", float(np.asarray(q)[self._separate]))
@@ -266,6 +173,9 @@ class CrtkClient:
         Args:
             name: "servo_jf", "servo_jp" or "move_jp".
             value: Effort [N m, N] or position [rad, m].
+
+        Raises:
+            DvrkDrakeError: The value is not finite, or DDS cannot send the message.
         """
         if not np.isfinite(value):
             raise DvrkDrakeError(f"{self._jaw_topic(name)}: the command {value} is not finite")
@@ -286,8 +196,12 @@ class CrtkClient:
         self._state_command.publish(StringStamped(Header.now(), command))
 
     def wait_until_received(self, seconds: float) -> bool:
-        """Waits until the arm has confirmed the last `hold`, at most `seconds`. Returns whether it has."""
-        return self._hold.wait_until_received(seconds)
+        """Repeats the last `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the message.
+        """
+        return repeat_until_received(self._hold, Empty(), self._state.num_publishers, seconds)
 
     def unheard_commands(self, names: Sequence[str]) -> list[str]:
         """Returns the command topics to which no process subscribes.
@@ -341,11 +255,6 @@ class CrtkClient:
         return self.domain.advertise(self._topic(name), JointState)
 
 
-def shown(text: str) -> str:
-    """Returns a received text for a message: on one line and with a limited length."""
-    return text if text.isprintable() and len(text) <= _SHOWN else repr(text[:_SHOWN])
-
-
 def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
     """Returns the topics on which another process of the domain could move an arm, without duplicates.
 
@@ -354,7 +263,7 @@ def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
         arm: Arm.
         namespace: Namespace of the topics, e.g. "/MTML".
     """
-    names = [*MOTION_TOPICS, *(f"{arm.separate_joint}/{name}" for name in _SEPARATE_TOPICS if arm.separate_joint)]
+    names = [*_MOTION_TOPICS, *(f"{arm.separate_joint}/{name}" for name in _SEPARATE_TOPICS if arm.separate_joint)]
     motion = {f"{namespace}/{name}" for name in names}
     return sorted({e.topic for e in domain.publishers() if e.topic in motion and not e.is_own})
 

@@ -54,7 +54,12 @@ class CrtkBridgeSystem(LeafSystem):
 
 
 def add_crtk_bridge(builder: DiagramBuilder, arm: Arm, driver: CrtkDriver) -> DrakeLcmInterface:
-    """Adds a `CrtkBridgeSystem`. Returns the LCM interface for `connect_arm`.
+    """Adds a `CrtkBridgeSystem` to a Diagram. Returns its LCM interface, for `connect_arm`.
+
+    Args:
+        builder: Builder of the Diagram.
+        arm: Arm on ROS 2.
+        driver: Configuration of the driver.
 
     Raises:
         DvrkDrakeError: See `CrtkBridgeSystem`.

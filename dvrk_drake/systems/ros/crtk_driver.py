@@ -25,8 +25,8 @@ class CrtkDriver:
         namespace: Namespace of the topics, e.g. "/MTML". If it is empty, it is the name of the arm. A PSM is then
             /PSM1, because a dVRK numbers its PSMs.
         rate: Rate of the measurements of a simulated arm [Hz].
-        gravity_compensation: If true, the arm adds its own gravity compensation to commanded efforts. The topic
-            `use_gravity_compensation` changes this setting.
+        gravity_compensation: If true, a simulated arm adds its own gravity compensation to commanded efforts. The topic
+            `use_gravity_compensation` changes this setting. The bridge switches it off on a real arm.
         model: File of the identified model of the arm. The path is relative to the driver's YAML file. If it is empty,
             the model of the arm's SDF is used.
         control_modes: Modes that the guard of a real arm accepts in addition to hold; see `DvrkDriver`.

@@ -37,7 +37,12 @@ class JointGroup:
     """
 
     def __init__(self, arm: Arm, joints: Sequence[int]) -> None:
-        """Creates the group of the joints with the given indices, in control mode "none"."""
+        """Creates a group in control mode "none".
+
+        Args:
+            arm: Arm of the group.
+            joints: Indices (k,) of the joints in the arm.
+        """
         self.joints = np.array(joints, int)
         self._names = [arm.joint_names[i] for i in joints]
         self._lower, self._upper = arm.position_lower[self.joints], arm.position_upper[self.joints]
@@ -62,10 +67,15 @@ class JointGroup:
         """True if the commanded effort acts."""
         return self.mode in ("effort", "free")
 
-    def fault(self, values: Sequence[float], unit: str) -> str:
-        """Returns the reason why commanded numbers are not accepted, or "" if they are accepted."""
+    def fault(self, values: Sequence[float], quantity: str) -> str:
+        """Returns the reason why commanded numbers are not accepted, or "" if they are accepted.
+
+        Args:
+            values: Commanded numbers. Accepted are k finite numbers.
+            quantity: Name of the numbers for the message, e.g. "positions".
+        """
         if len(values) != len(self._names):
-            return f"{len(values)} {unit}, allowed: {len(self._names)} for {', '.join(self._names)}"
+            return f"{len(values)} {quantity}, allowed: {len(self._names)} for {', '.join(self._names)}"
         for name, value in zip(self._names, values, strict=True):
             if not abs(value) < IMPLAUSIBLE:  # also true for NaN
                 return f"{name} is {value}; allowed: finite numbers with a magnitude below {IMPLAUSIBLE:g}"
@@ -76,7 +86,7 @@ class JointGroup:
         self._change("none")
 
     def servo_jp(self, q: Sequence[float], v: Sequence[float] = ()) -> None:
-        """Sets the set-point, clipped to the position limits. Without velocities, they are zero."""
+        """Sets the set-point q (k,), v (k,), clipped to the position limits. Without velocities, they are zero."""
         self._change("position")
         self.q = np.clip(q, self._lower, self._upper)
         # A set-point at a limit does not move beyond the limit. The speed limit prevents extreme efforts of damping.
@@ -84,7 +94,7 @@ class JointGroup:
         self.v = np.where(self.q == q, np.clip(v, -largest, largest), 0.0) if len(v) else np.zeros(len(self.q))
 
     def servo_jf(self, effort: Sequence[float]) -> None:
-        """Sets the effort, clipped to the effort limits."""
+        """Sets the effort (k,), clipped to the effort limits."""
         self._change("effort")
         self.effort = np.clip(effort, -self._effort_limits, self._effort_limits)
 

@@ -48,7 +48,7 @@ class CrtkKinematics:
         return RigidTransform(X_BF.rotation() @ self._R_FT, X_BF.translation())
 
     def velocity(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns V_BT (6,): angular velocity [rad/s], then velocity of the origin of T [m/s], expressed in B."""
+        """Returns V_BT (6,) at q (n,), v (n,): angular velocity [rad/s], then velocity of T's origin [m/s], in B."""
         return self._frame.jacobian(q) @ v
 
     def inverse(self, pose: Sequence[float], q_near: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.systems.ros.confirmation import repeat_until_received
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
@@ -26,8 +27,9 @@ if TYPE_CHECKING:
 TIMEOUT = 0.05
 #: Time between two checks [s].
 _POLL = 0.005
-#: Longest time until the arm confirms the message `hold` [s].
-_CONFIRMATION = 1.0
+#: Longest time until the arm confirms the message `hold` [s]. Time for which the process then continues to repeat it,
+#: e.g. until the network works again [s].
+_CONFIRMATION, _LOSS = 2.0, 60.0
 #: Longest time until a new deadman process is ready [s].
 _START = 20.0
 #: Lines with which the process reports whether it receives the commands of the bridge and can hold the arm.
@@ -57,8 +59,10 @@ class Deadman:
         self._commands = [
             domain.subscribe(f"{namespace}/{name}", JointState, wakes=False) for name in ("servo_jf", "servo_jp")
         ]
-        self._ends = domain.subscribe(f"{namespace}/hold", Empty, ignore_own=True)
-        self._state = domain.subscribe(f"{namespace}/operating_state", OperatingState, depth=100, latched=True)
+        self._ends = domain.subscribe(f"{namespace}/hold", Empty, ignore_own=True, wakes=False)
+        self._state = domain.subscribe(
+            f"{namespace}/operating_state", OperatingState, depth=100, latched=True, wakes=False
+        )
         self._hold = domain.advertise(f"{namespace}/hold", Empty)
         self._last_command: float | None = None
         self._last_published = 0
@@ -112,8 +116,13 @@ class Deadman:
         self._hold.publish(self._empty)
         self._last_command = None
         self._report(f"deadman: {self._namespace}: {reason}; published hold at {time.time():.3f} s")
-        if not self._hold.wait_until_received(_CONFIRMATION):
+        if not self._is_confirmed(_CONFIRMATION):
             self._report(f"deadman: {self._namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
+            if self._is_confirmed(_LOSS):
+                self._report(f"deadman: {self._namespace}: the arm has confirmed hold now")
+
+    def _is_confirmed(self, seconds: float) -> bool:
+        return repeat_until_received(self._hold, self._empty, self._state.num_publishers, seconds)
 
 
 class DeadmanProcess:

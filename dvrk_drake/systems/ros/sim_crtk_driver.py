@@ -13,7 +13,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.ros.crtk_arm_state import CrtkArmState, CrtkCommand
+from dvrk_drake.systems.ros.crtk_arm_state import ArmValues, CrtkArmState, CrtkCommand
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
@@ -109,8 +109,6 @@ class CrtkArmServer(LeafSystem):
             self._topics.publish_state(machine)
 
     def _publish(self, context: Context) -> None:
-        from dvrk_drake.systems.ros.crtk_arm_topics import ArmValues
-
         assert self._topics is not None
         machine = self.GetMachine(context)
         q, v = np.split(self._state.Eval(context), 2)

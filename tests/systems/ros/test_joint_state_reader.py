@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.ros.crtk_client import JointStateReader, shown
+from dvrk_drake.systems.ros.joint_state_reader import JointStateReader, shown
 from dvrk_drake.systems.ros.messages import Header, JointState, Time
 
 MTML, PSM = load_arm("mtml"), load_arm("psm")
