@@ -311,7 +311,7 @@ def connect_client(domain: RosDomain, arm: Arm, topic: str | None, commands: Seq
     if not domain.wait_until(lambda: not other_publishers(domain, arm, namespace), _ENDED):
         raise ControllerError(
             f"another process publishes {', '.join(other_publishers(domain, arm, namespace))}. Only one process may "
-            "command an arm: end the other one, e.g. another bridge, a simulated arm or a script"
+            "command an arm: end the other one, e.g. another bridge, teleoperation or a script"
         )
     client = CrtkClient(domain, arm, namespace)
 
