@@ -1,24 +1,23 @@
 //! Arm of a dVRK on ROS 2 topics, with a ROS 2 implementation that is independent of Cyclone DDS.
 //!
-//!     ros2_client_arm DOMAIN MESSAGES EFFORT...
+//!     ros2_client_arm DOMAIN COMMANDS JOINT...
 //!
-//! The arm is at rest in one pose. It publishes
+//! The arm is at rest. It publishes
 //!
 //! - a latched `/MTML/operating_state`: ENABLED, homed and not busy
-//! - `/MTML/measured_js` at 1 kHz: joint k is at 0.1 k rad and has the k-th effort
-//! - one message on `/MTML/malformed`, which names the type JointState but contains 12 bytes only
+//! - `/MTML/measured_js` at 1 kHz: all joints are at 0, except the last one, whose position counts the messages from 0
+//!   to 999 in microradians
+//! - `/MTML/gravity_compensation/setpoint_js` at 10 Hz: the dVRK's own gravity compensation is off
 //!
-//! The first publisher of commands starts the measurements, the stamp of which counts the messages in nanoseconds.
-//! Commands on `/MTML/servo_jf` and `/MTML/servo_jp` must have one number per joint. Their stamps
-//! count the messages in nanoseconds. Number k of message n must be k + 0.001 (n mod 1000). The arm prints the counts after MESSAGES
-//! measurements and 2 s without a command.
+//! After COMMANDS efforts on `/MTML/servo_jf`, the arm prints one line for each of them: the stamp [ns] and the efforts.
+//! The last line has the number of measurements and of messages on the other command topics.
 
 use ros2_client::{
     qos::{Durability, History, QosProfile, WhenFull},
     Context, ContextOptions, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Subscription,
 };
-use serde::{Deserialize, Serialize};
-use std::time::{Duration, Instant};
+use serde::{de::DeserializeOwned, Deserialize, Serialize};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct Header {
@@ -44,15 +43,9 @@ struct OperatingState {
     is_busy: bool,
 }
 
-/// Number of commands, and of the commands that are not as expected.
-#[derive(Default)]
-struct Counts {
-    received: u64,
-    undecodable: u64,
-    out_of_order: u64,
-    lost: u64,
-    wrong_content: u64,
-    last: i64,
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+struct Empty {
+    structure_needs_at_least_one_member: u8,
 }
 
 const TYPE: (&str, &str) = ("sensor_msgs", "JointState");
@@ -64,97 +57,79 @@ fn qos(depth: usize, durability: Durability) -> QosProfile {
         .history(History::KeepLast { depth })
 }
 
-fn publisher<M: Serialize>(node: &mut Node, name: &str, kind: (&str, &str), qos: QosProfile) -> Publisher<M> {
-    let name = Name::new("/MTML", name).unwrap();
+fn publisher<M: Serialize>(node: &mut Node, topic: &str, kind: (&str, &str), qos: QosProfile) -> Publisher<M> {
+    let (namespace, name) = topic.rsplit_once('/').unwrap();
+    let name = Name::new(namespace, name).unwrap();
     let topic = node.create_topic(&name, MessageTypeName::new(kind.0, kind.1), &qos).unwrap();
     node.create_publisher(&topic, None).unwrap()
 }
 
-fn subscription(node: &mut Node, name: &str) -> Subscription<JointState> {
-    let (name, qos) = (Name::new("/MTML", name).unwrap(), qos(100, Durability::Volatile));
-    let topic = node.create_topic(&name, MessageTypeName::new(TYPE.0, TYPE.1), &qos).unwrap();
+fn subscription<M: DeserializeOwned + 'static>(node: &mut Node, topic: &str, kind: (&str, &str)) -> Subscription<M> {
+    let (namespace, name) = topic.rsplit_once('/').unwrap();
+    let (name, qos) = (Name::new(namespace, name).unwrap(), qos(1000, Durability::Volatile));
+    let topic = node.create_topic(&name, MessageTypeName::new(kind.0, kind.1), &qos).unwrap();
     node.create_subscription(&topic, None).unwrap()
 }
 
-impl Counts {
-    /// Takes all commands that have arrived. Returns whether there was one.
-    fn take(&mut self, commands: &Subscription<JointState>, values: fn(&JointState) -> &Vec<f64>, joints: usize) -> bool {
-        let before = self.received;
-        loop {
-            match commands.take() {
-                Ok(None) => return self.received > before,
-                Err(_) => self.undecodable += 1,
-                Ok(Some((command, _))) => {
-                    let number = i64::from(command.header.sec) * 1_000_000_000 + i64::from(command.header.nanosec);
-                    self.received += 1;
-                    if self.last != 0 {
-                        self.out_of_order += u64::from(number <= self.last);
-                        self.lost += (number - self.last - 1).max(0) as u64;
-                    }
-                    self.last = number;
-                    let values = values(&command);
-                    let expected = |k: usize| 1e-3 * ((number % 1000) as f64) + k as f64;
-                    let right = values.len() == joints && (0..joints).all(|k| values[k] == expected(k));
-                    self.wrong_content += u64::from(!right);
-                }
-            }
-        }
+/// Returns all messages that have arrived.
+fn take<M: DeserializeOwned + 'static>(subscription: &Subscription<M>) -> Vec<M> {
+    let mut messages = Vec::new();
+    while let Some((message, _)) = subscription.take().expect("a message that can be decoded") {
+        messages.push(message);
     }
+    messages
+}
 
-    fn print(&self, name: &str) {
-        println!(
-            "{name}: received {}, lost {}, out of order {}, wrong content {}, not decodable {}",
-            self.received, self.lost, self.out_of_order, self.wrong_content, self.undecodable
-        );
-    }
+/// Returns the present time as a header.
+fn now() -> Header {
+    let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
+    Header { sec: time.as_secs() as i32, nanosec: time.subsec_nanos(), frame_id: String::new() }
 }
 
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
     let domain: u16 = arguments[1].parse().expect("DOMAIN");
-    let messages: u32 = arguments[2].parse().expect("MESSAGES");
-    let effort: Vec<f64> = arguments[3..].iter().map(|text| text.parse().expect("EFFORT")).collect();
-    let joints = effort.len();
+    let commands: usize = arguments[2].parse().expect("COMMANDS");
+    let name: Vec<String> = arguments[3..].to_vec();
+    let zero = vec![0.0; name.len()];
 
     let context = Context::with_options(ContextOptions::new().domain_id(domain)).unwrap();
     let mut node = context
         .new_node(NodeName::new("/", "ros2_client_arm").unwrap(), NodeOptions::new().enable_rosout(false))
         .unwrap();
-    let states = publisher(&mut node, "operating_state", ("crtk_msgs", "OperatingState"), qos(100, Durability::TransientLocal));
-    let measured = publisher(&mut node, "measured_js", TYPE, qos(100, Durability::Volatile));
-    let malformed = publisher(&mut node, "malformed", TYPE, qos(100, Durability::TransientLocal));
-    let efforts = subscription(&mut node, "servo_jf");
-    let positions = subscription(&mut node, "servo_jp");
+    let states = publisher(&mut node, "/MTML/operating_state", ("crtk_msgs", "OperatingState"), qos(100, Durability::TransientLocal));
+    let measured = publisher(&mut node, "/MTML/measured_js", TYPE, qos(100, Durability::Volatile));
+    let gravity = publisher(&mut node, "/MTML/gravity_compensation/setpoint_js", TYPE, qos(100, Durability::Volatile));
+    let efforts: Subscription<JointState> = subscription(&mut node, "/MTML/servo_jf", TYPE);
+    let positions: Subscription<JointState> = subscription(&mut node, "/MTML/servo_jp", TYPE);
+    let holds: Subscription<Empty> = subscription(&mut node, "/MTML/hold", ("std_msgs", "Empty"));
+    states.publish(OperatingState { header: now(), state: "ENABLED".to_string(), is_homed: true, is_busy: false }).unwrap();
 
-    let header = Header { sec: 1, nanosec: 2, frame_id: String::new() };
-    states.publish(OperatingState { header, state: "ENABLED".to_string(), is_homed: true, is_busy: false }).unwrap();
-    malformed.publish((1_u32, 2_u32, 0xffff_ffff_u32)).unwrap();
-    println!("ready");
-
-    let (mut effort_counts, mut position_counts) = (Counts::default(), Counts::default());
-    let mut number = 0;
+    let mut received: Vec<JointState> = Vec::new();
+    let (mut number, mut num_positions, mut num_holds) = (0, 0, 0);
     let mut next = Instant::now();
-    let mut last_command = Instant::now();
-    while number < messages || last_command.elapsed() < Duration::from_secs(2) {
-        let arrived = effort_counts.take(&efforts, |command| &command.effort, joints)
-            | position_counts.take(&positions, |command| &command.position, joints);
-        if arrived {
-            last_command = Instant::now();
-        }
-        if number < messages && effort_counts.received + position_counts.received > 0 && Instant::now() >= next {
+    while received.len() < commands {
+        received.extend(take(&efforts));
+        num_positions += take(&positions).len();
+        num_holds += take(&holds).len();
+        if Instant::now() >= next {
+            let mut position = zero.clone();
+            *position.last_mut().unwrap() = 1e-6 * ((number % 1000) as f64);
+            let (velocity, effort) = (zero.clone(), zero.clone());
+            measured.publish(JointState { header: now(), name: name.clone(), position, velocity, effort }).unwrap();
+            if number % 100 == 0 {
+                let effort = zero.clone();
+                let off = JointState { header: now(), name: name.clone(), position: vec![], velocity: vec![], effort };
+                gravity.publish(off).unwrap();
+            }
             number += 1;
-            let state = JointState {
-                header: Header { sec: (number / 1_000_000_000) as i32, nanosec: number, frame_id: String::new() },
-                name: (0..joints).map(|k| format!("joint_{k}")).collect(),
-                position: (0..joints).map(|k| 0.1 * k as f64).collect(),
-                velocity: vec![0.0; joints],
-                effort: effort.clone(),
-            };
-            measured.publish(state).unwrap();
             next = (next + Duration::from_millis(1)).max(Instant::now() - Duration::from_millis(100));
         }
         std::thread::sleep(Duration::from_micros(200));
     }
-    effort_counts.print("servo_jf");
-    position_counts.print("servo_jp");
+    for command in received {
+        let stamp = i64::from(command.header.sec) * 1_000_000_000 + i64::from(command.header.nanosec);
+        println!("{stamp} {:?}", command.effort);
+    }
+    println!("{number} measured_js, {num_positions} servo_jp, {num_holds} hold");
 }

@@ -188,9 +188,9 @@ def _report(line: str) -> None:
 
 
 def _report_connected(connected: bool) -> None:
-    # The bridge may have ended.
+    # The bridge may have ended. With PYTHONUNBUFFERED, `print` would write the end of the line separately.
     with contextlib.suppress(OSError):
-        print(_READY if connected else _BLIND, flush=True)
+        os.write(sys.stdout.fileno(), f"{_READY if connected else _BLIND}\n".encode())
 
 
 def main(namespace: str, domain: str) -> None:
