@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.processes.pace import Pace
@@ -16,6 +18,13 @@ from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 from dvrk_drake.systems.ros.sim_crtk_driver import PERIOD, apply_crtk_driver_config
+
+if TYPE_CHECKING:
+    from dvrk_drake.systems.ros.domain import RosDomain
+
+#: Time in which DDS discovers other processes [s]. Longest time until DDS considers a killed process as ended [s]; the
+#: default of Cyclone DDS is 10 s.
+_DISCOVERY, _ENDED = 1.0, 12.0
 
 
 class SimulatedRosArm:
@@ -45,6 +54,7 @@ class SimulatedRosArm:
 
         Raises:
             DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
+            StationError: Another arm publishes in the namespace.
             ModelError: The driver's model cannot be read, or is not valid for the arm.
         """
         self._report: Callable[[str], None] = lambda line: None
@@ -52,6 +62,7 @@ class SimulatedRosArm:
         self.source = f"{domain.name}, topics {driver.arm_namespace(arm)}/..."
         builder = DiagramBuilder()
         station = builder.AddSystem(ArmStation(arm, effects=effects))
+        _refuse_other_arm(domain, f"{driver.arm_namespace(arm)}/measured_js")
         sim_driver = apply_crtk_driver_config(driver, station, builder, domain=domain, report=self._report_with_time)
         for text in ("enable", "home") if enabled else ():
             sim_driver.Receive(CrtkCommand("state_command", text=text))
@@ -85,3 +96,12 @@ class SimulatedRosArm:
 
     def _report_with_time(self, line: str) -> None:
         self._report(f"{self._simulator.get_context().get_time():9.3f} s  {line}")
+
+
+def _refuse_other_arm(domain: RosDomain, topic: str) -> None:
+    """Raises StationError if another process publishes `topic`. Clients would receive the measurements of both arms."""
+    domain.wait_until(lambda: False, _DISCOVERY)
+    if not domain.wait_until(lambda: topic not in domain.joint_state_topics(), _ENDED):
+        raise StationError(
+            f"another arm publishes {topic} in {domain.name}. End it, or choose another --topic or --domain"
+        )

@@ -15,6 +15,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
+from dvrk_drake.systems.ros.crtk_client import other_publishers  # noqa: E402
 from dvrk_drake.systems.ros.messages import (  # noqa: E402
     Bool,
     Empty,
@@ -210,6 +211,20 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     client.until(lambda: abs(client.new("jaw/measured_js").position[0] - 0.3) < 0.01, "the jaw opens")
     client.send("servo_jp", 0.0, 0.0, 0.05, 0.0, 0.0, 0.0)
     client.until(lambda: abs(client.position()[2] - 0.05) < 2e-3, "insertion")
+    # A second arm with the same topics is refused, and a client of the first arm would notice its measurements.
+    other = start(sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", "psm", "--ros", "--topic", "dvrk/PSM2")
+    assert other.wait(TIMEOUT) == 2
+    assert "another arm publishes /dvrk/PSM2/measured_js in ROS domain 0. End it, or " in other.stdout.read()
+    second = client.domain.advertise("/dvrk/PSM2/measured_js", JointState)
+    observer = ros.RosDomain()
+
+    def others():
+        return other_publishers(observer, client.arm, "/dvrk/PSM2")
+
+    assert observer.wait_until(lambda: "/dvrk/PSM2/measured_js" in others(), TIMEOUT), others()
+    assert {"/dvrk/PSM2/servo_jp", "/dvrk/PSM2/jaw/servo_jf"} < set(others())
+    del second
+    assert observer.wait_until(lambda: "/dvrk/PSM2/measured_js" not in others(), TIMEOUT), others()
     end(client.process, 15)
 
 

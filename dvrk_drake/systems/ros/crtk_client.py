@@ -258,6 +258,8 @@ class CrtkClient:
 def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
     """Returns the topics on which another process of the domain could move an arm, without duplicates.
 
+    With two publishers of measured_js, e.g. an arm and a simulated arm, this topic is included too.
+
     Args:
         domain: ROS domain of the arm.
         arm: Arm.
@@ -265,7 +267,9 @@ def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
     """
     names = [*_MOTION_TOPICS, *(f"{arm.separate_joint}/{name}" for name in _SEPARATE_TOPICS if arm.separate_joint)]
     motion = {f"{namespace}/{name}" for name in names}
-    return sorted({e.topic for e in domain.publishers() if e.topic in motion and not e.is_own})
+    topics = [endpoint.topic for endpoint in domain.publishers() if not endpoint.is_own]
+    measured = f"{namespace}/measured_js"
+    return sorted(motion.intersection(topics)) + [measured] * (topics.count(measured) > 1)
 
 
 def find_arm(domain: RosDomain, arm: Arm, topic: str | None = None, seconds: float = _DISCOVERY) -> str:

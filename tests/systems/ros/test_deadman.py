@@ -108,7 +108,7 @@ def test_end_of_commands(name, stamp, message, held):
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_end_of_the_bridge_leads_to_one_hold(held):
+def test_end_of_the_bridge_leads_to_hold(held):
     bench = Bench()
     bench.send("servo_jf", 5)
     if held:
