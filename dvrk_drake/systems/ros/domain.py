@@ -222,6 +222,8 @@ class RosDomain:
             latched: Whether earlier messages of a latched topic are received.
             ignore_own: Whether to ignore the publishers of this object.
             wakes: Whether a message makes the file descriptor readable. If not, receiving needs less computing time.
+                Use False, or `ignore_own`, if this process and another one publish the topic: cyclonedds can otherwise
+                block for ever, because it publishes without releasing the lock of the Python interpreter.
         """
         qos = ros_qos(
             depth, reliable=reliable, latched=latched, type_hash=type_hash(message_type), ignore_own=ignore_own
