@@ -21,25 +21,29 @@ from waiting import TIMEOUT, wait_until
 
 #: Rate of the topics [Hz].
 RATE = 200
-#: Time after which a command without effect counts as refused [s].
-REFUSED = 0.3
+#: Time, and number of messages of the arm, after which a command without effect counts as refused [s]. A busy computer
+#: delays the messages as well as the effect.
+REFUSED, NUM_REFUSED = 0.1, 20
+#: Time after which a state is final [s]. A PSM engages its instrument after homing.
+STEADY = 0.3
 #: Longest duration of a motion, of homing or of a change of state [s].
 LONGEST = 20.0
 
 
 @contextlib.contextmanager
-def start_simulated_arm(arm, name, rate=RATE):
+def start_simulated_arm(arm, name, rate=RATE, output=subprocess.DEVNULL):
     """Context in which a simulated arm runs. It is in the state DISABLED.
 
     Args:
         arm: Name of the arm for --arm, e.g. "mtml".
         name: Name of the arm in its topics, e.g. "MTML".
         rate: Rate of the measurements [Hz].
+        output: File for the lines of the arm.
     """
     from dvrk_drake.systems.ros.domain import RosDomain
 
     command = [sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", "--rate", str(rate)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=output)
     subject = Console(name, process, process.pid, Path(os.devnull), RosDomain())
     try:
         wait_until(subject.state, "operating state", process)
@@ -106,7 +110,7 @@ class Observer:
         Args:
             label: Name of the check.
             words: State commands, sent one after the other.
-            goal: State (state, is_homed) that ends the wait. None: the state after `REFUSED`.
+            goal: State (state, is_homed) that ends the wait. None: the state after `pause`.
             seconds: Longest time to wait for `goal` [s].
         """
         for word in words:
@@ -118,7 +122,7 @@ class Observer:
         self.found[label] = f"{state}, {'homed' if homed else 'not homed'}{', busy' if busy else ''}"
 
     def wait_for_state(self, state, is_homed, seconds=LONGEST):
-        """Waits until an arm is in a state and not busy for `REFUSED`. A PSM engages its instrument after homing."""
+        """Waits until an arm is in a state and not busy for the time `STEADY`."""
         reached = None
 
         def is_steady():
@@ -127,7 +131,7 @@ class Observer:
                 reached = None
             elif reached is None:
                 reached = time.monotonic()
-            return reached is not None and time.monotonic() > reached + REFUSED
+            return reached is not None and time.monotonic() > reached + STEADY
 
         return self.wait_for(is_steady, seconds)
 
@@ -141,6 +145,8 @@ class Observer:
     def pause(self):
         """Waits for the effects of a command."""
         end = time.monotonic() + REFUSED
+        for _ in range(NUM_REFUSED):
+            self.subject.latest("setpoint_js")
         wait_until(lambda: time.monotonic() > end, "effects", self.subject.process)
 
     def setpoint(self):
@@ -320,9 +326,9 @@ def observe(subject, arm):
     if arm.separate_joint:
         jump = look.setpoint() + np.array([0, 0, 0.07, 0, 0, 0])
         subject.command("servo_jp", joints(jump))
-        look.state_after("servo_jp with a jump of 70 mm", [], ("FAULT", True), 2.0)
+        look.state_after("servo_jp with a jump of 70 mm", [], ("FAULT", True), 5.0)
         look.home_again()
-    look.state_after("unhome", ["unhome"])
+    look.state_after("unhome", ["unhome"], ("ENABLED", False))
     found["measured_js after unhome: header stamp"] = "0" if subject.latest().header.nanoseconds == 0 else "time of day"
     look.state_after("unhome, then home", ["home"], ("ENABLED", True), 5.0)
     return found

@@ -62,8 +62,10 @@ class CommandMonitor:
 
         kinds = {"hold": Empty, "servo_jp": JointState, "servo_jf": JointState, **dict.fromkeys(more, JointState)}
         self.messages = []
+        # Without wake-ups, this process may publish the same topics, see `RosDomain.subscribe`.
         self._subscriptions = {
-            name: domain.subscribe(f"{namespace}/{name}", kind, depth=10_000) for name, kind in kinds.items()
+            name: domain.subscribe(f"{namespace}/{name}", kind, depth=10_000, wakes=False)
+            for name, kind in kinds.items()
         }
 
     def receive(self):

@@ -1,4 +1,7 @@
-"""Bridge beside an arm that publishes bad messages over DDS. The bridge continues and commands only within limits."""
+"""Bridge beside bad messages over DDS, of the arm and of another process that commands the arm.
+
+The bridge continues. It commands only within limits, and no efforts while another process could command the arm.
+"""
 
 import os
 import threading
@@ -7,7 +10,7 @@ import time
 import numpy as np
 import pytest
 from own_network import inside, outside, run_inside
-from ros_bridge import CommandMonitor, Operator, start_bridge, wait_for_line
+from ros_bridge import CommandMonitor, Operator, start_bridge, start_controller, wait_for_line
 from ros_publisher import DOMAIN_FILE
 from waiting import wait_until
 
@@ -130,6 +133,43 @@ def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
                 assert not ARM.limit_violations(np.array(message.position))
     finally:
         bridge.end()
+        operator.end()
+
+
+@inside
+def test_random_commands_of_another_process_end_those_of_the_bridge(arm, tmp_path):
+    from dvrk_drake.systems.ros.domain import RosDomain
+
+    operator, bridge, controller = Operator("mtml"), start_bridge("mtml", tmp_path), start_controller("mtml")
+    other, generator = RosDomain(), np.random.default_rng(6)
+    try:
+        wait_for_line(bridge, "effort, sender")
+        publishers = [other.advertise("/MTML/servo_jf", arm.m.JointState)]
+        line = wait_for_line(bridge, "fault: ")
+        assert line == "fault: another process publishes /MTML/servo_jf. End it"
+        publishers += [other.advertise(f"/MTML/{name}", arm.m.JointState) for name in ("servo_jp", "move_jp")]
+        operator.until(lambda status: status.guard_state == Status.STATE_FAULT, "fault", process=bridge)
+        arm.monitor.forget()
+        first = len(operator.received)
+        for k in range(10_000):
+            # The first value is never finite, unlike those of the bridge.
+            values = [float(value) for value in generator.choice([0.0, np.nan, np.inf, 1e308, -1.0], 8)]
+            values = [np.nan, *values][: generator.integers(0, 9)]
+            publishers[k % 3].publish(arm.m.JointState(arm.m.Header.now(), [], values, values, values))
+        operator.until(lambda status: True, "a status", process=bridge)
+        assert {status.guard_state for status in operator.received[first:]} == {Status.STATE_FAULT}
+        efforts = [message.effort for name, _, message in arm.monitor.receive() if name == "servo_jf"]
+        assert efforts and not [effort for effort in efforts if effort and np.isfinite(effort[0])]
+
+        # Without the other process, an operator can reset the fault.
+        publishers.clear()
+        other.close()
+        length = len(bridge.output())
+        operator.reset(bridge)
+        wait_for_line(bridge, "effort, sender", after=length)
+    finally:
+        for process in (bridge, controller):
+            process.end()
         operator.end()
 
 

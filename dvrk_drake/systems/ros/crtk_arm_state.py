@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -251,7 +252,8 @@ class CrtkArmState:
 
     def _change_state(self, command: str, time: float) -> str:
         if command not in _STATE_COMMANDS:
-            return f'"{command[:_MAX_TEXT]}"; allowed: {", ".join(_STATE_COMMANDS)}'
+            # JSON shows a text with line breaks on one line.
+            return f"{json.dumps(command[:_MAX_TEXT])}; allowed: {', '.join(_STATE_COMMANDS)}"
         if command == "disable":
             if self.is_powered:
                 self._remove_power("DISABLED")

@@ -6,8 +6,11 @@ DDS (Data Distribution Service) is the middleware of ROS 2. The ROS 2 topic `/<A
 
 import atexit
 import contextlib
+import functools
 import os
+import queue
 import select
+import threading
 import time
 import weakref
 from collections.abc import Callable
@@ -39,6 +42,23 @@ from dvrk_drake.systems.ros.messages import JointState, dds_type_name, ros_type_
 _LISTENERS: list[Listener] = []
 #: Readers with a listener.
 _READERS: "weakref.WeakSet[DataReader]" = weakref.WeakSet()
+#: Readers of subscriptions that ended.
+_UNUSED: "queue.SimpleQueue[DataReader]" = queue.SimpleQueue()
+
+
+@functools.cache
+def _start_deletion() -> None:
+    """Starts the thread that deletes unused readers."""
+    threading.Thread(target=_delete_unused, daemon=True).start()
+
+
+def _delete_unused() -> None:
+    # While a listener is called, its thread has a reference to the reader. If it were the last one, this thread would
+    # delete the reader, and wait for ever for the end of its own call. So the listener is removed before.
+    while True:
+        reader = _UNUSED.get()
+        reader.set_listener(None)
+        del reader
 
 
 @atexit.register
@@ -222,6 +242,8 @@ class RosDomain:
             latched: Whether earlier messages of a latched topic are received.
             ignore_own: Whether to ignore the publishers of this object.
             wakes: Whether a message makes the file descriptor readable. If not, receiving needs less computing time.
+                Use False, or `ignore_own`, if this process and another one publish the topic: cyclonedds can otherwise
+                block for ever, because it publishes without releasing the lock of the Python interpreter.
         """
         qos = ros_qos(
             depth, reliable=reliable, latched=latched, type_hash=type_hash(message_type), ignore_own=ignore_own
@@ -375,6 +397,8 @@ class Subscription(Generic[Message]):
         )
         _READERS.add(self._reader)
         _LISTENERS.append(listener)
+        _start_deletion()
+        weakref.finalize(self, _UNUSED.put, self._reader).atexit = False
 
     @property
     def num_lost(self) -> int:

@@ -122,7 +122,7 @@ def test_messages_continue_after_a_suspension(domain, arm):
 
     assert domain.wait_until(answers, TIMEOUT)
     # In some of the suspensions, only one of the processes considers the other one as ended.
-    for _ in range(6):
+    for _ in range(4):
         arm.send_signal(signal.SIGSTOP)
         os.waitpid(arm.pid, os.WUNTRACED)
         assert domain.wait_until(lambda: not measured.num_publishers(), DETECTION)
@@ -173,6 +173,38 @@ def test_unused_subscription_ends(domain):
         assert domain.wait_until(lambda: not publisher.num_subscribers(), DETECTION)
     finally:
         gc.enable()
+
+
+PUBLISH = """
+import time
+from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.messages import Empty
+publisher = RosDomain().advertise("/often", Empty)
+while True:
+    publisher.publish(Empty())
+    time.sleep(5e-4)
+"""
+SUBSCRIBE = """
+from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.messages import Empty
+domain = RosDomain()
+for _ in range(1500):
+    subscription = domain.subscribe("/often", Empty)
+    assert domain.wait_until(subscription.take, 60.0)
+    del subscription
+"""
+
+
+@inside
+def test_subscriptions_end_while_messages_arrive(monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    publisher = subprocess.Popen([sys.executable, "-c", PUBLISH])
+    try:
+        # Without a separate process, an error could block the test for ever.
+        subprocess.run([sys.executable, "-c", SUBSCRIBE], timeout=60, check=True)
+    finally:
+        publisher.kill()
+        publisher.wait()
 
 
 @inside
