@@ -108,9 +108,7 @@ def refused(capfd, *options):
 
 
 def start_collection(folder, *options, poses=POSES):
-    return start(
-        *COMMAND, "collect", "--ros", "--arm", "mtml", *files(folder, poses), "--traverse-time", "2", *options
-    )
+    return start(*COMMAND, "collect", "--ros", "--arm", "mtml", *files(folder, poses), "--traverse-time", "2", *options)
 
 
 def collect(folder, *options, poses=POSES, code=0):
@@ -141,7 +139,6 @@ def test_holding_torques_and_model_with_friction(tmp_path):
     model = identify(recording, MTML).model
     others = MTML.sample_poses(50, np.random.default_rng(1))
     error = [model.holding_torque(q) - truth.holding_torque(q) for q in others]
-    print("RMS", np.sqrt(np.mean(np.square(error), axis=0)) / MTML.dry_friction(), (np.abs(recording.tau - expected).max(axis=0)) / MTML.dry_friction(), friction.max(axis=0) / MTML.dry_friction(), model.feedforward_scale)
     assert np.all(np.sqrt(np.mean(np.square(error), axis=0)) < friction.max(axis=0) + overshoot)
     bag = read_recording(tmp_path / "p_1.mcap", MTML)
     assert np.all(np.min(np.linalg.norm(bag.q[:, None] - recording.q, axis=2), axis=0) < 0.01)
