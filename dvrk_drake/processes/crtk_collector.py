@@ -48,6 +48,9 @@ STALL, _PROGRESS = 2.0, 0.005
 #: Length of an approach, as a fraction of the range of the joint. Dry friction is elastic at first, so a short approach
 #: does not reverse it completely. Random poses have at least a tenth of the range on both sides.
 _APPROACH = 0.08
+#: Speed of an approach as a fraction of the speed of other motions. A fast approach would end with an overshoot, which
+#: changes the friction at the pose.
+_APPROACH_SPEED = 0.4
 #: Time for which the arm must be at rest at the start of an approach [s].
 APPROACH_REST = 0.2
 #: Distance [rad, m] outside the limits that is accepted at the start, because the limits of two arms differ.
@@ -205,11 +208,9 @@ class CrtkCollector:
         pose = self._poses[k]
         measured: list[NDArray[np.float64]] = []
         for begin in approaches(self._arm, pose, self._settings):
-            for goal, rest in ((begin, APPROACH_REST), (pose, REST_TIME)):
-                if goal is None:
-                    continue
+            for goal, rest, speed in _motions(begin, pose):
                 self._activity = f"going to pose {k + 1}"
-                yield from self._move_to(goal)
+                yield from self._move_to(goal, speed)
                 self._activity = f"settling at pose {k + 1}"
                 if not (yield from self._settle(rest)):
                     self.unsettled.append(k + 1)
@@ -224,9 +225,14 @@ class CrtkCollector:
         self.done[k], self._pose_end = True, self._time
         self._report(f"pose {k + 1} measured, {np.count_nonzero(self.done)} of {len(self.done)}{self._time_left()}")
 
-    def _move_to(self, q_end: NDArray[np.float64]) -> Steps:
-        """Publishes goals on a line to `q_end`. The goals wait while the measured pose is too far behind."""
-        path = CubicTrajectory.rest_to_rest(self._goal, q_end, self._span / self._settings.traverse_time)
+    def _move_to(self, q_end: NDArray[np.float64], speed: float) -> Steps:
+        """Publishes goals on a line to `q_end`. The goals wait while the measured pose is too far behind.
+
+        Args:
+            q_end: Last goal (n,).
+            speed: Fraction of the speed that the settings define.
+        """
+        path = CubicTrajectory.rest_to_rest(self._goal, q_end, speed * self._span / self._settings.traverse_time)
         elapsed = waited = 0.0
         least = np.inf
         before = next_goal = self._time
@@ -304,11 +310,17 @@ def estimated_duration(
     speed, total = (arm.position_upper - arm.position_lower) / settings.traverse_time, 0.0
     for pose in poses:
         for begin in approaches(arm, pose, settings):
-            total += REST_TIME + MEASURE + DELAY
-            for goal in (begin, pose):
-                if goal is not None:
-                    total += CubicTrajectory.rest_to_rest(q, goal, speed).duration
-                    q = goal
-            if begin is not None:
-                total += APPROACH_REST + DELAY
+            for goal, rest, share in _motions(begin, pose):
+                total += CubicTrajectory.rest_to_rest(q, goal, share * speed).duration + rest + DELAY
+                q = goal
+            total += MEASURE
     return total
+
+
+def _motions(
+    begin: NDArray[np.float64] | None, pose: NDArray[np.float64]
+) -> list[tuple[NDArray[np.float64], float, float]]:
+    """Returns (goal, time at rest [s], fraction of the speed) of the motions to `pose` through `begin`."""
+    if begin is None:
+        return [(pose, REST_TIME, 1.0)]
+    return [(begin, APPROACH_REST, 1.0), (pose, REST_TIME, _APPROACH_SPEED)]

@@ -47,7 +47,8 @@ class CrtkMonitor:
         self.q = self.effort = np.zeros(client.arm.num_joints)
         self.num_received = self._stamp = 0
         self._span = self._arm.position_upper - self._arm.position_lower
-        self._clock = ArrivalClock()
+        # The first message may be late, if this computer is busy.
+        self._clock = ArrivalClock(SILENCE)
         self._overload_since: float | None = None
         self._num_changes = -1
 

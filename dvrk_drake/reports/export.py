@@ -128,8 +128,7 @@ def _print_compensation(
             table.add_row(name, *(f"{x[j]:g}" for x in (file.friction_ratio, file.dead_band, file.saturation)))
         console.print(table)
         console.print()
-    if off := [joint.name for joint in export.model.joints if joint.feedforward_scale == 0]:
-        console.print(f"The file applies no torque because the feedforward scale is 0: {', '.join(off)}.")
+    _print_disabled_joints(console, export.model, MTM_JOINTS)
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
         console.print(f"Joints whose torque limit equals the effort limit of the arm: {', '.join(short)}.")
@@ -164,7 +163,14 @@ def _print_kinematic_compensation(
             table.add_row(name, f"{mass:.4f}", " ".join(f"{1e3 * x:+8.2f}" for x in centre))
         console.print(table)
         console.print()
+    _print_disabled_joints(console, export.model, ARM_JOINTS)
     _print_estimates(console, export)
+
+
+def _print_disabled_joints(console: Console, model: IdentifiedModel, names: Sequence[str]) -> None:
+    """Prints the joints of the file whose feedforward is disabled."""
+    if off := [joint.name for joint in model.joints if joint.name in names and joint.feedforward_scale == 0]:
+        console.print(f"The file applies no torque because the feedforward scale is 0: {', '.join(off)}.")
 
 
 def _loss_text(loss: CompensationLoss) -> str:

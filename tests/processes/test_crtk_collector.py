@@ -9,7 +9,13 @@ from substitute_crtk_arm import PERIOD, Collection, SubstituteArm
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.crtk_collection import bag_path, summary
-from dvrk_drake.processes.crtk_collector import DELAY, GOAL_PERIOD, CrtkCollectionSettings, estimated_duration
+from dvrk_drake.processes.crtk_collector import (
+    DELAY,
+    GOAL_PERIOD,
+    CrtkCollectionSettings,
+    approaches,
+    estimated_duration,
+)
 from dvrk_drake.recordings.reading import read_recording
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
@@ -135,6 +141,23 @@ def test_soft_stops(collection, fault, message):
     ahead = np.abs(np.array(collection.arm.goals[goals - 1 :]) - collection.arm.q)
     span = MTML.position_upper - MTML.position_lower
     assert np.all(ahead <= 0.1 * span + span * (GOAL_PERIOD + 2 * PERIOD)) or "jumped" in message
+
+
+@pytest.mark.parametrize(("speed", "is_accepted"), [(0.02, True), (0.001, False)])
+def test_slow_arm_is_waited_for(collection, speed, is_accepted):
+    """The speed is given in ranges of the joints per second. The goals move by up to one range per second."""
+    collection.arm._speed = speed * (MTML.position_upper - MTML.position_lower)
+    problem = collection.run().problem
+    assert problem is None if is_accepted else "it does not follow. " in str(problem)
+
+
+def test_goals_of_the_summary_contain_the_approaches():
+    settings = CrtkCollectionSettings(1.0)
+    pose = np.zeros(7)
+    ends = np.array(approaches(MTML, pose, settings))
+    line = summary(MTML, pose, pose[None], settings)[1]
+    assert ends[0, 0] < 0 < ends[1, 0] and line.endswith(f"{ends[0, 0]:.3f} to {ends[1, 0]:.3f}")
+    assert np.all(MTML.position_lower <= ends) and np.all(ends <= MTML.position_upper)
 
 
 def test_short_effort_peak_is_accepted(collection):

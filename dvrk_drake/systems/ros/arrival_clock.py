@@ -11,8 +11,6 @@ import numpy as np
 _WINDOW = 100
 #: Time after which the difference of the clocks is determined anew [us], because the clocks drift.
 _RENEWAL = 10_000_000
-#: Change of the difference of the clocks that is a jump of a clock [us].
-_JUMP = 100_000
 
 
 class ArrivalClock:
@@ -26,8 +24,13 @@ class ArrivalClock:
     therefore not detected.
     """
 
-    def __init__(self) -> None:
-        """Starts the clock."""
+    def __init__(self, largest_change: float = 0.1) -> None:
+        """Starts the clock.
+
+        Args:
+            largest_change: Largest change of the difference of the clocks [s] that is not a jump of a clock.
+        """
+        self._largest_change = round(1e6 * largest_change)
         self._start = time.time_ns() - time.monotonic_ns()
         self._stamps: deque[int] = deque(maxlen=_WINDOW)
         self._offset = self._next_offset = self._renewal = 0
@@ -52,7 +55,7 @@ class ArrivalClock:
             self._restart(difference, arrival)
         elif stamp == self._stamps[-1]:
             return self._last, ""
-        elif stamp < self._stamps[-1] or difference < self._offset - _JUMP:
+        elif stamp < self._stamps[-1] or difference < self._offset - self._largest_change:
             change = 1e-6 * (stamp - self._stamps[-1])
             jump = f"the time stamp changed by {change:.3f} s since the previous message"
             self._stamps.clear()
