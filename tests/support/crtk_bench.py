@@ -27,7 +27,7 @@ class SubstituteClient:
         self.arm, self.namespace = ARMS[name], f"/{ARMS[name].name}"
         self.measurement, self.gravity_compensation, self.not_ready_reason = None, 0.0, ""
         self.others, self.domain = [], SimpleNamespace(num_changes=0, clear=lambda: None)
-        self.sent, self.is_new, self.other_hold = [], False, False
+        self.sent, self.is_new, self.other_hold, self.confirms = [], False, False, True
         #: Effort of the dVRK's own gravity compensation after it was switched off; None: no message arrives.
         self.gravity_after_switch = 0.0
 
@@ -47,7 +47,7 @@ class SubstituteClient:
         return taken
 
     def wait_until_received(self, seconds):
-        return True
+        return self.confirms
 
     def use_gravity_compensation(self, on):
         self.sent.append(("use_gravity_compensation", on))

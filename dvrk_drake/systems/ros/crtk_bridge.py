@@ -137,11 +137,18 @@ class CrtkBridge:
             self._step(now)
 
     def close(self) -> None:
-        """Commands the arm to hold its present pose, and ends the deadman process."""
-        self._client.hold()
-        self._client.wait_until_received(_CONFIRMATION)
-        if self._deadman is not None:
-            self._deadman.close()
+        """Commands the arm to hold its present pose, and ends the deadman process.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the command.
+        """
+        try:
+            self._client.hold()
+            if not self._client.wait_until_received(_CONFIRMATION):
+                self._report(f"{self._client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
+        finally:
+            if self._deadman is not None:
+                self._deadman.close()
 
     def fileno(self) -> int:
         """Returns a file descriptor that is readable after a message of the arm has arrived."""
@@ -356,7 +363,15 @@ def connect_bridge(
 
 
 def compile_guard(arm: Arm, driver: DvrkDriver) -> None:
-    """Compiles the functions of the guard. During a compilation, no message can be received."""
+    """Compiles the functions of the guard. During a compilation, no message can be received.
+
+    Args:
+        arm: Arm of the guard.
+        driver: Configuration with the settings and the model of the guard.
+
+    Raises:
+        ModelError: The driver's model cannot be read, or is not valid for this arm.
+    """
     model = ControlModel(driver.load_model(arm) or IdentifiedModel.from_arm(arm))
     guard = CommandGuard(arm, draw_id(), model, driver.guard)
     zero = np.zeros(arm.num_joints)

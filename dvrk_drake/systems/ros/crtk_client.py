@@ -42,6 +42,7 @@ _MOTION_TOPICS = (
     "move_jr",
     "move_cp",
     "move_cr",
+    "free",
 )
 #: Topics with which a client moves the separate joint.
 _SEPARATE_TOPICS = ("servo_jp", "servo_jf", "move_jp")

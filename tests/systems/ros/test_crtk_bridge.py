@@ -7,6 +7,7 @@ pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from crtk_bench import ARMS, MS, CrtkBench
 
+from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import MessageKey, create_key_file
@@ -354,10 +355,25 @@ def test_key_signs_statuses_and_verifies_commands(monkeypatch, tmp_path):
     assert bench.tick().status.num_accepted == 10
 
 
-def test_close_publishes_hold(bench):
+@pytest.mark.parametrize("confirms", [True, False])
+def test_close_publishes_hold_and_ends_the_deadman(bench, confirms):
     bench.started().clear()
+    bench.client.confirms = confirms
     bench.bridge.close()
     assert bench.names() == ["hold"]
+    problem = "/MTML: the arm did not confirm hold. PRESS THE STOP BUTTON"
+    assert bench.lines[-2:] == [problem, "deadman ended"] if not confirms else problem not in bench.lines
+    assert bench.lines[-1] == "deadman ended"
+
+
+def test_deadman_ends_if_hold_cannot_be_published(bench, monkeypatch):
+    def fail():
+        raise DvrkDrakeError("/MTML/hold: the message could not be sent")
+
+    monkeypatch.setattr(bench.client, "hold", fail)
+    with pytest.raises(DvrkDrakeError):
+        bench.bridge.close()
+    assert bench.lines[-1] == "deadman ended"
 
 
 def test_ten_thousand_random_messages_command_nothing(bench):
