@@ -144,7 +144,7 @@ def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
 
 
 @inside
-def test_random_commands_of_another_process_end_those_of_the_bridge(arm, tmp_path):
+def test_random_commands_of_others_stop_the_bridge(arm, tmp_path):
     from dvrk_drake.systems.ros.domain import RosDomain
 
     operator, bridge, controller = Operator("mtml"), start_bridge("mtml", tmp_path), start_controller("mtml")
