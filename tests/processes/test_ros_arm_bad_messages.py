@@ -210,7 +210,7 @@ def check_arm(sender):
     sender.next_setpoint()
     jaw = subject.latest("jaw/setpoint_js").position
     sender.setpoints.clear()
-    sender.send(1500, random.invalid, [name for name in TOPICS if name != "free"])
+    sender.send(1000, random.invalid, [name for name in TOPICS if name != "free"])
     sender.send_malformed()
     assert len({tuple(message.position) for message in sender.setpoints}) == 1
     assert subject.latest("jaw/setpoint_js").position == jaw
@@ -222,7 +222,7 @@ def check_arm(sender):
     sender.until(lambda: sender.setpoints[-1].effort == effort, "effort")
     sender.setpoints.clear()
     names = [*JOINT_COMMANDS, *(f"jaw/{name}" for name in JOINT_COMMANDS), "servo_cp", "state_command"]
-    sender.send(1500, random.invalid, names)
+    sender.send(1000, random.invalid, names)
     sender.send_malformed()
     assert {tuple(message.effort) for message in sender.setpoints} == {tuple(effort)}
     assert subject.state() == HOMED

@@ -26,7 +26,10 @@ def start_controller(arm, *options):
 
 def wait_for_line(process, text, after=0):
     """Waits until the output of a process contains a text after a number of characters. Returns this line."""
-    wait_until(lambda: text in process.output()[after:], f"{text!r} in {process.output()!r}", process)
+    try:
+        wait_until(lambda: text in process.output()[after:], f"line with {text!r}", process)
+    except AssertionError as error:
+        raise AssertionError(f"{error}; {process.output()[after:]}") from None
     return next(line for line in process.output()[after:].splitlines() if text in line)
 
 

@@ -66,7 +66,9 @@ def wait_for_mode(console, mode, *processes):
 def start_efforts(arm, folder, console, *options):
     """Returns a bridge and a controller whose efforts act."""
     bridge, controller = start_bridge(arm, folder, *options), start_controller(arm)
-    wait_for_line(bridge, "effort, sender")
+    # If the computer is stalled, the guard changes to FAULT and remains there.
+    wait_until(lambda: re.search("effort, sender|fault: ", bridge.output()), "efforts", bridge)
+    assert "fault: " not in bridge.output(), bridge.output()
     wait_for_mode(console, EFFORT, bridge)
     return bridge, controller
 

@@ -316,19 +316,22 @@ def connect_client(domain: RosDomain, arm: Arm, topic: str | None, commands: Seq
         )
     client = CrtkClient(domain, arm, namespace)
 
+    def problem() -> str:
+        """Returns the problem of a valid message. The first message of the arm may precede that of its jaw."""
+        measurement = client.measurement
+        return measurement.problem if measurement is not None and measurement.stamp else ""
+
     def is_complete() -> bool:
         client.receive()
-        measurement = client.measurement
-        # The separate joint may be discovered later than the arm. An arm that is not homed has no measurements.
-        is_measured = measurement is not None and not (measurement.stamp and measurement.problem)
-        return bool(client.operating_state and is_measured and not client.unheard_commands(commands))
+        has_messages = client.operating_state is not None and client.measurement is not None
+        return has_messages and not problem() and not client.unheard_commands(commands)
 
     if not domain.wait_until(is_complete, _FIRST):
         messages = {"measured_js": client.measurement, "operating_state": client.operating_state}
         if missing := [name for name, message in messages.items() if message is None]:
             raise ControllerError(f"no message on {namespace}/{missing[0]} within {_FIRST:g} s. Is it a dVRK?")
-        if client.measurement is not None and client.measurement.stamp and client.measurement.problem:
-            raise ControllerError(client.measurement.problem)
-        unheard = ", ".join(client.unheard_commands(commands))
-        raise ControllerError(f"no process subscribes to {unheard}. Is it a dVRK?")
+        if unheard := ", ".join(client.unheard_commands(commands)):
+            raise ControllerError(f"no process subscribes to {unheard}. Is it a dVRK?")
+        if text := problem():
+            raise ControllerError(text)
     return client
