@@ -41,7 +41,6 @@ class SimulatedClient:
         self._station = builder.AddSystem(ArmStation(arm, effects=arm.effects.only(["friction"])))
         self._driver = builder.AddSystem(SimCrtkDriver(arm, CrtkDriver()))
         driver = self._driver
-        efforts = self._station.GetInputPort(f"{name}.effort_commanded")
         for port in ("state_estimated", "effort_measured"):
             builder.Connect(self._station.GetOutputPort(f"{name}.{port}"), driver.GetInputPort(port))
         builder.Connect(
