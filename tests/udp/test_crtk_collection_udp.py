@@ -117,7 +117,8 @@ def test_holding_torques_with_friction(tmp_path):
         assert "contains all 6 poses already" in collect(tmp_path)
     truth = IdentifiedModel.from_arm(MTML)
     recording = read_recording(tmp_path / "p.csv")
-    np.testing.assert_allclose(recording.q, POSES, atol=0.02)
+    # At rest, the proportional effort of the position controller is at most the dry friction.
+    assert np.all(np.abs(recording.q - POSES) < MTML.dry_friction() / np.asarray(MTML.gains.kp) + 2e-3)
     expected = np.array([truth.holding_torque(q) for q in recording.q])
     # The friction at rest never exceeds the dry friction. How far it cancels depends on the speed of the simulated arm,
     # and thus on the load of the computer. `tests/processes/test_crtk_collection_with_dynamics.py` tests it.
