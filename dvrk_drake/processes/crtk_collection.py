@@ -31,6 +31,8 @@ _DEPTH = 5000
 #: Longest time until the first valid measurement of a homed arm, until the arm confirms `hold`, and until it is
 #: discovered again [s].
 _FIRST, _CONFIRMATION, _DISCOVERY = 5.0, 1.0, 3.0
+#: Longest time until the latest operating state arrives after an older one [s].
+_STATES = 2.0
 
 
 @dataclass(frozen=True)
@@ -188,8 +190,14 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
     from dvrk_drake.systems.ros.crtk_client import connect_client
 
     client = connect_client(ros, arm, topic, ("move_jp", "hold"))
-    if reason := client.not_ready_reason:
-        raise CollectionError(f"{client.namespace}: {reason}. Enable and home the arm at its console")
+
+    def is_ready() -> bool:
+        client.receive()
+        return not client.not_ready_reason
+
+    # The first state that arrives may be an older one, because the topic is latched.
+    if not ros.wait_until(is_ready, _STATES):
+        raise CollectionError(f"{client.namespace}: {client.not_ready_reason}. Enable and home the arm at its console")
 
     def is_measured() -> bool:
         client.receive()

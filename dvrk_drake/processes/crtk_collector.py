@@ -60,7 +60,7 @@ _PAUSE = 1.0
 #: Largest time step of a motion [s]. It prevents a distant goal after this process was suspended.
 _MAX_STEP = 0.05
 #: Typical delay of an arm behind the goal [s], for the estimated duration.
-DELAY = 0.5
+DELAY = 0.7
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,9 @@ from own_network import end, inside, outside, run_inside, start
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT, wait_until
 
-from dvrk_drake.analysis.identification import identify
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, approaches
 from dvrk_drake.recordings.pose_file import save_poses
 from dvrk_drake.recordings.reading import read_recording
 
@@ -38,8 +36,16 @@ COMMAND = [
     "crtk_monitor.SILENCE, crtk_collector.STALL, crtk_collector.SETTLE = 30.0, 100.0, 100.0\n"
     "sys.exit(main(sys.argv[1:]))",
 ]
-#: Poses near each other, so that the arm needs little time, but with different gravity efforts. `identify` requires 8.
-POSES = MTML.sample_poses(8, np.random.default_rng(4), margin=0.3)
+#: Program that could move the arm.
+OTHER = (
+    "from dvrk_drake.systems.ros.domain import RosDomain\n"
+    "from dvrk_drake.systems.ros.messages import JointState\n"
+    "publisher = RosDomain().advertise('/MTML/servo_jp', JointState)\n"
+    "import time\n"
+    "time.sleep(1000)"
+)
+#: Poses near each other, so that the arm needs little time, but with different gravity efforts.
+POSES = MTML.sample_poses(6, np.random.default_rng(4), margin=0.3)
 
 
 @outside
@@ -75,25 +81,6 @@ def simulated_arm(*options):
         end(process, signal.SIGINT)
 
 
-def remaining_friction(q):
-    """Returns a bound (7,) for the friction [N m] that the mean of both approach directions to a pose contains.
-
-    A presliding element is a spring with the stiffness F / s that slides at the force F. If an approach is shorter than
-    the travel 2 s from one sliding force to the other, the force does not reach its limit. The mean of both directions
-    then contains up to F (1 - d / 2 s), where d is the length of the approach. An element that slides in one direction
-    only adds the mean F / 2.
-    """
-    ends = approaches(MTML, q, CrtkCollectionSettings())
-    bound = np.zeros(7)
-    for effect in MTML.effects.friction:
-        if effect.kind != "viscous":
-            row = MTML.effect_coordinates[effect.coordinate] @ MTML.transmission.matrix
-            length = np.min(np.abs(row @ (ends - q).T))
-            share = max(0.0, 1 - length / (2 * effect.scale)) if effect.kind == "presliding" else 0.5
-            bound += np.abs(row) * effect.coefficient * share
-    return bound
-
-
 def files(folder, poses=POSES[:2]):
     """Writes a pose file and returns the options with its path and the path of the output."""
     save_poses(poses, MTML, folder / "p.yaml")
@@ -120,26 +107,22 @@ def collect(folder, *options, poses=POSES, code=0):
 
 
 @inside
-def test_holding_torques_and_model_with_friction(tmp_path):
+def test_holding_torques_with_friction(tmp_path):
     with simulated_arm("--effects", "friction") as domain:
         hold = domain.subscribe("/MTML/hold", Empty, depth=10)
         KEPT.append(hold)
         assert domain.wait_until(hold.num_publishers, 0.0) == 0
-        assert "pose 8 measured, 8 of 8" in collect(tmp_path)
+        assert "pose 6 measured, 6 of 6" in collect(tmp_path)
         assert domain.wait_until(lambda: len(hold.take()) > 0, TIMEOUT)
-        assert "contains all 8 poses already" in collect(tmp_path)
+        assert "contains all 6 poses already" in collect(tmp_path)
     truth = IdentifiedModel.from_arm(MTML)
     recording = read_recording(tmp_path / "p.csv")
-    np.testing.assert_allclose(recording.q, POSES, atol=0.02)
+    # At rest, the proportional effort of the position controller is at most the dry friction.
+    assert np.all(np.abs(recording.q - POSES) < MTML.dry_friction() / np.asarray(MTML.gains.kp) + 2e-3)
     expected = np.array([truth.holding_torque(q) for q in recording.q])
-    friction = np.array([remaining_friction(q) for q in recording.q])
-    # If the arm overshoots a pose before it rests there, the friction elements are partly unloaded.
-    overshoot = 0.15 * MTML.dry_friction()
-    assert np.all(np.abs(recording.tau - expected) < friction + overshoot)
-    model = identify(recording, MTML).model
-    others = MTML.sample_poses(50, np.random.default_rng(1))
-    error = [model.holding_torque(q) - truth.holding_torque(q) for q in others]
-    assert np.all(np.sqrt(np.mean(np.square(error), axis=0)) < friction.max(axis=0) + overshoot)
+    # The friction at rest never exceeds the dry friction. How far it cancels depends on the speed of the simulated arm,
+    # and thus on the load of the computer. `tests/processes/test_crtk_collection_with_dynamics.py` tests it.
+    assert np.all(np.abs(recording.tau - expected) < MTML.dry_friction() + 1e-3)
     bag = read_recording(tmp_path / "p_1.mcap", MTML)
     assert np.all(np.min(np.linalg.norm(bag.q[:, None] - recording.q, axis=2), axis=0) < 0.01)
     assert not (tmp_path / "p_2.mcap").exists()
@@ -157,8 +140,10 @@ def test_interrupted_collection_continues_in_a_second_bag(tmp_path):
         collect(tmp_path, "--no-both-sides", poses=POSES[:1])
         assert sorted(os.listdir(tmp_path)) == ["p.csv", "p.yaml", "p_1.mcap", "p_2.mcap"]
         assert len(read_recording(tmp_path / "p.csv").q) == 1
-        KEPT.append(domain.advertise("/MTML/servo_jp", JointState))
+        other = start(sys.executable, "-c", OTHER)
+        wait_until(lambda: "/MTML/servo_jp" in {e.topic for e in domain.publishers()}, "the other publisher", other)
         output = collect(tmp_path, "--no-both-sides", poses=POSES[:2], code=2)
+        end(other)
         assert "another process publishes /MTML/servo_jp" in output
 
 
