@@ -85,7 +85,7 @@ class CrtkClient:
         self._measured: Subscription[JointState] = subscribe(self._topic("measured_js"), JointState)
         self._state = subscribe(self._topic("operating_state"), OperatingState, depth=100, latched=True)
         self._gravity = subscribe(self._topic("gravity_compensation/setpoint_js"), JointState)
-        self._other_hold = subscribe(self._topic("hold"), Empty, ignore_own=True)
+        self._other_hold = subscribe(self._topic("hold"), Empty, ignore_own=True, wakes=False)
         self._jaw = None if self._separate is None else subscribe(self._jaw_topic("measured_js"), JointState)
         self._servo_jp = self._advertise("servo_jp")
         self._servo_jf = self._advertise("servo_jf")
