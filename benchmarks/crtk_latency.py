@@ -1,13 +1,16 @@
 """Measures the time from a measurement of a dVRK to the effort that answers it, through the bridge.
 
-    python benchmarks/crtk_latency.py [--seconds 20] [--realtime]
+    python benchmarks/crtk_latency.py [--seconds 20] [--realtime] [--core 1]
 
 This process plays the arm: it publishes `measured_js` at 1 kHz and receives `servo_jf`. The position and the effort of
-the last joint contain the number of the measurement. Three paths are measured in one run, one after the other:
+the last joint contain the number of the measurement. These paths are measured in one run, one after the other:
 
     echo of cyclonedds   a process that answers each JointState message with another one; encoder of cyclonedds
     echo                 the same with the encoder of this package
-    bridge               `dvrk-drake bridge`, and over LCM a controller that answers each status with an effort
+    controller on LCM    without DDS: this process publishes the status, and the controller answers it over LCM
+    bridge               `dvrk-drake bridge`, and the same controller
+
+With --core, the bridge uses only this processor core, as with `taskset`.
 
 The table lists the round-trip times and the measurements without an answer. The counters of the guard are printed
 below: commands that LCM lost, and commands that the guard refused.
@@ -27,7 +30,9 @@ import select
 import sys
 import tempfile
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
@@ -38,9 +43,10 @@ from effort_controller import LENIENT_DRIVER, effort_command
 from ros_publisher import DOMAIN_FILE
 
 from dvrk_drake import cli
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
+from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command import draw_id
 from dvrk_drake.systems.ros.domain import RosDomain
@@ -50,6 +56,8 @@ ARM = load_arm("mtml")
 N, NAMES = ARM.num_joints, list(ARM.joint_names)
 #: Numbers of measurements from 0 to 999 are sent as multiples of this position [rad] and effort [N m].
 UNIT, CYCLE = 1e-6, 1000
+#: Time until the controller runs [s].
+START = 3.0
 
 
 def number(value: float) -> int:
@@ -90,8 +98,10 @@ def controller(realtime: bool) -> None:
         network.handle()
 
 
-def bridge(folder: str, realtime: bool) -> None:
+def bridge(folder: str, realtime: bool, core: int | None) -> None:
     """Runs the bridge with a guard that tolerates an arm without efforts."""
+    if core is not None:
+        os.sched_setaffinity(0, {core})
     driver = Path(folder, "driver.yaml")
     driver.write_text(LENIENT_DRIVER)
     cli.main(["bridge", "--arm", "mtml", "--driver", str(driver), *(["--realtime"] if realtime else [])])
@@ -157,6 +167,22 @@ class Arm:
         return np.array([self.answered.get(k, np.nan) - self.sent[k] for k in range(first + 1000, last + 1)])
 
 
+def start(*mains: tuple[Any, ...]) -> list[BaseProcess]:
+    """Starts one process for each (function, *arguments)."""
+    context = multiprocessing.get_context("spawn")
+    processes: list[BaseProcess] = [context.Process(target=main, args=arguments) for main, *arguments in mains]
+    for process in processes:
+        process.start()
+    return processes
+
+
+def end(processes: list[BaseProcess]) -> None:
+    """Ends processes."""
+    for process in processes:
+        process.kill()
+        process.join()
+
+
 def guard_counters() -> str:
     """Returns the numbers of commands in the last status of the bridge."""
     network, found = lcm.LCM(), []
@@ -166,35 +192,52 @@ def guard_counters() -> str:
     return ", ".join(f"{getattr(found[-1], f'num_{name}')} {name}" for name in ("accepted", "lost", "refused"))
 
 
-def measure(name: str, seconds: float, realtime: bool, folder: str) -> np.ndarray:
-    """Measures one path."""
+def measure(name: str, seconds: float, realtime: bool, folder: str, core: int | None) -> np.ndarray:
+    """Measures one path over DDS."""
     domain, namespace = RosDomain(), "/MTML" if name == "bridge" else f"/ECHO_{name[-3:].strip().upper()}"
     arm = Arm(domain, namespace)
-    context = multiprocessing.get_context("spawn")
-    targets = (
-        [(bridge, (folder, realtime)), (controller, (realtime,))]
-        if name == "bridge"
-        else [(echo, (namespace, realtime, name != "echo"))]
-    )
-    processes = [context.Process(target=target, args=arguments) for target, arguments in targets]
-    for process in processes:
-        process.start()
+    if name == "bridge":
+        processes = start((bridge, folder, realtime, core), (controller, realtime))
+    else:
+        processes = start((echo, namespace, realtime, name != "echo"))
     try:
         arm.run(seconds, needs_answer=True)
         if name == "bridge":
             lost = f"lost on DDS: {arm.num_lost()} efforts; guard: {guard_counters()} commands"
             print(lost, file=sys.stderr, flush=True)
     finally:
-        for process in processes:
-            process.kill()
-            process.join()
+        end(processes)
     return arm.trips()
+
+
+def measure_lcm(seconds: float, realtime: bool) -> np.ndarray:
+    """Measures the round-trip times [s] from this process to the controller. A lost message has the time NaN."""
+    network, trips = lcm.LCM(), []
+    network.subscribe(command_channel(ARM), lambda channel, data: trips.append(lcmt_dvrk_command.decode(data).utime))
+    status = lcmt_dvrk_status()
+    status.arm_name, status.num_joints = ARM.name, N
+    for name in ("position", "velocity", "effort_measured", "position_commanded", "effort_commanded", "joint_flags"):
+        setattr(status, name, [0] * N)
+    processes = start((controller, realtime))
+    pace, end_time, times = Pace(1e-3), time.monotonic() + START + seconds, []
+    try:
+        while time.monotonic() < end_time:
+            pace.wait()
+            count, begin = len(trips), time.monotonic()
+            network.publish(status_channel(ARM), status.encode())
+            handle_message(network, 5e-3)
+            times.append(time.monotonic() - begin if len(trips) > count else np.nan)
+    finally:
+        end(processes)
+    first = int(np.flatnonzero(np.isfinite(times))[0])
+    return np.array(times[first + 1000 :])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--realtime", action="store_true")
+    parser.add_argument("--core", type=int, help="processor core of the bridge")
     options = parser.parse_args()
     os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
     if options.realtime:
@@ -205,8 +248,11 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|")
     p50 = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("echo of cyclonedds", "echo", "bridge"):
-            trips = measure(name, options.seconds, options.realtime, folder)
+        for name in ("echo of cyclonedds", "echo", "controller on LCM", "bridge"):
+            if name == "controller on LCM":
+                trips = measure_lcm(options.seconds, options.realtime)
+            else:
+                trips = measure(name, options.seconds, options.realtime, folder, options.core)
             valid = 1e3 * trips[np.isfinite(trips)]
             quantiles = np.quantile(valid, [0.5, 0.99, 0.999, 1.0])
             p50[name] = quantiles[0]
