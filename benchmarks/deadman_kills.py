@@ -65,8 +65,8 @@ ACTING = (0.3, 0.6)
 AFTER = 0.5
 #: Longest wait for a change of the control mode [s].
 LONGEST = 60.0
-#: Amplitude of the effort of the jaw [N m].
-JAW = 0.05
+#: Amplitude of the effort of the jaw [N m]. Commands start only with an effort near the measured one, which is 0.
+JAW = 0.02
 #: Configuration of the bridge: default times, but the console measures no effort although gravity acts on the model.
 DRIVER = "guard: {resume_automatically: true, plausibility: {start_gravity: 2.0}}\n"
 EFFORT, POSITION = "JOINT_SPACE/EFFORT_MODE", "JOINT_SPACE/POSITION_MODE"
@@ -195,7 +195,10 @@ def count_flips(realtime: bool, seconds: float, jaw: float) -> str:
         time.sleep(1.0)
         bench.monitor.forget()
         num_modes = len(console.modes())
-        time.sleep(seconds)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            time.sleep(0.5)
+            bench.monitor.receive()
         modes = console.modes()[num_modes:]
         sent = [name for name, *_ in bench.monitor.receive()]
     cells = (sent.count("servo_jf"), sent.count("jaw/servo_jf"), len(modes), sum("CARTESIAN" in mode for mode in modes))

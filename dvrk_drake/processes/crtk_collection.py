@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable
@@ -28,9 +29,8 @@ if TYPE_CHECKING:
 _POLL = 0.01
 #: Messages of one topic that may arrive between two updates. Older messages are lost.
 _DEPTH = 5000
-#: Longest time until the first valid measurement of a homed arm, until the arm confirms `hold`, and until it is
-#: discovered again [s].
-_FIRST, _CONFIRMATION, _DISCOVERY = 5.0, 1.0, 3.0
+#: Longest time until the first valid measurement of a homed arm, and until the arm confirms `hold` [s].
+_FIRST, _CONFIRMATION = 5.0, 4.0
 #: Longest time until the latest operating state arrives after an older one [s].
 _STATES = 2.0
 
@@ -168,16 +168,16 @@ def run_crtk_collection(
         report=dialog.report,
     )
     recorder = MeasurementBag(ros, arm, client.namespace, bag)
-    try:
+    with contextlib.ExitStack() as stack:
+        # In the case of an exception, all three are called, the last one first.
+        stack.callback(recorder.close)
+        stack.callback(output.close)
+        stack.callback(_hold, client, dialog.report)
         while not collector.finished:
             ros.wait(_POLL)
             collector.update(time.monotonic())
             recorder.update()
             dialog.show(collector.describe)
-    finally:
-        _hold(client, dialog.report)
-        output.close()
-        recorder.close()
     return collector
 
 
@@ -212,12 +212,5 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
 def _hold(client: CrtkClient, report: Callable[[str], None]) -> None:
     """Publishes `hold`, and reports if the arm does not confirm it."""
     client.hold()
-
-    def is_heard() -> bool:
-        return not client.unheard_commands(("hold",))
-
-    # After an interruption of the network or of this process, DDS first has to discover the arm again.
-    if not is_heard() and client.domain.wait_until(is_heard, _DISCOVERY):
-        client.hold()
-    if not (is_heard() and client.wait_until_received(_CONFIRMATION)):
+    if not client.wait_until_received(_CONFIRMATION):
         report(f"{client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")

@@ -9,7 +9,6 @@ from pydrake.systems.framework import DiagramBuilder
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
-from dvrk_drake.analysis.identification import identify
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, approaches, estimated_duration
@@ -109,8 +108,8 @@ def remaining_friction(arm, q, settings):
     return bound
 
 
-def test_friction_cancels_and_the_model_is_identified(tmp_path):
-    poses = MTML.sample_poses(12, np.random.default_rng(4), margin=0.1)
+def test_friction_cancels_in_both_approach_directions(tmp_path):
+    poses = MTML.sample_poses(4, np.random.default_rng(4), margin=0.1)
     client, model = SimulatedClient(MTML), IdentifiedModel.from_arm(MTML)
     settings = CrtkCollectionSettings()
     output = CollectionFile(tmp_path / "p.csv", MTML, both_sides=True)
@@ -130,7 +129,3 @@ def test_friction_cancels_and_the_model_is_identified(tmp_path):
     assert np.all(np.abs(error) < friction + 0.15 * dry)
     # Shoulder and elbow, which carry most of the weight, keep at most half of their dry friction.
     assert np.all(friction[:, :3] < 0.5 * dry[:3])
-    identified = identify(recording, MTML).model
-    others = MTML.sample_poses(200, np.random.default_rng(1))
-    error = [identified.holding_torque(q) - model.holding_torque(q) for q in others]
-    assert np.all(np.sqrt(np.mean(np.square(error), axis=0)) < friction.max(axis=0) + 0.05 * dry)

@@ -46,6 +46,11 @@ _READERS: "weakref.WeakSet[DataReader]" = weakref.WeakSet()
 _UNUSED: "queue.SimpleQueue[DataReader]" = queue.SimpleQueue()
 
 
+def _remove_listener(reader: DataReader) -> None:
+    with contextlib.suppress(DDSException):  # DDS has deleted the reader together with its participant
+        reader.set_listener(None)
+
+
 @functools.cache
 def _start_deletion() -> None:
     """Starts the thread that deletes unused readers."""
@@ -57,7 +62,7 @@ def _delete_unused() -> None:
     # delete the reader, and wait for ever for the end of its own call. So the listener is removed before.
     while True:
         reader = _UNUSED.get()
-        reader.set_listener(None)
+        _remove_listener(reader)
         del reader
 
 
@@ -66,7 +71,7 @@ def _remove_listeners() -> None:
     # At the end of the interpreter, a thread of Cyclone DDS that calls a listener would wait for ever, and the deletion
     # of the reader would wait for this thread.
     for reader in list(_READERS):
-        reader.set_listener(None)
+        _remove_listener(reader)
 
 
 Message = TypeVar("Message", bound=IdlStruct)
