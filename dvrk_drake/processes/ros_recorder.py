@@ -16,8 +16,8 @@ from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
-    from dvrk_drake.systems.ros.domain import Subscription
     from dvrk_drake.systems.ros.messages import JointState
+    from dvrk_drake.systems.ros.topic import Subscription
 
 #: Longest wait for a message between two checks for a stop [s].
 _POLL = 0.1

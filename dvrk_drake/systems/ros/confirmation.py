@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dvrk_drake.systems.ros.domain import Publisher
+    from dvrk_drake.systems.ros.topic import Publisher
 
 #: Time between two repetitions [s].
 _INTERVAL = 0.25

@@ -15,9 +15,10 @@ from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
 from dvrk_drake.systems.ros.confirmation import repeat_until_received
-from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
+from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement, JointStateReader, shown
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
+from dvrk_drake.systems.ros.topic import Publisher, Subscription
 
 #: Longest time to wait for the topics of an arm [s]. Time to wait for other topics of the domain after the first one
 #: [s].

@@ -20,6 +20,7 @@ from waiting import TIMEOUT
 
 module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
+topic_module = pytest.importorskip("dvrk_drake.systems.ros.topic", reason="needs cyclonedds")
 JointState, OperatingState, StringStamped = messages.JointState, messages.OperatingState, messages.StringStamped
 
 #: Numbers of domains. Each test has its own domain, without endpoints of other tests.
@@ -227,8 +228,8 @@ def test_malformed_text_is_counted(domain):
     from cyclonedds.topic import Topic
 
     subscription = domain.subscribe("/text", StringStamped, depth=10)
-    topic = Topic(domain.participant, module.dds_topic("/text"), StringStamped)
-    writer = DataWriter(domain.participant, topic, qos=module.ros_qos(10))
+    topic = Topic(domain.participant, topic_module.dds_topic("/text"), StringStamped)
+    writer = DataWriter(domain.participant, topic, qos=topic_module.ros_qos(10))
     assert domain.wait_until(subscription.num_publishers, TIMEOUT)
     message = StringStamped(messages.Header(), "abc")
     encoded = message.serialize(use_version_2=False)
@@ -251,8 +252,8 @@ def test_publisher_of_another_layout_is_not_received(domain):
         number: uint32 = 0
 
     subscription = domain.subscribe("/other", StringStamped, depth=10)
-    topic = Topic(domain.participant, module.dds_topic("/other"), Other)
-    writer = DataWriter(domain.participant, topic, qos=module.ros_qos(10))
+    topic = Topic(domain.participant, topic_module.dds_topic("/other"), Other)
+    writer = DataWriter(domain.participant, topic, qos=topic_module.ros_qos(10))
     publisher = domain.advertise("/other", StringStamped)
     assert domain.wait_until(lambda: len(domain.publishers()) == 2, TIMEOUT)
     assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
