@@ -194,7 +194,9 @@ def test_client_controls_the_arm(monkeypatch):
     for line in (
         "simulated MTML on ROS domain 0, topics /MTML/...; press Ctrl-C to end",
         "servo_jf refused: the arm is DISABLED; allowed: ENABLED, homed",
-        "ENABLED, homed, control mode effort, gravity compensation on",
+        # A busy computer may handle two commands in one step, so the two texts need not be on the same line.
+        "control mode effort",
+        "gravity compensation on",
     ):
         assert line in output, output
     assert "late" in output.splitlines()[-1]
