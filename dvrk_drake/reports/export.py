@@ -225,13 +225,13 @@ def print_comparison(
     difference = np.abs(comparison.clipped_torque - comparison.model_torque).max(axis=0)
     j = int(np.argmax(difference))
     faults = comparison.clipped | comparison.runaway | comparison.opposed
-    wrong = 100 * faults[:, : len(MTM_JOINTS) - 1].any(axis=1).mean()
+    marked = 100 * faults[:, : len(MTM_JOINTS) - 1].any(axis=1).mean()
     print_answer(
         console,
-        f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). At {wrong:.0f} % of "
-        "the poses, the file's torque on a joint is at a limit, far outside the model's range, or opposite in sign.",
+        f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). Poses with a torque "
+        f"at limit, runaway or opposed: {marked:.3g} % (--verbose explains these columns).",
         _next_step(comparison.model, model_name),
-        "yellow" if wrong else "green",
+        "yellow" if marked else "green",
     )
     table = make_table(
         f"Torque of the file minus model [N m], {len(comparison.q)} random static poses",
