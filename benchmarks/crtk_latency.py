@@ -12,8 +12,9 @@ the last joint contain the number of the measurement. These paths are measured i
 
 With --core, the bridge uses only this processor core, as with `taskset`.
 
-The table lists the round-trip times and the measurements without an answer. The counters of the guard are printed
-below: commands that LCM lost, and commands that the guard refused.
+The table lists the round-trip times, the largest interval between two measurements, and the measurements without an
+answer. The nominal interval is 1 ms. A much larger interval shows that the system suspended this process. The counters
+of the guard are printed below: commands that LCM lost, and commands that the guard refused.
 
 The benchmark requires a network namespace and multicast:
 
@@ -160,11 +161,12 @@ class Arm:
         """Returns the number of efforts that DDS has lost."""
         return self._effort.num_lost
 
-    def trips(self) -> np.ndarray:
-        """Returns the round-trip times [s] between the first and the last answer, NaN for no answer."""
-        first, last = min(self.answered), max(self.answered)
+    def trips(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns times of sending and round-trip times [s] from the first to the last answer, NaN for no answer."""
         # During the first second, the bridge starts commands.
-        return np.array([self.answered.get(k, np.nan) - self.sent[k] for k in range(first + 1000, last + 1)])
+        numbers = range(min(self.answered) + 1000, max(self.answered) + 1)
+        sent = np.array([self.sent[k] for k in numbers])
+        return sent, np.array([self.answered.get(k, np.nan) for k in numbers]) - sent
 
 
 def start(*mains: tuple[Any, ...]) -> list[BaseProcess]:
@@ -192,8 +194,8 @@ def guard_counters() -> str:
     return ", ".join(f"{getattr(found[-1], f'num_{name}')} {name}" for name in ("accepted", "lost", "refused"))
 
 
-def measure(name: str, seconds: float, realtime: bool, folder: str, core: int | None) -> np.ndarray:
-    """Measures one path over DDS."""
+def measure(name: str, seconds: float, realtime: bool, folder: str, core: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Measures one path over DDS. Returns times of sending and round-trip times [s]."""
     domain, namespace = RosDomain(), "/MTML" if name == "bridge" else f"/ECHO_{name[-3:].strip().upper()}"
     arm = Arm(domain, namespace)
     if name == "bridge":
@@ -210,8 +212,8 @@ def measure(name: str, seconds: float, realtime: bool, folder: str, core: int | 
     return arm.trips()
 
 
-def measure_lcm(seconds: float, realtime: bool) -> np.ndarray:
-    """Measures the round-trip times [s] from this process to the controller. A lost message has the time NaN."""
+def measure_lcm(seconds: float, realtime: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Measures the path to the controller over LCM. Returns times of sending and round-trip times [s], NaN if lost."""
     network, trips = lcm.LCM(), []
     network.subscribe(command_channel(ARM), lambda channel, data: trips.append(lcmt_dvrk_command.decode(data).utime))
     status = lcmt_dvrk_status()
@@ -219,18 +221,21 @@ def measure_lcm(seconds: float, realtime: bool) -> np.ndarray:
     for name in ("position", "velocity", "effort_measured", "position_commanded", "effort_commanded", "joint_flags"):
         setattr(status, name, [0] * N)
     processes = start((controller, realtime))
-    pace, end_time, times = Pace(1e-3), time.monotonic() + START + seconds, []
+    pace, end_time = Pace(1e-3), time.monotonic() + START + seconds
+    sent: list[float] = []
+    times: list[float] = []
     try:
         while time.monotonic() < end_time:
             pace.wait()
             count, begin = len(trips), time.monotonic()
             network.publish(status_channel(ARM), status.encode())
             handle_message(network, 5e-3)
+            sent.append(begin)
             times.append(time.monotonic() - begin if len(trips) > count else np.nan)
     finally:
         end(processes)
-    first = int(np.flatnonzero(np.isfinite(times))[0])
-    return np.array(times[first + 1000 :])
+    first = int(np.flatnonzero(np.isfinite(times))[0]) + 1000
+    return np.array(sent[first:]), np.array(times[first:])
 
 
 def main() -> None:
@@ -244,19 +249,20 @@ def main() -> None:
         for warning in make_realtime():
             print(warning, file=sys.stderr)
     scheduling = "real-time" if options.realtime else "normal"
-    print(f"| {scheduling} scheduling | p50 [ms] | p99 [ms] | p99.9 [ms] | max [ms] | without answer | p50 / echo |")
-    print("|---|---|---|---|---|---|---|")
+    columns = ("p50 [ms]", "p99 [ms]", "p99.9 [ms]", "max [ms]", "largest interval between measurements [ms]")
+    print(f"| {scheduling} scheduling | {' | '.join(columns)} | without answer | p50 / echo |")
+    print("|---|---|---|---|---|---|---|---|")
     p50 = {}
     with tempfile.TemporaryDirectory() as folder:
         for name in ("echo of cyclonedds", "echo", "controller on LCM", "bridge"):
             if name == "controller on LCM":
-                trips = measure_lcm(options.seconds, options.realtime)
+                sent, trips = measure_lcm(options.seconds, options.realtime)
             else:
-                trips = measure(name, options.seconds, options.realtime, folder, options.core)
+                sent, trips = measure(name, options.seconds, options.realtime, folder, options.core)
             valid = 1e3 * trips[np.isfinite(trips)]
             quantiles = np.quantile(valid, [0.5, 0.99, 0.999, 1.0])
             p50[name] = quantiles[0]
-            numbers = " | ".join(f"{q:.2f}" for q in quantiles)
+            numbers = " | ".join(f"{x:.2f}" for x in (*quantiles, 1e3 * np.diff(sent).max()))
             lost = f"{len(trips) - len(valid)} of {len(trips)}"
             print(f"| {name} | {numbers} | {lost} | {quantiles[0] / p50['echo of cyclonedds']:.2f} |", flush=True)
 

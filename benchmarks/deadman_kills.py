@@ -14,8 +14,9 @@ The measurement starts just before the call that sends the signal. It ends twice
 With --jaw-seconds, the script then counts the changes between joint space and Cartesian space of a PSM. Meanwhile, the
 bridge sends efforts of the arm and of the jaw.
 
-A busy computer may suspend a process for so long that the arm is held before the signal. The script counts such an
-attempt and repeats it. The console has no dynamics: efforts move nothing. Nothing was measured on a real arm.
+A busy computer may suspend a process for so long that the arm is held before the signal. The script repeats such an
+attempt and counts it in the column "held before the signal". The console has no dynamics: efforts move nothing. Nothing
+was measured on a real arm.
 
 The benchmark requires a network namespace and multicast:
 
@@ -54,10 +55,10 @@ from dvrk_drake.systems.ros.crtk_bridge import compile_guard
 
 #: Name of each condition, processes that get the signal, and the signal.
 CONDITIONS = {
-    "SIGKILL controller": (("controller",), signal.SIGKILL),
-    "SIGKILL bridge": (("bridge",), signal.SIGKILL),
-    "SIGKILL both": (("bridge", "controller"), signal.SIGKILL),
-    "SIGSTOP bridge": (("bridge",), signal.SIGSTOP),
+    "SIGKILL to the controller": (("controller",), signal.SIGKILL),
+    "SIGKILL to the bridge": (("bridge",), signal.SIGKILL),
+    "SIGKILL to both": (("bridge", "controller"), signal.SIGKILL),
+    "SIGSTOP to the bridge": (("bridge",), signal.SIGSTOP),
 }
 #: Minimum and maximum time for which efforts act before the signal [s].
 ACTING = (0.3, 0.6)
@@ -221,10 +222,12 @@ def main() -> None:
     scheduling = "real-time" if options.realtime else "normal"
     print(f"load average at the start: {os.getloadavg()[0]:.2f} on {os.cpu_count()} cores")
     if options.kills:
-        print(f"MTML, {scheduling} scheduling: time from the signal to the hold message and to position control [ms]")
-        columns = ("condition", "signals", "message p50", "message max", "mode p50", "mode max", "held before")
-        print(f"| {' | '.join(columns)} | remained in effort mode |")
-        print("|---|---|---|---|---|---|---|---|")
+        title = f"MTML, {scheduling} scheduling, {options.kills} signals per row"
+        print(f"{title}: time [ms] from a signal to the command and to position control")
+        times = [f"{name}, {which}" for name in ("command", "position control") for which in ("p50", "max")]
+        columns = ("scheduling, signal", *times, "held before the signal", "remained in effort control")
+        print(f"| {' | '.join(columns)} |")
+        print("|---|---|---|---|---|---|---|")
         with started("mtml", "MTML", options.realtime) as (console, bench):
             for condition, (names, number) in CONDITIONS.items():
                 if options.condition not in (None, condition):
@@ -236,7 +239,7 @@ def main() -> None:
                     for value in (values[len(values) // 2], values[-1])
                 ]
                 counts = (len(found["early"]), len(found["remains in effort mode"]))
-                print(f"| {condition} | {options.kills} | {' | '.join([*times, *map(str, counts)])} |", flush=True)
+                print(f"| {scheduling}, {condition} | {' | '.join([*times, *map(str, counts)])} |", flush=True)
     if options.jaw_seconds:
         print(f"\nPSM1, {scheduling} scheduling: changes of the control space in {options.jaw_seconds:g} s")
         print("| jaw effort [N m] | servo_jf | jaw/servo_jf | mode changes | to Cartesian space |")
