@@ -92,8 +92,11 @@ class CrtkBench:
             driver,
             self._store,
             report=self.lines.append,
-            deadman=SimpleNamespace(problem=lambda: self.blocked, close=lambda: self.lines.append("deadman ended")),
+            deadman=SimpleNamespace(problem=lambda: self.blocked, close=self._close_deadman),
         )
+
+    def _close_deadman(self, *, is_confirmed):
+        self.lines.append("deadman ended" if is_confirmed else "deadman repeats hold")
 
     def time_ns(self):
         return START + self.now

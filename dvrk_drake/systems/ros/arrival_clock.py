@@ -9,8 +9,8 @@ import numpy as np
 
 #: Number of measurements whose rate is determined.
 _WINDOW = 100
-#: Time after which the difference of the clocks is determined anew [us], because the clocks drift.
-_RENEWAL = 10_000_000
+#: Largest drift of the clocks, as a fraction of the time: each clock is corrected by at most 500 ppm, the limit of NTP.
+_DRIFT = 1e-3
 
 
 class ArrivalClock:
@@ -19,9 +19,10 @@ class ArrivalClock:
     The clock is the time of day at its creation plus the monotonic time since then. It also advances while this process
     is suspended, and it does not jump.
 
-    The smallest observed time from a stamp to its arrival is the difference of the two clocks plus the shortest delay
-    of the network. A measurement is as old as its time from stamp to arrival exceeds this minimum. A constant delay is
-    therefore not detected.
+    The shortest observed time from a stamp to its arrival is the difference of the two clocks plus the shortest delay
+    of the network. The age of a measurement is its time from stamp to arrival minus this reference. The reference
+    increases by at most 1 ms per second, because the clocks drift. So a delay that is constant from the first
+    measurement on, or that increases more slowly, is not detected.
     """
 
     def __init__(self, largest_change: float = 0.1) -> None:
@@ -33,7 +34,7 @@ class ArrivalClock:
         self._largest_change = round(1e6 * largest_change)
         self._start = time.time_ns() - time.monotonic_ns()
         self._stamps: deque[int] = deque(maxlen=_WINDOW)
-        self._offset = self._next_offset = self._renewal = 0
+        self._offset, self._offset_time = 0.0, 0
         self._last = 0
 
     def now(self) -> int:
@@ -51,21 +52,19 @@ class ArrivalClock:
         """
         stamp, arrival = stamp // 1000, (self._start + arrival) // 1000
         difference, jump = arrival - stamp, ""
+        reference = self._offset + _DRIFT * (arrival - self._offset_time)
         if not self._stamps:
-            self._restart(difference, arrival)
+            reference = difference
         elif stamp == self._stamps[-1]:
             return self._last, ""
-        elif stamp < self._stamps[-1] or difference < self._offset - self._largest_change:
+        elif stamp < self._stamps[-1] or difference < reference - self._largest_change:
             change = 1e-6 * (stamp - self._stamps[-1])
             jump = f"the time stamp changed by {change:.3f} s since the previous message"
             self._stamps.clear()
-            self._restart(difference, arrival)
+            reference = difference
         self._stamps.append(stamp)
-        self._offset, self._next_offset = min(self._offset, difference), min(self._next_offset, difference)
-        if arrival > self._renewal:
-            self._offset, self._next_offset = self._next_offset, difference
-            self._renewal = arrival + _RENEWAL
-        self._last = max(stamp + self._offset, self._last + 1)
+        self._offset, self._offset_time = min(reference, difference), arrival
+        self._last = max(stamp + round(self._offset), self._last + 1)
         return self._last, jump
 
     @property
@@ -74,7 +73,3 @@ class ArrivalClock:
         if len(self._stamps) < _WINDOW:
             return None
         return 1e6 / float(np.median(np.diff(self._stamps)))
-
-    def _restart(self, difference: int, arrival: int) -> None:
-        self._offset = self._next_offset = difference
-        self._renewal = arrival + _RENEWAL

@@ -14,9 +14,9 @@ _INTERVAL = 0.25
 
 
 def repeat_until_received(
-    publisher: Publisher[Any], message: Any, is_present: Callable[[], object], seconds: float
+    publisher: Publisher[Any], message: Any, is_present: Callable[[], object], is_over: Callable[[], bool]
 ) -> bool:
-    """Waits until a published message is confirmed, at most `seconds` [s]. Returns whether it is confirmed.
+    """Waits until a published message is confirmed. Returns whether it is confirmed.
 
     The message is published again while it is not confirmed. A subscription that DDS discovers again after a loss of
     the network does not receive the messages that were published before, but confirms them. After a repetition, two
@@ -27,12 +27,12 @@ def repeat_until_received(
         message: Message that was published last.
         is_present: Function that returns whether DDS has a connection to the arm. Without subscriptions, DDS regards
             each message as confirmed.
-        seconds: Longest time to wait [s].
+        is_over: Function that returns whether to stop waiting. It is called after each attempt without confirmation.
 
     Raises:
         DvrkDrakeError: DDS cannot send the message.
     """
-    end, missing = time.monotonic() + seconds, 1
+    missing = 1
     while True:
         begin = time.monotonic()
         if publisher.wait_until_received(_INTERVAL) and is_present():
@@ -41,7 +41,7 @@ def repeat_until_received(
                 return True
         else:
             missing = 2
-            if time.monotonic() >= end:
+            if is_over():
                 return False
             time.sleep(max(0.0, begin + _INTERVAL - time.monotonic()))
         publisher.publish(message)

@@ -139,16 +139,20 @@ class CrtkBridge:
     def close(self) -> None:
         """Commands the arm to hold its present pose, and ends the deadman process.
 
+        If the arm does not confirm the command, the deadman process continues to send it.
+
         Raises:
             DvrkDrakeError: DDS cannot send the command.
         """
+        is_confirmed = False
         try:
             self._client.hold()
-            if not self._client.wait_until_received(_CONFIRMATION):
+            is_confirmed = self._client.wait_until_received(_CONFIRMATION)
+            if not is_confirmed:
                 self._report(f"{self._client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
         finally:
             if self._deadman is not None:
-                self._deadman.close()
+                self._deadman.close(is_confirmed=is_confirmed)
 
     def fileno(self) -> int:
         """Returns a file descriptor that is readable after a message of the arm has arrived."""

@@ -203,7 +203,8 @@ class CrtkClient:
         Raises:
             DvrkDrakeError: DDS cannot send the message.
         """
-        return repeat_until_received(self._hold, Empty(), self._state.num_publishers, seconds)
+        end = time.monotonic() + seconds
+        return repeat_until_received(self._hold, Empty(), self._state.num_publishers, lambda: time.monotonic() >= end)
 
     def unheard_commands(self, names: Sequence[str]) -> list[str]:
         """Returns the command topics to which no process subscribes.

@@ -27,11 +27,10 @@ if TYPE_CHECKING:
 TIMEOUT = 0.05
 #: Time between two checks [s].
 _POLL = 0.005
-#: Longest time until the arm confirms the message `hold` [s]. Time for which the process then continues to repeat it,
-#: e.g. until the network works again [s].
-_CONFIRMATION, _LOSS = 2.0, 60.0
-#: Longest time until a new deadman process is ready [s].
-_START = 20.0
+#: Time without a confirmation of `hold` after which the process prints a warning [s]. Time between two warnings [s].
+_CONFIRMATION, _WARNING = 2.0, 10.0
+#: Longest time until a new deadman process is ready [s]. Longest time until it has ended [s].
+_START, _END = 20.0, 4.0
 #: Lines with which the process reports whether it receives the commands of the bridge and can hold the arm.
 _READY, _BLIND = "ready", "blind"
 #: Real-time priority, above that of the other processes of this package.
@@ -43,6 +42,8 @@ class Deadman:
 
     The process that sends commands ends them with `hold`. Without further commands, the deadman then does nothing. It
     also does nothing while the arm is not enabled.
+
+    The deadman repeats `hold` without a time limit until the arm has confirmed it, e.g. after a loss of the network.
     """
 
     def __init__(self, domain: RosDomain, namespace: str, report: Callable[[str], None]) -> None:
@@ -51,7 +52,7 @@ class Deadman:
         Args:
             domain: ROS domain of the arm.
             namespace: Namespace of the topics, e.g. "/MTML".
-            report: Function that is called with one line when `hold` is published.
+            report: Function that is called with one line when `hold` is published, and while it is not confirmed.
         """
         from dvrk_drake.systems.ros.messages import Empty, JointState, OperatingState
 
@@ -78,12 +79,13 @@ class Deadman:
         bridge: int | None = None,
         report_connected: Callable[[bool], None] = lambda connected: None,
     ) -> None:
-        """Monitors the commands until `stopped` returns true, or until the bridge process ends.
+        """Monitors the commands until `stopped` returns true, or until the bridge process has ended and the arm holds.
 
         Args:
             stopped: Function that returns whether to stop.
-            bridge: File descriptor of a pipe from the bridge process. The end of this process closes the pipe. None:
-                there is no such pipe.
+            bridge: File descriptor of a pipe from the bridge process. The end of this process closes the pipe. The
+                bridge process writes to it before its end if the arm has not confirmed the last `hold`. None: there is
+                no such pipe.
             report_connected: Function that is called with each change of `is_connected`.
         """
         pipes = [] if bridge is None else [bridge]
@@ -96,10 +98,10 @@ class Deadman:
             self._update(time.monotonic())
             silence = 0.0 if self._last_command is None else time.monotonic() - self._last_command
             if silence > TIMEOUT:
-                self._publish_hold(f"no command for {1e3 * silence:.0f} ms")
+                self._publish_hold(f"no command for {1e3 * silence:.0f} ms", stopped)
             if ended:
-                if not self._is_held:
-                    self._publish_hold("the bridge has ended")
+                if os.read(pipes[0], 1) or not self._is_held:
+                    self._publish_hold("the bridge has ended", stopped)
                 return
 
     def _update(self, now: float) -> None:
@@ -112,17 +114,27 @@ class Deadman:
         if (holds and max(holds) >= self._last_published) or (states and states[-1] != "ENABLED"):
             self._last_command, self._is_held = None, True
 
-    def _publish_hold(self, reason: str) -> None:
+    def _publish_hold(self, reason: str, stopped: Callable[[], bool]) -> None:
         self._hold.publish(self._empty)
+        start = time.monotonic()
+        next_warning = start + _CONFIRMATION
         self._last_command = None
         self._report(f"deadman: {self._namespace}: {reason}; published hold at {time.time():.3f} s")
-        if not self._is_confirmed(_CONFIRMATION):
-            self._report(f"deadman: {self._namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
-            if self._is_confirmed(_LOSS):
-                self._report(f"deadman: {self._namespace}: the arm has confirmed hold now")
 
-    def _is_confirmed(self, seconds: float) -> bool:
-        return repeat_until_received(self._hold, self._empty, self._state.num_publishers, seconds)
+        def is_over() -> bool:
+            nonlocal next_warning
+            if (now := time.monotonic()) >= next_warning:
+                next_warning = now + _WARNING
+                self._report(
+                    f"deadman: {self._namespace}: the arm has not confirmed hold for {now - start:.0f} s. "
+                    f"PRESS THE STOP BUTTON. Process {os.getpid()} continues to send hold"
+                )
+            return stopped()
+
+        if repeat_until_received(self._hold, self._empty, self._state.num_publishers, is_over):
+            self._is_held = True
+            if next_warning > start + _CONFIRMATION:
+                self._report(f"deadman: {self._namespace}: the arm has confirmed hold now")
 
 
 class DeadmanProcess:
@@ -169,13 +181,22 @@ class DeadmanProcess:
         assert self._process.stdout is not None
         return self._process.stdout.read(4096).split()[-1:] == [_READY.encode()]
 
-    def close(self) -> None:
-        """Ends the process."""
+    def close(self, *, is_confirmed: bool = True) -> None:
+        """Ends the process.
+
+        Args:
+            is_confirmed: Whether the arm has confirmed `hold`. If not, the process continues to send `hold` until the
+                arm confirms it, also after the end of the bridge.
+        """
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
+            if not is_confirmed:
+                self._process.stdin.write(b"\0")
             self._process.stdin.close()
+        if not is_confirmed:
+            return
         try:
-            self._process.wait(2 * _CONFIRMATION)
+            self._process.wait(_END)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -194,13 +215,19 @@ def _report_connected(connected: bool) -> None:
 
 
 def main(namespace: str, domain: str) -> None:
-    """Runs the deadman of a bridge, whose end closes the standard input."""
+    """Runs the deadman of a bridge, whose end closes the standard input. Signals end it only after the bridge."""
+    received: list[int] = []
+
+    def stop(number: int, frame: object) -> None:
+        if select.select([sys.stdin], [], [], 0.0)[0]:
+            received.append(number)
+
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, stop)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     deadman = Deadman(open_ros_domain(int(domain) if domain else None), namespace, _report)
-    deadman.run(lambda: False, sys.stdin.fileno(), _report_connected)
+    deadman.run(lambda: bool(received), sys.stdin.fileno(), _report_connected)
     # Without the destructors of Cyclone DDS, which may wait for ever if another participant ends at the same time.
     os._exit(0)
 

@@ -4,12 +4,14 @@ DDS (Data Distribution Service) is the middleware of ROS 2.
 """
 
 import contextlib
+import ctypes
 import os
 import select
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cyclonedds.__library__ import library_path
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 from cyclonedds.core import DDSException, InstanceState, Policy, ReadCondition, SampleState, ViewState
 from cyclonedds.domain import DomainParticipant
@@ -29,6 +31,8 @@ _LEASE = 1
 #: suspended for the time `_LEASE`, other processes consider the process as ended until its next announcement.
 _ANNOUNCEMENT = 500
 _CONFIG = "CYCLONEDDS_URI"
+#: Masks for the log of Cyclone DDS: only errors that end the process. Also other errors and warnings.
+_LOG_FATAL, _LOG_DEFAULT = 1, 7
 #: Largest number of discovered endpoints.
 _MAX_ENDPOINTS = 10_000
 
@@ -80,7 +84,10 @@ class RosDomain:
             self._publications = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
             self._subscriptions = BuiltinDataReader(self.participant, BuiltinTopicDcpsSubscription)
         except DDSException as error:
-            raise DvrkDrakeError(f"{self.name} cannot be used: {error}. Check the network and {_CONFIG}") from error
+            raise DvrkDrakeError(
+                f"{self.name} cannot be used; Cyclone DDS has printed the reason. Check the network and the variable "
+                f"{_CONFIG}"
+            ) from error
         self._alive = {
             reader: ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Alive)
             for reader in (self._publications, self._subscriptions)
@@ -218,14 +225,28 @@ class RosDomain:
 
 
 def _participant(domain: int) -> DomainParticipant:
-    """Joins a domain with a short lease, so that other processes soon detect the end of a killed process."""
+    """Joins a domain with a short lease, so that other processes soon detect the end of a killed process.
+
+    Cyclone DDS by default forgets the addresses of peers after 30 to 60 s without an answer, and then never finds these
+    peers again without multicast. Here it keeps them, so that messages continue after a long loss of the network.
+    """
     configured = os.environ.get(_CONFIG)
-    discovery = f"<LeaseDuration>{_LEASE}s</LeaseDuration><SPDPInterval>{_ANNOUNCEMENT}ms</SPDPInterval>"
+    discovery = (
+        f"<LeaseDuration>{_LEASE}s</LeaseDuration><SPDPInterval>{_ANNOUNCEMENT}ms</SPDPInterval>"
+        "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
+        "<DiscoveredLocatorPruneDelay>inf</DiscoveredLocatorPruneDelay>"
+    )
     lease = f"<CycloneDDS><Domain><Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
     # A list of configurations is separated by commas. A later entry takes precedence over an earlier one.
     os.environ[_CONFIG] = f"{lease},{configured}" if configured else lease
+    # Cyclone DDS would print a line for each packet that it cannot send, thousands during a loss of the network.
+    log = ctypes.CDLL(str(library_path))
+    log.dds_set_log_mask(_LOG_FATAL)
     try:
         return DomainParticipant(domain)
+    except DDSException:
+        log.dds_set_log_mask(_LOG_DEFAULT)
+        return DomainParticipant(domain)  # prints the reason
     finally:
         if configured is None:
             del os.environ[_CONFIG]

@@ -120,27 +120,55 @@ def test_end_of_the_bridge_leads_to_hold(held):
     assert bench.lines == [] if held else "the bridge has ended; published hold at" in bench.lines[0]
 
 
-def test_hold_is_repeated_until_the_network_works_again(monkeypatch):
+@pytest.fixture
+def fast(monkeypatch):
+    """Makes the time between two attempts and two warnings short."""
     monkeypatch.setattr(confirmation, "_INTERVAL", 0.001)
     monkeypatch.setattr(deadman, "_CONFIRMATION", 0.01)
+    monkeypatch.setattr(deadman, "_WARNING", 0.01)
+
+
+def num_warnings(bench):
+    return sum("the arm has not confirmed hold for" in line for line in bench.lines)
+
+
+@pytest.mark.usefixtures("fast")
+def test_hold_is_repeated_until_the_network_works_again():
     bench = Bench()
     arm = bench.subscribed["operating_state"]
     # Without a connection to the arm, DDS regards each message as confirmed.
-    arm.connections = 0
-
-    def connect_after_the_warning():
-        if bench.lines and "PRESS THE STOP BUTTON" in bench.lines[-1]:
-            arm.connections = 1
-        return arm.connections
-
-    arm.num_publishers = connect_after_the_warning
+    arm.num_publishers = lambda: num_warnings(bench) >= 20
     bench.send("servo_jf", 1)
-    bench.run(lambda: bench.hold.published)
-    assert bench.hold.published > 3
-    assert bench.lines[1:] == [
-        f"deadman: {ARM}: the arm did not confirm hold. PRESS THE STOP BUTTON",
-        f"deadman: {ARM}: the arm has confirmed hold now",
-    ]
+    bench.run(lambda: bench.lines and "confirmed hold now" in bench.lines[-1])
+    assert bench.hold.published > 20
+    assert num_warnings(bench) == 20
+    assert bench.lines[1].endswith(f"PRESS THE STOP BUTTON. Process {os.getpid()} continues to send hold")
+    assert bench.lines[-1] == f"deadman: {ARM}: the arm has confirmed hold now"
+
+
+@pytest.mark.usefixtures("fast")
+def test_stop_ends_the_repetition_of_hold():
+    bench = Bench()
+    bench.hold.confirms = False
+    bench.send("servo_jf", 1)
+    bench.run(lambda: num_warnings(bench) == 3)
+    assert num_warnings(bench) == 3
+    assert "now" not in bench.lines[-1]
+
+
+@pytest.mark.usefixtures("fast")
+def test_hold_that_the_bridge_could_not_confirm_is_repeated():
+    bench = Bench()
+    bench.subscribed["operating_state"].num_publishers = lambda: num_warnings(bench) >= 3
+    bench.send("servo_jf", 5)
+    bench.send("hold", 6)
+    bridge, end = os.pipe()
+    os.write(end, b"\0")
+    os.close(end)
+    bench.run(lambda: False, bridge)
+    os.close(bridge)
+    assert "the bridge has ended; published hold at" in bench.lines[0]
+    assert bench.lines[-1] == f"deadman: {ARM}: the arm has confirmed hold now"
 
 
 def test_changes_of_the_connection_are_reported():

@@ -18,6 +18,8 @@ from own_network import inside, outside, run_inside
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
+from dvrk_drake.errors import DvrkDrakeError
+
 module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
 topic_module = pytest.importorskip("dvrk_drake.systems.ros.topic", reason="needs cyclonedds")
@@ -93,14 +95,18 @@ def test_endpoints_are_discovered(domain, arm):
         ),
     }
     assert domain.wait_until(lambda: set(domain.publishers()) == expected, TIMEOUT), domain.publishers()
-    command = module.Endpoint(ros_arm.COMMAND, "sensor_msgs/msg/JointState", True, False, joints, False)
-    assert domain.wait_until(lambda: domain.subscribers() == [command], TIMEOUT), domain.subscribers()
+    expected = {
+        module.Endpoint(ros_arm.COMMAND, "sensor_msgs/msg/JointState", True, False, joints, False),
+        module.Endpoint(ros_arm.HOLD, "std_msgs/msg/Empty", True, False, messages.type_hash(messages.Empty), False),
+    }
+    assert domain.wait_until(lambda: set(domain.subscribers()) == expected, TIMEOUT), domain.subscribers()
     assert domain.joint_state_topics() == {ros_arm.MEASURED: True}
     assert own.num_subscribers() == 0
     reader = domain.subscribe("/own", StringStamped, reliable=False)
     assert domain.wait_until(lambda: own.num_subscribers() == 1 and reader.num_publishers() == 1, TIMEOUT)
     best_effort = {(e.topic, e.reliable, e.is_own) for e in domain.subscribers()}
-    assert best_effort == {(ros_arm.COMMAND, True, False), ("/own", False, True)}
+    received = {(ros_arm.COMMAND, True, False), (ros_arm.HOLD, True, False)}
+    assert best_effort == received | {("/own", False, True)}
 
 
 @inside
@@ -312,3 +318,22 @@ def test_invalid_domain_is_refused(value, monkeypatch):
 @inside
 def test_configuration_of_the_user_is_kept(domain):
     assert os.environ["CYCLONEDDS_URI"] == DOMAIN_FILE
+
+
+@inside
+def test_lost_network_prints_nothing(monkeypatch, capfd):
+    peer = '<Peer address="192.0.2.1"/></Peers>'
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE.replace("</Peers>", peer))
+    ros = module.RosDomain(next(DOMAINS))
+    ros.wait_until(lambda: False, 1.5)  # three announcements to an address without a route
+    assert capfd.readouterr() == ("", "")
+
+
+@inside
+def test_reason_of_an_invalid_configuration_is_printed(monkeypatch, capfd):
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><Invalid/></Domain></CycloneDDS>")
+    with pytest.raises(DvrkDrakeError, match=r"ROS domain \d+ cannot be used; Cyclone DDS has printed the reason"):
+        module.RosDomain(next(DOMAINS))
+    printed = capfd.readouterr().err.splitlines()
+    assert len(printed) == 1
+    assert "Invalid: unknown element" in printed[0]
