@@ -109,14 +109,13 @@ def record(
         raise RecordingError("--lcm-url and --key cannot be used with --ros")
     if not ros and (topic is not None or domain is not None):
         raise RecordingError("--topic and --domain require --ros")
-    recorded = load_arm(arm)
+    recorded, line = load_arm(arm), LiveLine(sys.stderr)
     recorder: Recorder | RosRecorder
     if ros:
-        recorder = RosRecorder(recorded, file, topic, domain)
+        recorder = RosRecorder(recorded, file, topic, domain, _reporter(line))
     else:
         check_stream_output(file)
         recorder = Recorder(recorded, file, open_lcm(lcm_url).get_lcm_url(), load_key(key))
-    line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
     print(f"recording {recorded.name} on {recorder.source}; Ctrl-C ends the recording", flush=True)
     try:
@@ -278,8 +277,10 @@ def _visit_over_ros(
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey
+    from dvrk_drake.systems.ros.open_domain import domain_number
 
     quiet_drake()
+    domain_number(options.domain)  # rejects an invalid number before any other step
     settings = CrtkCollectionSettings(traverse_time, both_sides)
     if options.max_effort is not None:
         settings = CrtkCollectionSettings(traverse_time, both_sides, options.max_effort)

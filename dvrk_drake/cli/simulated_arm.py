@@ -124,7 +124,9 @@ def _run_ros_arm(arm: LoadedArm, options: SimulatedRos, pose: list[float] | None
     from dvrk_drake.processes.simulated_arm import start_pose, stop_on_signals
     from dvrk_drake.processes.simulated_ros_arm import SimulatedRosArm
     from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
+    from dvrk_drake.systems.ros.open_domain import domain_number
 
+    domain_number(options.domain)  # the driver has a different message, for its YAML file
     driver = CrtkDriver(domain=options.domain, namespace=options.topic or "", model=options.model or "")
     if options.rate is not None:
         driver.rate = options.rate

@@ -20,7 +20,7 @@ from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess
-from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0
@@ -355,8 +355,8 @@ def connect_bridge(
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
     compile_guard(arm, driver)
-    ros = RosDomain(domain)
-    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"))
+    ros = open_ros_domain(domain)
+    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"), report)
     deadman = DeadmanProcess(client.namespace, domain)
     report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
     return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)
