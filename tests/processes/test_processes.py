@@ -40,6 +40,7 @@ def test_pace_keeps_its_period_and_catches_up():
     assert np.abs(np.array(tick_times[:501]) - 1e-3 * np.arange(501)).max() < 1e-9
     assert np.abs(np.array(tick_times[-400:]) - 1e-3 * np.arange(600, 1000)).max() < 1e-9
     assert 9 <= pacer.late <= 15
+    assert (pacer.count, pacer.lost) == (1000, 0.0)
 
 
 def test_pace_continues_from_now_after_long_delay():
@@ -53,6 +54,9 @@ def test_pace_continues_from_now_after_long_delay():
         tick_times.append(clock.now - 110.0)
     np.testing.assert_allclose(tick_times, 1e-3 * np.arange(5), atol=1e-9)
     assert pacer.late == 1
+    assert pacer.describe() == (
+        "1 of 6 steps (16.7 %) started more than one period late, and the simulation was 10.0 s slower than real time"
+    )
 
 
 def test_missing_realtime_permissions_are_warnings(monkeypatch):
