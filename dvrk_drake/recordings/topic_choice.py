@@ -59,8 +59,8 @@ def choose_topic(source: str | Path, arm: Arm, topic: str | None, topics: Mappin
             "(topic= in Python)."
         )
     raise RecordingError(
-        f"{source}: has no topic /{arm.name}/{MEASURED_JS}. {available} Choose one with --topic TOPIC "
-        "(topic= in Python)."
+        f"{source}: has no topic /{arm.name}/{MEASURED_JS}. {available} Check --arm, or choose one "
+        "with --topic TOPIC (topic= in Python)."
     )
 
 

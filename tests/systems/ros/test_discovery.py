@@ -63,7 +63,7 @@ def test_topics_of_the_domain_are_listed_only_if_there_are_any():
     assert refused(domain, MTML) == f"{DOMAIN}: no topic /MTML/measured_js within 10 s. {advice}"
     assert domain.time == pytest.approx(10.0, abs=0.25)
     assert refused(SubstituteDomain(), MTML, "left/") == f"{DOMAIN}: no topic /left within 10 s. {advice}"
-    assert "Topics with JointState messages: /PSM1/measured_js. Choose one" in refused(
+    assert "Topics with JointState messages: /PSM1/measured_js. Check --arm, or choose one" in refused(
         SubstituteDomain(["/PSM1/measured_js"]), MTML
     )
 
