@@ -163,8 +163,8 @@ def test_dvrk_console_moves_to_the_poses(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--yes"], "--topic, --domain, --max-effort and --yes require --ros"),
-        (["--ros", "--reset"], "cannot be used with --ros"),
+        (["--yes"], "error: --yes requires --ros"),
+        (["--ros", "--reset"], "error: --reset cannot be used with --ros"),
         (["--ros", "--max-effort", "3"], "max_effort is 3; allowed: 0.05..2"),
     ],
 )
