@@ -2,7 +2,10 @@
 
 import contextlib
 import os
+import pty
+import select
 import signal
+import subprocess
 import sys
 
 import numpy as np
@@ -145,6 +148,43 @@ def test_interrupted_collection_continues_in_a_second_bag(tmp_path):
         output = collect(tmp_path, "--no-both-sides", poses=POSES[:2], code=2)
         end(other)
         assert "another process publishes /MTML/servo_jp" in output
+
+
+@inside
+@pytest.mark.parametrize("action", ["SIG_DFL", "SIG_IGN"])
+def test_closed_terminal_holds_the_arm(tmp_path, action):
+    """The kernel sends SIGHUP. If the shell has ignored this signal, the next output fails."""
+    with simulated_arm() as domain:
+        goals, hold = domain.subscribe("/MTML/move_jp", JointState), domain.subscribe("/MTML/hold", Empty, depth=10)
+        KEPT.extend((goals, hold))
+        terminal, child = pty.openpty()
+        command = [*COMMAND, "collect", "--ros", "--yes", "--arm", "mtml", *files(tmp_path), "--traverse-time", "5"]
+        shell = (
+            "import os, signal, sys\n"
+            f"os.login_tty({child})\n"
+            f"signal.signal(signal.SIGHUP, signal.{action})\n"
+            "os.execv(sys.executable, sys.argv[1:])"
+        )
+        process = subprocess.Popen([sys.executable, "-c", shell, *command], pass_fds=[child])
+        os.close(child)
+        output = b""
+
+        def moves():
+            nonlocal output
+            if select.select([terminal], [], [], 0.0)[0]:
+                output += os.read(terminal, 4096)
+            return len(goals.take()) > 0
+
+        try:
+            wait_until(moves, "the first goal", process)
+            assert not hold.take(), output
+            os.close(terminal)
+            wait_until(lambda: len(hold.take()) > 0, "hold")
+            process.wait(TIMEOUT)
+        finally:
+            process.kill()
+            process.wait()
+    assert len(read_recording(tmp_path / "p_1.mcap", MTML)) > 0
 
 
 @inside
