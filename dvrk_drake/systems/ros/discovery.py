@@ -23,12 +23,12 @@ _NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*/?")
 
 
 def topic_fault(name: str) -> str:
-    """Returns the reason why the name of a topic or namespace is not valid in ROS 2, or "" if it is valid."""
+    """Returns the end of a message if the name of a topic or namespace is not valid in ROS 2, otherwise ""."""
     if _NAME.fullmatch(name):
         return ""
     return (
-        f'"{name}" is not a name in ROS 2; allowed: names of letters, digits and underscores, separated by "/"; no '
-        "name begins with a digit"
+        f'is "{name}"; allowed: names of letters, digits and underscores, separated by "/". No name begins with a '
+        "digit."
     )
 
 
