@@ -88,7 +88,7 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     def report(line: str) -> None:
         print(line, flush=True)
 
-    namespace = find_arm(ros, load_arm(arm), topic, report)
+    namespace = find_arm(ros, load_arm(arm), topic, report=report)
     monitor = Deadman(ros, namespace, report)
     stopped = stop_on_signals()
     print(f"deadman of {namespace}; Ctrl-C ends it", flush=True)

@@ -151,6 +151,20 @@ def test_interrupted_collection_continues_in_a_second_bag(tmp_path):
 
 
 @inside
+@pytest.mark.parametrize("command", ["bridge", "collect", "record"])
+def test_interruption_ends_the_search_for_the_arm(command, tmp_path):
+    options = {"bridge": [], "collect": ["--ros", *files(tmp_path)], "record": [str(tmp_path / "a.mcap"), "--ros"]}
+    process = start(*COMMAND, command, *options[command], "--arm", "mtml", "--domain", "8")
+    lines = []
+    while not lines or lines[-1] != "searching for /MTML/measured_js in ROS domain 8\n":
+        lines.append(process.stdout.readline())
+        assert lines[-1], lines
+    output = end(process, signal.SIGINT)
+    assert output == "dvrk-drake: error: ROS domain 8: the search for /MTML/measured_js was stopped\n"
+    assert process.returncode == 2 and not list(tmp_path.glob("*.mcap"))
+
+
+@inside
 @pytest.mark.parametrize("action", ["SIG_DFL", "SIG_IGN"])
 def test_closed_terminal_holds_the_arm(tmp_path, action):
     """The kernel sends SIGHUP. If the shell has ignored this signal, the next output fails."""

@@ -337,6 +337,7 @@ def connect_bridge(
     topic: str | None = None,
     domain: int | None = None,
     report: Callable[[str], None] = lambda line: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> CrtkBridge:
     """Finds an arm on ROS 2 and connects a bridge with its deadman process.
 
@@ -347,6 +348,7 @@ def connect_bridge(
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         report: Function that is called with one line for each change of the state.
+        stopped: Function that returns whether to end the search for the arm.
 
     Returns:
         Bridge. Call `CrtkBridge.close` at the end.
@@ -356,7 +358,7 @@ def connect_bridge(
     """
     compile_guard(arm, driver)
     ros = open_ros_domain(domain)
-    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"), report)
+    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"), report=report, stopped=stopped)
     deadman = DeadmanProcess(client.namespace, domain)
     report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
     return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)

@@ -272,7 +272,12 @@ def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
 
 
 def find_arm(
-    domain: RosDomain, arm: Arm, topic: str | None = None, report: Callable[[str], None] = lambda line: None
+    domain: RosDomain,
+    arm: Arm,
+    topic: str | None = None,
+    *,
+    report: Callable[[str], None] = lambda line: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> str:
     """Waits until the arm's topic measured_js is discovered, and returns the namespace of the arm, e.g. "/PSM1".
 
@@ -281,11 +286,12 @@ def find_arm(
         arm: Arm to find.
         topic: Topic measured_js or its namespace; see `find_topic`.
         report: Function that is called with one line if the search takes longer than a second.
+        stopped: Function that returns whether to end the search.
 
     Raises:
         RecordingError: See `find_topic`.
     """
-    return find_topic(domain, arm, topic, report=report).rpartition("/")[0]
+    return find_topic(domain, arm, topic, report=report, stopped=stopped).rpartition("/")[0]
 
 
 def connect_client(
@@ -293,7 +299,9 @@ def connect_client(
     arm: Arm,
     topic: str | None,
     commands: Sequence[str],
+    *,
     report: Callable[[str], None] = lambda line: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> CrtkClient:
     """Finds an arm, and creates a client when the arm is present and no other process could move it.
 
@@ -303,13 +311,14 @@ def connect_client(
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         commands: Names of the commands to which the arm must subscribe, see `CrtkClient.unheard_commands`.
         report: Function that is called with one line if the search for the arm takes longer than a second.
+        stopped: Function that returns whether to end the search.
 
     Raises:
         RecordingError: See `find_topic`.
         ControllerError: Another process could move the arm, no operating state or measurement arrives, the joints do
             not fit, or no process receives the commands.
     """
-    namespace = find_arm(domain, arm, topic, report)
+    namespace = find_arm(domain, arm, topic, report=report, stopped=stopped)
     # The publishers of a new client would stop a bridge that already runs. So their check comes first. DDS considers a
     # killed process as present for about a second.
     if not domain.wait_until(lambda: not other_publishers(domain, arm, namespace), _ENDED):
