@@ -14,13 +14,14 @@ from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, o
 from dvrk_drake.cli.lcm import ControlledArm, ready_controller
 from dvrk_drake.cli.support import (
     check_output,
+    check_ros_options,
     interrupt_ends_process,
     load_key,
     print_notes,
     print_written,
     quiet_drake,
 )
-from dvrk_drake.errors import CollectionError, RecordingError
+from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -105,18 +106,14 @@ def record(
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.recordings.recording_stream import check_stream_output
 
-    if ros and (lcm_url or key):
-        raise RecordingError("--lcm-url and --key cannot be used with --ros")
-    if not ros and (topic is not None or domain is not None):
-        raise RecordingError("--topic and --domain require --ros")
-    recorded = load_arm(arm)
+    check_ros_options(ros, {"topic": topic, "domain": domain}, {"lcm_url": lcm_url, "key": key})
+    recorded, line = load_arm(arm), LiveLine(sys.stderr)
     recorder: Recorder | RosRecorder
     if ros:
-        recorder = RosRecorder(recorded, file, topic, domain)
+        recorder = RosRecorder(recorded, file, topic, domain, _reporter(line))
     else:
         check_stream_output(file)
         recorder = Recorder(recorded, file, open_lcm(lcm_url).get_lcm_url(), load_key(key))
-    line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
     print(f"recording {recorded.name} on {recorder.source}; Ctrl-C ends the recording", flush=True)
     try:
@@ -156,10 +153,8 @@ def collect(
         both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
         traverse_time: Time to move a joint over its full range, 1 to 60 s. This time defines the speed between poses.
     """
-    if not ros.ros and ros != _ROS:
-        raise CollectionError("--topic, --domain, --max-effort and --yes require --ros")
-    if ros.ros and (controlled.lcm_url or controlled.key or controlled.realtime or controlled.reset):
-        raise CollectionError("--lcm-url, --key, --realtime and --reset cannot be used with --ros")
+    lcm_only = {name: getattr(controlled, name) for name in ("lcm_url", "key", "realtime", "reset")}
+    check_ros_options(ros.ros, vars(ros) | {"ros": None}, lcm_only)
     if ros.ros and output is None:
         raise CollectionError(
             "--ros requires --output; --random needs no arm, and --teach needs LCM (dvrk-drake bridge)"
@@ -187,9 +182,11 @@ def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
     poses = load_poses_if_any(path, arm)
     # Near a joint limit the guard adds a restoring effort, and there is no room to approach a pose from both sides.
     added = arm.sample_poses(count, np.random.default_rng([seed, len(poses)]), margin=0.1)
-    poses = np.vstack([poses, added])
-    save_poses(poses, arm, path)
-    print_written(path, f"{len(poses)} poses of {arm.name}")
+    save_poses(np.vstack([poses, added]), arm, path)
+    if len(poses):
+        print(f"added {count} poses; {path} has {len(poses) + count} poses of {arm.name}", flush=True)
+    else:
+        print_written(path, f"{count} poses of {arm.name}")
 
 
 def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
@@ -278,8 +275,10 @@ def _visit_over_ros(
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey
+    from dvrk_drake.systems.ros.open_domain import domain_number
 
     quiet_drake()
+    domain_number(options.domain)  # rejects an invalid number before any other step
     settings = CrtkCollectionSettings(traverse_time, both_sides)
     if options.max_effort is not None:
         settings = CrtkCollectionSettings(traverse_time, both_sides, options.max_effort)

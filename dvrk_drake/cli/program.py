@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Sequence
 
 from cyclopts import (
+    CoercionError,
     CycloptsError,
     MissingArgumentError,
     UnknownCommandError,
@@ -109,6 +110,8 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
         message = "; ".join(f"{option} is now {renamed[option]}" for option in old)
     elif isinstance(error, UnknownCommandError):
         message = message.partition(" Available commands")[0].rstrip(".")
+    elif isinstance(error, CoercionError):
+        message = re.sub(r': unable to convert (".*") into float$', r": must be a number, not \1", message)
     elif isinstance(error, ValidationError):
         message = error.exception_message if error.group else message.replace(". must", ": must")
     elif isinstance(error, UnusedCliTokensError):

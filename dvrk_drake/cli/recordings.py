@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -20,6 +20,10 @@ from dvrk_drake.cli.support import (
     write_json,
 )
 from dvrk_drake.errors import RecordingError
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm as LoadedArm
+    from dvrk_drake.recordings.recording import Recording as LoadedRecording
 
 _FILE = FileOptions()
 
@@ -73,7 +77,10 @@ def check(
     if json is not None:
         write_json(json, report.as_dict())
     options = arm + locked_option(recorded_arm) + file.as_text()
-    print_report(make_console(), report, arm=options, verbose=verbose)
+    other = _other_arm(checked, recorded_arm)
+    print_report(
+        make_console(), report, arm=options, other_arm=f"{other}{file.as_text()}" if other else "", verbose=verbose
+    )
     if json is not None:
         print_written(json)
     if folder is not None:
@@ -87,6 +94,23 @@ def check(
         print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:
         raise RecordingError(report.refusal)
+
+
+def _other_arm(recording: LoadedRecording, arm: LoadedArm) -> str:
+    """Returns the arm of a recording that is outside the limits of `arm`, "ARM" if several arms fit, "" if none."""
+    from dvrk_drake.models.arm_files import known_arms
+
+    def fits(tested: LoadedArm) -> bool:
+        try:
+            recording.check_fits(tested)
+        except RecordingError:
+            return False
+        return True
+
+    if arm.locked_joints or fits(arm):
+        return ""
+    fitting = [name for name in known_arms() if fits(dvrk.load_arm(name))]
+    return fitting[0] if len(fitting) == 1 else "ARM" if fitting else ""
 
 
 @app.command(group=IDENTIFY)

@@ -39,6 +39,7 @@ def bridge(
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import load_driver, stop_on_signals
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.ros.open_domain import domain_number
 
     def ready() -> None:
         if realtime:
@@ -47,6 +48,7 @@ def bridge(
         settle_memory()
 
     quiet_drake()
+    domain_number(domain)  # rejects an invalid number before any other step
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
     configuration.model = model or configuration.model
@@ -83,8 +85,11 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     ros = open_ros_domain(domain)
     from dvrk_drake.systems.ros.crtk_client import find_arm
 
-    namespace = find_arm(ros, load_arm(arm), topic)
-    monitor = Deadman(ros, namespace, lambda line: print(line, flush=True))
+    def report(line: str) -> None:
+        print(line, flush=True)
+
+    namespace = find_arm(ros, load_arm(arm), topic, report=report)
+    monitor = Deadman(ros, namespace, report)
     stopped = stop_on_signals()
     print(f"deadman of {namespace}; Ctrl-C ends it", flush=True)
     monitor.run(stopped)

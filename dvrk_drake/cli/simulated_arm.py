@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, app, whole_number
-from dvrk_drake.cli.support import interrupt_ends_process, mounted, print_warning, quiet_drake
+from dvrk_drake.cli.support import check_ros_options, interrupt_ends_process, mounted, print_warning, quiet_drake
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm as LoadedArm
@@ -79,7 +79,6 @@ def arm(
         pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.
         meshcat: Show the arm in a web browser.
     """
-    from dvrk_drake.errors import StationError
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import live_view
@@ -88,14 +87,12 @@ def arm(
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
     quiet_drake()
+    lcm_only = {"driver": driver, "lcm_url": lcm_url, "key": key, "meshcat": meshcat}
+    check_ros_options(ros.ros, vars(ros) | {"ros": None}, lcm_only)
     simulated_arm = mounted(load_arm(arm), gravity)
     if ros.ros:
-        if driver or lcm_url or key or meshcat:
-            raise StationError("--driver, --lcm-url, --key and --meshcat cannot be used with --ros")
         _run_ros_arm(simulated_arm, ros, pose, realtime)
         return
-    if ros != _ROS:
-        raise StationError("--topic, --domain, --rate, --model, --effects and --enabled require --ros")
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
     start = start_pose(simulated_arm, pose)
@@ -111,7 +108,7 @@ def arm(
         settle_memory()
         print(f"simulated {simulated_arm.name} on LCM {url}; press Ctrl-C to end", flush=True)
         pace = simulated.run(stopped, lambda line: print(line, flush=True))
-    print(f"ended; {pace.late} steps started more than one period late", flush=True)
+    print(f"ended; {pace.describe()}", flush=True)
 
 
 def _run_ros_arm(arm: LoadedArm, options: SimulatedRos, pose: list[float] | None, realtime: bool) -> None:
@@ -124,7 +121,9 @@ def _run_ros_arm(arm: LoadedArm, options: SimulatedRos, pose: list[float] | None
     from dvrk_drake.processes.simulated_arm import start_pose, stop_on_signals
     from dvrk_drake.processes.simulated_ros_arm import SimulatedRosArm
     from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
+    from dvrk_drake.systems.ros.open_domain import domain_number
 
+    domain_number(options.domain)  # the driver has a different message, for its YAML file
     driver = CrtkDriver(domain=options.domain, namespace=options.topic or "", model=options.model or "")
     if options.rate is not None:
         driver.rate = options.rate
@@ -141,4 +140,4 @@ def _run_ros_arm(arm: LoadedArm, options: SimulatedRos, pose: list[float] | None
     settle_memory()
     print(f"simulated {arm.name} on {simulated.source}; press Ctrl-C to end", flush=True)
     pace = simulated.run(stopped, lambda line: print(line, flush=True))
-    print(f"ended; {pace.late} steps started more than one period late", flush=True)
+    print(f"ended; {pace.describe()}", flush=True)

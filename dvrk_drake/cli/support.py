@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -79,6 +79,29 @@ def interrupt_ends_process() -> Iterator[None]:
 def quiet_drake() -> None:
     """Disables Drake's log messages. Importing Drake sets the log level, so call this function after the import."""
     logging.getLogger("drake").setLevel(logging.WARNING)
+
+
+def check_ros_options(ros: bool, ros_only: Mapping[str, object], lcm_only: Mapping[str, object]) -> None:
+    """Rejects options that do not apply with or without --ros. The message contains only options that were given.
+
+    Args:
+        ros: Whether --ros was given.
+        ros_only: Values of the options that require --ros, by name. None, "" or False: the option was not given.
+        lcm_only: Values of the options that cannot be used with --ros, by name.
+
+    Raises:
+        DvrkDrakeError: An option does not apply.
+    """
+    values = lcm_only if ros else ros_only
+    given = [
+        f"--{name.replace('_', '-')}"
+        for name, value in values.items()
+        if not (value is None or value is False or value == "")
+    ]
+    if given:
+        names = " and ".join(filter(None, [", ".join(given[:-1]), given[-1]]))
+        verb = "cannot be used with" if ros else "requires" if len(given) == 1 else "require"
+        raise DvrkDrakeError(f"{names} {verb} --ros")
 
 
 def load_key(path: str | None) -> MessageKey | None:

@@ -66,7 +66,7 @@ def run_bridge(
                 problem = f"LCM {url}: the status could not be sent: {error.strerror}"
                 report(problem)
 
-    bridge = connect_bridge(arm, driver, send_status, topic=topic, domain=domain, report=report)
+    bridge = connect_bridge(arm, driver, send_status, topic=topic, domain=domain, report=report, stopped=stopped)
     try:
         network.subscribe(command_channel(arm), lambda channel, data: bridge.put(data)).set_queue_capacity(_QUEUE)
         while not stopped():

@@ -150,7 +150,7 @@ def run_crtk_collection(
     control_model.gravity_effort(np.zeros(arm.num_joints))  # compiles the function
     remaining = poses[~output.finished(poses)]
     ros = open_ros_domain(domain)
-    client = _connect(ros, arm, topic)
+    client = _connect(ros, arm, topic, dialog)
     assert client.measurement is not None
     for line in summary(arm, client.measurement.q, remaining, settings):
         dialog.report(line)
@@ -181,7 +181,7 @@ def run_crtk_collection(
     return collector
 
 
-def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
+def _connect(ros: RosDomain, arm: Arm, topic: str | None, dialog: Dialog) -> CrtkClient:
     """Returns a client of an arm that is enabled and homed.
 
     Raises:
@@ -189,7 +189,7 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None) -> CrtkClient:
     """
     from dvrk_drake.systems.ros.crtk_client import connect_client
 
-    client = connect_client(ros, arm, topic, ("move_jp", "hold"))
+    client = connect_client(ros, arm, topic, ("move_jp", "hold"), report=dialog.report, stopped=dialog.stopped)
 
     def is_ready() -> bool:
         client.receive()

@@ -23,7 +23,9 @@ class Pace:
     continues from the current time.
 
     Attributes:
+        count: Number of ticks.
         late: Number of ticks that began more than a period late.
+        lost: Time that was not caught up, because the loop was more than 0.1 s late [s].
     """
 
     def __init__(
@@ -41,18 +43,29 @@ class Pace:
         """
         self._period, self._clock, self._sleep = period, clock, sleep
         self._next = clock()
-        self.late = 0
+        self.count = self.late = 0
+        self.lost = 0.0
 
     def wait(self) -> None:
         """Waits until the next tick."""
+        self.count += 1
         now = self._clock()
         if now < self._next:
             self._sleep(self._next - now)
         elif now > self._next + self._period:
             self.late += 1
             if now > self._next + _MAX_DELAY:
+                self.lost += now - self._next
                 self._next = now
         self._next += self._period
+
+    def describe(self) -> str:
+        """Returns the share of late ticks, and the time by which a simulation was slower than real time."""
+        share = 100 * self.late / max(self.count, 1)
+        return (
+            f"{self.late} of {self.count} steps ({share:.1f} %) started more than one period late, and the simulation "
+            f"was {self.lost:.1f} s slower than real time"
+        )
 
 
 def make_realtime() -> list[str]:

@@ -12,7 +12,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.recorder import FIRST_STATUS, Rate
 from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
 from dvrk_drake.recordings.recording_stream import check_stream_output
-from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
+from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 _POLL = 0.1
 #: Messages of one topic that may arrive while the recorder writes. Older messages are lost.
 _DEPTH = 5000
-#: Time to wait for other fitting topics after the first one was discovered [s].
-_DISCOVERY = 1.0
 
 
 class RosRecorder:
@@ -35,7 +33,14 @@ class RosRecorder:
         num_rows: Number of recorded valid messages of the arm, without those on a separate topic, e.g. of the jaw.
     """
 
-    def __init__(self, arm: Arm, path: str | Path, topic: str | None = None, domain: int | None = None) -> None:
+    def __init__(
+        self,
+        arm: Arm,
+        path: str | Path,
+        topic: str | None = None,
+        domain: int | None = None,
+        report: Callable[[str], None] = lambda line: None,
+    ) -> None:
         """Creates a recorder. The file is created when the topic of the arm is found.
 
         Args:
@@ -44,6 +49,7 @@ class RosRecorder:
             topic: JointState topic or its namespace. Default: the only topic `/<ARM>/measured_js`, in any namespace,
                 where ARM is the name of the arm, optionally followed by a number.
             domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+            report: Function that is called with one line if the search for the arm takes longer than a second.
 
         Raises:
             RecordingError: A new bag cannot be created at `path`.
@@ -51,6 +57,7 @@ class RosRecorder:
         """
         check_stream_output(path, (".mcap",))
         self._arm, self._path, self._topic = arm, path, topic
+        self._report = report
         self._domain = open_ros_domain(domain)
         self.source = self._domain.name
         self.num_rows = 0
@@ -70,8 +77,8 @@ class RosRecorder:
                 function that returns the text of the status line.
 
         Raises:
-            RecordingError: No topic or several topics fit, no valid message arrived within 10 s, the messages have
-                other joints, or the file cannot be written.
+            RecordingError: The arm was not found, see `find_topic`. No valid message arrived within 10 s, the messages
+                have other joints, or the file cannot be written.
         """
         self._subscribe(stopped)
         end = time.monotonic() + FIRST_STATUS
@@ -114,16 +121,8 @@ class RosRecorder:
         """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one."""
         from dvrk_drake.systems.ros.messages import JointState
 
-        start, found = time.monotonic(), None
-        topics: dict[str, bool] = {}
-        while not stopped():
-            topics, now = self._domain.joint_state_topics(), time.monotonic()
-            if found is None and fitting_topics(self._arm, self._topic, topics):
-                found = now
-            if now > (start + FIRST_STATUS if found is None else found + _DISCOVERY):
-                break
-            self._domain.wait(_POLL)
-        main = choose_topic(self.source, self._arm, self._topic, {name: name for name in topics})
+        main = find_topic(self._domain, self._arm, self._topic, stopped=stopped, report=self._report)
+        topics = self._domain.joint_state_topics()
         others = joint_state_topics(self._arm, main.rpartition("/")[0])[1:]
         for name in (main, *(topic.name for topic in others)):
             subscription = self._domain.subscribe(name, JointState, depth=_DEPTH, reliable=topics.get(name, True))

@@ -191,8 +191,12 @@ class SimulatedArm:
 
 
 def stop_on_signals() -> Callable[[], bool]:
-    """Handles SIGINT and SIGTERM. Returns a function that returns whether one of them was received."""
+    """Handles SIGINT, SIGTERM and SIGHUP. Returns a function that returns whether one of them was received.
+
+    A closed terminal sends SIGHUP. With nohup, SIGHUP stays ignored.
+    """
     received: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: received.append(number))
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda number, frame: received.append(number))
     return lambda: bool(received)

@@ -131,10 +131,13 @@ class CollectionFile:
             both_sides: Whether each pose is measured from both approach directions.
 
         Raises:
-            CollectionError: The file is not a collection of this arm with this setting of `both_sides`.
+            CollectionError: The file name does not end in .csv, or the file is not a collection of this arm with this
+                setting of `both_sides`.
             RecordingError: The file cannot be read.
         """
         self._path, self._arm, self._both_sides = Path(path), arm, both_sides
+        if self._path.suffix != ".csv":
+            raise CollectionError(f"{path}: a collection is a table; the file name must end in .csv")
         self._header = [*self._names("q"), *self._names("tau"), *self._names("pose"), "arm", "utime"]
         if both_sides:
             self._header += self._names("friction")

@@ -141,8 +141,8 @@ class Recording:
         """
         if self.tau is None:
             raise RecordingError(
-                f"{self.source or 'recording'} has no efforts; needs columns tau1..tau{self.q.shape[1]}, an array tau, "
-                "or efforts in the messages"
+                f"{self.source and f'{self.source}: '}the recording has no efforts; needs columns "
+                f"tau1..tau{self.q.shape[1]}, an array tau, or efforts in the messages"
             )
         return self.tau
 

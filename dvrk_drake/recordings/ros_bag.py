@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 import struct
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,6 +25,7 @@ from dvrk_drake.models.files import open_input
 from dvrk_drake.models.locked_joints import check_held, lock_hint
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.topic_choice import choose_topic
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -66,8 +66,8 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
             name of the arm, optionally followed by a number.
 
     Raises:
-        RecordingError: The bag is damaged or empty, no topic or several topics match, or the messages do not fit
-            the arm.
+        RecordingError: The bag is damaged or empty, no topic or several topics match, the topic is in the namespace of
+            another arm, or the messages do not fit the arm.
     """
     arm, skip_invalid, progress = options.required_arm(path), options.skip_invalid, options.progress
     reader = _Bag(path)
@@ -181,50 +181,6 @@ class _Connections(NamedTuple):
     @property
     def msgcount(self) -> int:
         return sum(connection.msgcount for connection in self.connections)
-
-
-def fitting_topics(arm: Arm, topic: str | None, names: Iterable[str]) -> list[str]:
-    """Returns the JointState topics that fit, see `read_ros_bag`.
-
-    Args:
-        arm: Arm whose joints are read. Used only if `topic` is None.
-        topic: Topic or its namespace, or None.
-        names: Names of the available topics.
-    """
-    if topic is not None:
-        topic = f"/{topic.strip('/')}"
-        return [name for name in (topic, f"{topic}/measured_js") if name in names][:1]
-    pattern = re.compile(rf"(/.*)?/{re.escape(arm.name)}[0-9]*/measured_js")
-    # A dVRK cart publishes the joints of a setup joint arm on /SUJ/<ARM>/measured_js.
-    return [name for name in names if pattern.fullmatch(name) and "/SUJ/" not in name]
-
-
-def choose_topic(source: str | Path, arm: Arm, topic: str | None, topics: Mapping[str, str]) -> str:
-    """Returns the only JointState topic that fits, see `fitting_topics`.
-
-    Args:
-        source: Bag or network with the topics, for messages.
-        arm: Arm whose joints are read.
-        topic: Topic or its namespace. None: the topic of the arm.
-        topics: Mapping from the name of each topic to its description, for messages.
-
-    Raises:
-        RecordingError: No topic fits, or several topics.
-    """
-    fitting = fitting_topics(arm, topic, topics)
-    if len(fitting) == 1:
-        return fitting[0]
-    available = f"Topics with JointState messages: {', '.join(topics.values()) or 'none'}."
-    if topic is not None:
-        raise RecordingError(f"{source}: has no JointState topic {topic}. {available}")
-    if fitting:
-        raise RecordingError(
-            f"{source}: several topics fit {arm.name}: {', '.join(fitting)}. Choose one with --topic TOPIC "
-            "(topic= in Python)."
-        )
-    raise RecordingError(
-        f"{source}: has no topic /{arm.name}/measured_js. {available} Choose one with --topic TOPIC (topic= in Python)."
-    )
 
 
 def _read_topic(bag: _Bag, connections: _Connections, skip_invalid: bool, progress: Callable[[int], object]) -> _Topic:

@@ -10,7 +10,9 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 _STYLES = {"refusal": "red", "warning": "yellow", "note": ""}
 
 
-def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM", verbose: bool = False) -> None:
+def print_report(
+    console: Console, report: RecordingReport, *, arm: str = "ARM", other_arm: str = "", verbose: bool = False
+) -> None:
     """Prints whether a recording is usable, the warnings, and the position range and effort of each joint.
 
     Refusals are not printed, because the command prints them on stderr. docs/checking_a_recording.md defines all
@@ -20,9 +22,10 @@ def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM",
         console: Console to print to.
         report: Report to print.
         arm: Value of --arm and further options, for the suggested next command.
+        other_arm: As `arm`, for another arm to which the recording probably belongs, or "".
         verbose: Whether to print the notes, and the signal properties of each actuator.
     """
-    _print_verdict(console, report, arm)
+    _print_verdict(console, report, arm, other_arm)
     notes = [finding for finding in report.findings if finding.severity == "note"]
     for finding in [*report.warnings, *(notes if verbose else [])]:
         console.print(str(finding), style=_STYLES[finding.severity], markup=False, soft_wrap=True)
@@ -38,7 +41,7 @@ def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM",
         _print_signals(console, report)
 
 
-def _print_verdict(console: Console, report: RecordingReport, arm: str) -> None:
+def _print_verdict(console: Console, report: RecordingReport, arm: str, other_arm: str) -> None:
     what = f"{report.rows} rows of {report.kind}"
     if report.rate is not None and report.duration is not None:
         what = f"motion of {report.rows} rows, {report.duration:.2f} s at {report.rate:.4g} Hz"
@@ -46,7 +49,7 @@ def _print_verdict(console: Console, report: RecordingReport, arm: str) -> None:
     verdict, style, found = "usable", "green", report.warnings
     if report.refusals:
         verdict, style, found = "unusable", "red", report.refusals
-        next_command = f"dvrk-drake check OTHER.csv --arm {arm}"
+        next_command = f"dvrk-drake check {report.source if other_arm else 'OTHER.csv'} --arm {other_arm or arm}"
     elif report.warnings:
         verdict, style = f"usable with {_count(len(report.warnings), 'warning')}", "yellow"
     kinds = ", ".join(dict.fromkeys(finding.kind for finding in found))

@@ -1,6 +1,7 @@
 """Pace, network and start of the processes."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -17,7 +18,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import pace
 from dvrk_drake.processes.lcm_network import open_lcm
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
-from dvrk_drake.processes.simulated_arm import load_driver, start_pose
+from dvrk_drake.processes.simulated_arm import load_driver, start_pose, stop_on_signals
 
 
 class Clock:
@@ -40,6 +41,7 @@ def test_pace_keeps_its_period_and_catches_up():
     assert np.abs(np.array(tick_times[:501]) - 1e-3 * np.arange(501)).max() < 1e-9
     assert np.abs(np.array(tick_times[-400:]) - 1e-3 * np.arange(600, 1000)).max() < 1e-9
     assert 9 <= pacer.late <= 15
+    assert (pacer.count, pacer.lost) == (1000, 0.0)
 
 
 def test_pace_continues_from_now_after_long_delay():
@@ -53,6 +55,32 @@ def test_pace_continues_from_now_after_long_delay():
         tick_times.append(clock.now - 110.0)
     np.testing.assert_allclose(tick_times, 1e-3 * np.arange(5), atol=1e-9)
     assert pacer.late == 1
+    assert pacer.describe() == (
+        "1 of 6 steps (16.7 %) started more than one period late, and the simulation was 10.0 s slower than real time"
+    )
+
+
+@pytest.mark.parametrize(
+    ("number", "before", "is_stopped"),
+    [
+        (signal.SIGINT, signal.SIG_DFL, True),
+        (signal.SIGTERM, signal.SIG_DFL, True),
+        (signal.SIGHUP, signal.SIG_DFL, True),
+        (signal.SIGHUP, signal.SIG_IGN, False),  # nohup
+    ],
+)
+def test_signals_stop_a_process(number, before, is_stopped):
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    handlers = {each: signal.getsignal(each) for each in numbers}
+    try:
+        signal.signal(number, before)
+        stopped = stop_on_signals()
+        assert not stopped()
+        signal.raise_signal(number)
+        assert stopped() == is_stopped
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
 
 
 def test_missing_realtime_permissions_are_warnings(monkeypatch):

@@ -15,6 +15,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import ros_recorder as module
 from dvrk_drake.processes.ros_recorder import RosRecorder
 from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.systems.ros import discovery
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages_module = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
@@ -65,7 +66,7 @@ def test_recording_has_the_published_numbers(publisher, tmp_path):
 
 
 def test_messages_name_the_topics_that_exist(publisher, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "FIRST_STATUS", 2.0)
+    monkeypatch.setattr(discovery, "_DISCOVERY", 2.0)
     found = r"Topics with JointState messages: /dvrk/PSM1/jaw/measured_js, /dvrk/PSM1/measured_js\."
     for arm, topic, problem in (("mtml", None, "has no topic /MTML/measured_js"), ("psm", "/PSM3", "topic /PSM3")):
         recorder = RosRecorder(load_arm(arm), tmp_path / "a.mcap", topic, publisher)
@@ -99,11 +100,15 @@ class SubstituteDomain:
     def wait(self, seconds):
         pass
 
+    def wait_until(self, condition, seconds):
+        return condition()
+
 
 @pytest.fixture
 def record(tmp_path, monkeypatch):
     """Records the messages of a substitute domain and returns the recorder and the status lines."""
-    monkeypatch.setattr(module, "_DISCOVERY", 0.0)
+    monkeypatch.setattr(discovery, "_OTHERS", 0.0)
+    monkeypatch.setattr(discovery, "_DISCOVERY", 1.0)
     monkeypatch.setattr(module, "FIRST_STATUS", 0.5)
 
     def run(messages, **options):
@@ -143,7 +148,9 @@ def test_missing_jaw_is_noted(record):
         ({TOPIC: [(JointState(), 1)] * 4}, {}, "all 4 messages have header stamp 0 .* Home the arm first"),
         ({TOPIC: []}, {}, f"no message within 0 s on {TOPIC} of ROS domain 0"),
         ({TOPIC: [], "/PSM2/measured_js": []}, {}, "several topics fit PSM: /PSM1/measured_js, /PSM2/measured_js"),
-        ({TOPIC: []}, {"topic": "/MTML"}, r"has no JointState topic /MTML\. Topics .*: /PSM1/measured_js\."),
+        ({TOPIC: []}, {"topic": "/PSM3"}, r"has no JointState topic /PSM3\. Topics .*: /PSM1/measured_js\."),
+        ({TOPIC: []}, {"topic": "/MTML"}, "/MTML is the namespace of the arm MTML, not of PSM. Choose --arm mtml"),
+        ({}, {}, "no topic /PSM/measured_js within 1 s. Start the dVRK's console"),
     ],
 )
 def test_what_cannot_be_recorded_is_refused(record, tmp_path, messages, options, error):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from sticky_arm import random_poses
 
+from dvrk_drake.cli import main
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import CollectionFile
+from dvrk_drake.recordings.pose_file import CollectionFile, save_poses
 from dvrk_drake.recordings.reading import read_recording
 
 ARMS = ("mtml", "psm")
@@ -55,6 +56,22 @@ def test_incomplete_last_row_is_measured_again(cut, tmp_path):
     again.close()
     rows = [line.rsplit(",", 8)[0] for line in path.read_text().splitlines()]  # without utime and friction
     assert rows == [line.rsplit(",", 8)[0] for line in whole.decode().splitlines()]
+
+
+@pytest.mark.parametrize("ros", [[], ["--ros"]])
+@pytest.mark.parametrize("name", ["o.mcap", "o.yaml", "o"])
+def test_output_must_be_a_csv(name, ros, tmp_path, capsys):
+    arm, poses, output = load_arm("mtml"), tmp_path / "p.yaml", tmp_path / name
+    save_poses(random_poses(arm, 2), arm, poses)
+    for content in (None, b"\x89MCAP0\r\n"):
+        if content is not None:
+            output.write_bytes(content)
+        # The command ends before it searches for the arm.
+        assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--output", str(output), *ros]) == 2
+        captured = capsys.readouterr()
+        expected = f"dvrk-drake: error: {output}: a collection is a table; the file name must end in .csv\n"
+        assert (captured.out, captured.err) == ("", expected)
+    assert output.read_bytes() == content
 
 
 def test_other_existing_output_is_refused_and_unchanged(tmp_path):

@@ -66,12 +66,14 @@ def test_poses_in_millimetres_are_refused(tmp_path):
         load_poses(tmp_path / "p.yaml", load_arm("psm"))
 
 
-def test_random_poses_are_appended_and_depend_on_the_seed(tmp_path):
+def test_random_poses_are_appended_and_depend_on_the_seed(tmp_path, capsys):
     path, arm = tmp_path / "p.yaml", load_arm("psm")
     command = ["collect", "--arm", "psm", "--poses", str(path), "--random"]
     assert main([*command, "5", "--seed", "3"]) == 0
+    assert capsys.readouterr().out == f"wrote {path}: 5 poses of PSM\n"
     first = load_poses(path, arm)
     assert main([*command, "4", "--seed", "4"]) == 0
+    assert capsys.readouterr().out == f"added 4 poses; {path} has 9 poses of PSM\n"
     both = load_poses(path, arm)
     np.testing.assert_array_equal(both[:5], first)
     np.testing.assert_array_equal(both[5:], random_poses(arm, 4, seed=[4, 5]))  # another seed than for an empty file

@@ -56,9 +56,11 @@ def test_blank_lines_do_not_shift_line_numbers(tmp_path):
 def test_missing_efforts_are_reported_when_required(tmp_path):
     path = write_text(tmp_path, ",".join(Q_NAMES) + "\n" + ",".join(["0"] * 7) + "\n")
     recording = read_recording(path)
-    with pytest.raises(RecordingError, match=r"recording\.csv has no efforts; needs columns tau1\.\.tau7"):
+    with pytest.raises(
+        RecordingError, match=r"recording\.csv: the recording has no efforts; needs columns tau1\.\.tau7"
+    ):
         recording.measured_effort()
-    with pytest.raises(RecordingError, match=r"^recording has no efforts"):
+    with pytest.raises(RecordingError, match=r"^the recording has no efforts"):
         replace(recording, source="").measured_effort()
 
 

@@ -132,6 +132,17 @@ def test_finds_the_arm_in_a_namespace(mtm, tmp_path):
     np.testing.assert_array_equal(read_recording(path, mtm).q, q)
 
 
+def test_refuses_the_namespace_of_another_arm(mtm, tmp_path):
+    q, qd, tau = blocks(5, 7)
+    topics = {f"{name}/measured_js": joint_states(stamps(5), mtm.joint_names, q, qd, tau) for name in ("/MTML", "/m")}
+    path = write_bag(tmp_path, "mcap", topics)
+    other = load_arm("mtmr")
+    for topic in ("/MTML", "/MTML/measured_js"):
+        with pytest.raises(RecordingError, match=r"/MTML is the namespace of the arm MTML, not of MTMR"):
+            read_recording(path, other, topic=topic)
+    np.testing.assert_array_equal(read_recording(path, other, topic="/m").q, q)
+
+
 def test_omits_invalid_and_repeated_stamps(mtm, tmp_path):
     q, qd, tau = blocks(10, 7)
     times = stamps(10)

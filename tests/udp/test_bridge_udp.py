@@ -75,12 +75,14 @@ def start_efforts(arm, folder, console, *options):
 
 @inside
 def test_wrong_domain_topic_and_arm_end_with_one_line(tmp_path):
-    """No publisher exists in the first case; in the others, another arm is there."""
+    """The first two cases wait for a publisher, the others do not."""
     cases = {
-        ("mtml", "--domain", "77"): "error: ROS domain 77: has no topic /MTML/measured_js. Topics with JointState "
-        "messages: none. Choose one with --topic TOPIC (topic= in Python).",
-        ("mtml", "--topic", "/MTMX"): "error: ROS domain 0: has no JointState topic /MTMX. Topics with JointState "
-        "messages: none.",
+        ("mtml", "--domain", "77"): "error: ROS domain 77: no topic /MTML/measured_js within 10 s. Start the dVRK's "
+        "console, or check --domain and the network",
+        ("mtml", "--topic", "/MTMX"): "error: ROS domain 0: no topic /MTMX within 10 s. Start the dVRK's console, or "
+        "check --domain and the network",
+        ("mtml", "--topic", "/MTMR"): "error: ROS domain 0: /MTMR is the namespace of the arm MTMR, not of MTML. "
+        "Choose --arm mtmr, or the namespace of MTML with --topic (topic= in Python).",
         ("mtml", "--domain", "300"): "error: ROS domain 300: allowed: 0 to 232 (--domain, or ROS_DOMAIN_ID)",
     }
     start = time.monotonic()
@@ -89,8 +91,12 @@ def test_wrong_domain_topic_and_arm_end_with_one_line(tmp_path):
         for case, process in processes.items():
             assert process.wait() == 2
             lines = [line for line in process.output().splitlines() if "warning: " not in line]
+            if case[2] == "300":  # found before any other step
+                lines.insert(0, "connecting MTML to LCM")
             assert lines[0].startswith("connecting MTML to LCM")
-            assert lines[1:] == [f"dvrk-drake: {cases[case]}"]
+            searching = [line for line in lines[1:] if line.startswith("searching for /MTM")]
+            assert len(searching) == ("within 10 s" in cases[case])
+            assert lines[1 + len(searching) :] == [f"dvrk-drake: {cases[case]}"]
     # Most of this time is the longest time for discovery, 10 s.
     assert time.monotonic() - start < 60.0
 

@@ -2,7 +2,10 @@
 
 import contextlib
 import os
+import pty
+import select
 import signal
+import subprocess
 import sys
 
 import numpy as np
@@ -148,6 +151,57 @@ def test_interrupted_collection_continues_in_a_second_bag(tmp_path):
 
 
 @inside
+@pytest.mark.parametrize("command", ["bridge", "collect", "record"])
+def test_interruption_ends_the_search_for_the_arm(command, tmp_path):
+    options = {"bridge": [], "collect": ["--ros", *files(tmp_path)], "record": [str(tmp_path / "a.mcap"), "--ros"]}
+    process = start(*COMMAND, command, *options[command], "--arm", "mtml", "--domain", "8")
+    lines = []
+    while not lines or lines[-1] != "searching for /MTML/measured_js in ROS domain 8\n":
+        lines.append(process.stdout.readline())
+        assert lines[-1], lines
+    output = end(process, signal.SIGINT)
+    assert output == "dvrk-drake: error: ROS domain 8: the search for /MTML/measured_js was stopped\n"
+    assert process.returncode == 2 and not list(tmp_path.glob("*.mcap"))
+
+
+@inside
+@pytest.mark.parametrize("action", ["SIG_DFL", "SIG_IGN"])
+def test_closed_terminal_holds_the_arm(tmp_path, action):
+    """The kernel sends SIGHUP. If the shell has ignored this signal, the next output fails."""
+    with simulated_arm() as domain:
+        goals, hold = domain.subscribe("/MTML/move_jp", JointState), domain.subscribe("/MTML/hold", Empty, depth=10)
+        KEPT.extend((goals, hold))
+        terminal, child = pty.openpty()
+        command = [*COMMAND, "collect", "--ros", "--yes", "--arm", "mtml", *files(tmp_path), "--traverse-time", "5"]
+        shell = (
+            "import os, signal, sys\n"
+            f"os.login_tty({child})\n"
+            f"signal.signal(signal.SIGHUP, signal.{action})\n"
+            "os.execv(sys.executable, sys.argv[1:])"
+        )
+        process = subprocess.Popen([sys.executable, "-c", shell, *command], pass_fds=[child])
+        os.close(child)
+        output = b""
+
+        def moves():
+            nonlocal output
+            if select.select([terminal], [], [], 0.0)[0]:
+                output += os.read(terminal, 4096)
+            return len(goals.take()) > 0
+
+        try:
+            wait_until(moves, "the first goal", process)
+            assert not hold.take(), output
+            os.close(terminal)
+            wait_until(lambda: len(hold.take()) > 0, "hold")
+            process.wait(TIMEOUT)
+        finally:
+            process.kill()
+            process.wait()
+    assert len(read_recording(tmp_path / "p_1.mcap", MTML)) > 0
+
+
+@inside
 def test_dvrk_console_moves_to_the_poses(tmp_path):
     with start_console("MTML", tmp_path, rate=100.0, motion=True) as console:
         output = collect(tmp_path, poses=POSES[:2], code=2)
@@ -163,8 +217,8 @@ def test_dvrk_console_moves_to_the_poses(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--yes"], "--topic, --domain, --max-effort and --yes require --ros"),
-        (["--ros", "--reset"], "cannot be used with --ros"),
+        (["--yes"], "error: --yes requires --ros"),
+        (["--ros", "--reset"], "error: --reset cannot be used with --ros"),
         (["--ros", "--max-effort", "3"], "max_effort is 3; allowed: 0.05..2"),
     ],
 )

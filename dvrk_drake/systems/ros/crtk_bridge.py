@@ -20,7 +20,7 @@ from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess
-from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0
@@ -341,6 +341,7 @@ def connect_bridge(
     topic: str | None = None,
     domain: int | None = None,
     report: Callable[[str], None] = lambda line: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> CrtkBridge:
     """Finds an arm on ROS 2 and connects a bridge with its deadman process.
 
@@ -351,6 +352,7 @@ def connect_bridge(
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         report: Function that is called with one line for each change of the state.
+        stopped: Function that returns whether to end the search for the arm.
 
     Returns:
         Bridge. Call `CrtkBridge.close` at the end.
@@ -359,8 +361,8 @@ def connect_bridge(
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
     compile_guard(arm, driver)
-    ros = RosDomain(domain)
-    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"))
+    ros = open_ros_domain(domain)
+    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"), report=report, stopped=stopped)
     deadman = DeadmanProcess(client.namespace, domain)
     report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
     return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)

@@ -6,23 +6,20 @@ The topic names are those of CRTK (Collaborative Robotics Toolkit, https://crtk-
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.ros_bag import choose_topic, fitting_topics
 from dvrk_drake.systems.ros.confirmation import repeat_until_received
+from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement, JointStateReader, shown
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
 from dvrk_drake.systems.ros.topic import Publisher, Subscription
 
-#: Longest time to wait for the topics of an arm [s]. Time to wait for other topics of the domain after the first one
-#: [s].
-_DISCOVERY, _OTHERS = 10.0, 1.0
 #: Longest time until the arm has sent its state and a measurement [s]. Longest time until DDS detects the end of a
 #: killed process [s].
 _FIRST, _ENDED = 5.0, 3.0
@@ -275,26 +272,38 @@ def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
     return sorted(motion.intersection(topics)) + [measured] * (topics.count(measured) > 1)
 
 
-def find_arm(domain: RosDomain, arm: Arm, topic: str | None = None, seconds: float = _DISCOVERY) -> str:
+def find_arm(
+    domain: RosDomain,
+    arm: Arm,
+    topic: str | None = None,
+    *,
+    report: Callable[[str], None] = lambda line: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> str:
     """Waits until the arm's topic measured_js is discovered, and returns the namespace of the arm, e.g. "/PSM1".
 
     Args:
         domain: ROS domain.
         arm: Arm to find.
-        topic: Topic measured_js or its namespace. None: the only topic `/<ARM>/measured_js`, in any namespace, where
-            ARM is the name of the arm, optionally followed by a number.
-        seconds: Longest time to wait [s].
+        topic: Topic measured_js or its namespace; see `find_topic`.
+        report: Function that is called with one line if the search takes longer than a second.
+        stopped: Function that returns whether to end the search.
 
     Raises:
-        RecordingError: No topic or several topics fit. The message lists the topics of the domain.
+        RecordingError: See `find_topic`.
     """
-    domain.wait_until(lambda: bool(fitting_topics(arm, topic, domain.joint_state_topics())), seconds)
-    domain.wait_until(lambda: False, min(_OTHERS, seconds))
-    topics = {name: name for name in domain.joint_state_topics()}
-    return choose_topic(domain.name, arm, topic, topics).rpartition("/")[0]
+    return find_topic(domain, arm, topic, report=report, stopped=stopped).rpartition("/")[0]
 
 
-def connect_client(domain: RosDomain, arm: Arm, topic: str | None, commands: Sequence[str]) -> CrtkClient:
+def connect_client(
+    domain: RosDomain,
+    arm: Arm,
+    topic: str | None,
+    commands: Sequence[str],
+    *,
+    report: Callable[[str], None] = lambda line: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> CrtkClient:
     """Finds an arm, and creates a client when the arm is present and no other process could move it.
 
     Args:
@@ -302,13 +311,15 @@ def connect_client(domain: RosDomain, arm: Arm, topic: str | None, commands: Seq
         arm: Arm.
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         commands: Names of the commands to which the arm must subscribe, see `CrtkClient.unheard_commands`.
+        report: Function that is called with one line if the search for the arm takes longer than a second.
+        stopped: Function that returns whether to end the search.
 
     Raises:
-        RecordingError: No topic or several topics fit.
+        RecordingError: See `find_topic`.
         ControllerError: Another process could move the arm, no operating state or measurement arrives, the joints do
             not fit, or no process receives the commands.
     """
-    namespace = find_arm(domain, arm, topic)
+    namespace = find_arm(domain, arm, topic, report=report, stopped=stopped)
     # The publishers of a new client would stop a bridge that already runs. So their check comes first. DDS considers a
     # killed process as present for about a second.
     if not domain.wait_until(lambda: not other_publishers(domain, arm, namespace), _ENDED):

@@ -14,6 +14,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.ros.discovery import topic_fault
 
 
 @dataclass
@@ -53,10 +54,8 @@ class CrtkDriver:
         if fault := number_fault(self):
             raise StationError(fault)
         self.guard_driver().check()
-        if any(not part.isidentifier() or not part.isascii() for part in self.namespace.strip("/").split("/") if part):
-            raise StationError(
-                f'namespace is "{self.namespace}"; allowed: names of letters, digits and underscores, separated by "/"'
-            )
+        if self.namespace.strip("/") and (fault := topic_fault(self.namespace)):
+            raise StationError(f"namespace {fault}")
 
     def relative_to(self, folder: Path) -> None:
         """Resolves a relative path in `model` against `folder`."""

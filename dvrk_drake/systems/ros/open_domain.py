@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
+from textwrap import shorten
 from typing import TYPE_CHECKING
 
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
     from dvrk_drake.systems.ros.domain import RosDomain
+
+#: Largest domain whose default UDP ports exist.
+_MAX_DOMAIN = 232
+#: Environment variable with the configuration of Cyclone DDS.
+_CONFIG = "CYCLONEDDS_URI"
 
 
 def require_cyclonedds() -> None:
@@ -21,6 +28,21 @@ def require_cyclonedds() -> None:
         raise DvrkDrakeError("ROS 2 needs the package cyclonedds: pip install cyclonedds")
 
 
+def domain_number(domain: int | None = None) -> int:
+    """Returns the number of a ROS domain.
+
+    Args:
+        domain: Number of the domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+
+    Raises:
+        DvrkDrakeError: The number is not valid.
+    """
+    text = os.environ.get("ROS_DOMAIN_ID", "") or "0" if domain is None else str(domain)
+    if not text.isdecimal() or int(text) > _MAX_DOMAIN:
+        raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {_MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
+    return int(text)
+
+
 def open_ros_domain(domain: int | None = None) -> RosDomain:
     """Joins a ROS domain, see `RosDomain`.
 
@@ -28,6 +50,18 @@ def open_ros_domain(domain: int | None = None) -> RosDomain:
         DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
     """
     require_cyclonedds()
+    number = domain_number(domain)
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    return RosDomain(domain)
+    try:
+        return RosDomain(number)
+    except DvrkDrakeError as error:
+        # The error of Cyclone DDS is not specific. Cyclone DDS prints the reason on stderr itself.
+        configured = os.environ.get(_CONFIG)
+        advice = "Check that the network is connected"
+        if configured:
+            advice = (
+                f'{_CONFIG} is "{shorten(configured, 60)}"; allowed: an existing XML file, or XML, with existing '
+                "network interfaces. Correct it or unset it"
+            )
+        raise DvrkDrakeError(f"ROS domain {number} cannot be used. {advice}") from error

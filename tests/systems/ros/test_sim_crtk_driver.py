@@ -202,6 +202,7 @@ def test_driver_file(tmp_path):
         ({"domain": 233}, r"domain is 233; allowed: 0\.\.232"),
         ({"rate": 1e4}, r"rate is 10000; allowed: 10\.\.1000 Hz"),
         ({"namespace": "MTM L"}, 'namespace is "MTM L"; allowed: names of letters, digits and underscores'),
+        ({"namespace": "lab//MTML"}, 'namespace is "lab//MTML"; allowed: '),
     ],
 )
 def test_invalid_driver_is_refused(options, message):
