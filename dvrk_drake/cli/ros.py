@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -86,7 +87,9 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     from dvrk_drake.systems.ros.crtk_client import find_arm
 
     def report(line: str) -> None:
-        print(line, flush=True)
+        # The terminal may be closed. This must not end the process.
+        with contextlib.suppress(OSError):
+            print(line, flush=True)
 
     namespace = find_arm(ros, load_arm(arm), topic, report=report)
     monitor = Deadman(ros, namespace, report)

@@ -16,8 +16,8 @@ from dvrk_drake.processes import ros_recorder as module
 from dvrk_drake.processes.ros_recorder import RosRecorder
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.ros import discovery
+from dvrk_drake.systems.ros.open_domain import MAX_DOMAIN, domain_number
 
-ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages_module = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
 JointState, Header, Time = messages_module.JointState, messages_module.Header, messages_module.Time
 
@@ -30,7 +30,7 @@ TOPIC, JAW = "/PSM1/measured_js", "/PSM1/jaw/measured_js"
 def publisher(request, monkeypatch):
     """Starts a publisher in a domain of its own, and returns the number of the domain."""
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
-    domain = 1 + os.getpid() % (ros.MAX_DOMAIN - 1)
+    domain = 1 + os.getpid() % (MAX_DOMAIN - 1)
     script = os.path.join(os.path.dirname(__file__), "../support/ros_publisher.py")
     process = subprocess.Popen([sys.executable, script, str(domain), request.param], stdout=subprocess.PIPE, text=True)
     try:
@@ -165,7 +165,7 @@ def test_wrong_arguments_are_refused(tmp_path, monkeypatch):
     for domain in ("-1", "233", "x"):
         monkeypatch.setenv("ROS_DOMAIN_ID", domain)
         with pytest.raises(DvrkDrakeError, match=f"ROS domain {domain}: allowed: 0 to 232"):
-            ros.RosDomain()
+            domain_number()
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     with pytest.raises(DvrkDrakeError, match=r"needs the package cyclonedds: pip install cyclonedds"):
         RosRecorder(PSM, tmp_path / "a.mcap")

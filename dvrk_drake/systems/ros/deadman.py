@@ -90,18 +90,23 @@ class Deadman:
         """
         pipes = [] if bridge is None else [bridge]
         connected = False
-        while not stopped():
+
+        def is_over() -> bool:
+            nonlocal connected
             if self.is_connected() != connected:
                 connected = not connected
                 report_connected(connected)
+            return stopped()
+
+        while not is_over():
             ended = bool(select.select(pipes, [], [], _POLL)[0])
             self._update(time.monotonic())
             silence = 0.0 if self._last_command is None else time.monotonic() - self._last_command
             if silence > TIMEOUT:
-                self._publish_hold(f"no command for {1e3 * silence:.0f} ms", stopped)
+                self._publish_hold(f"no command for {1e3 * silence:.0f} ms", is_over)
             if ended:
                 if os.read(pipes[0], 1) or not self._is_held:
-                    self._publish_hold("the bridge has ended", stopped)
+                    self._publish_hold("the bridge has ended", is_over)
                 return
 
     def _update(self, now: float) -> None:
@@ -114,14 +119,14 @@ class Deadman:
         if (holds and max(holds) >= self._last_published) or (states and states[-1] != "ENABLED"):
             self._last_command, self._is_held = None, True
 
-    def _publish_hold(self, reason: str, stopped: Callable[[], bool]) -> None:
+    def _publish_hold(self, reason: str, is_over: Callable[[], bool]) -> None:
         self._hold.publish(self._empty)
         start = time.monotonic()
         next_warning = start + _CONFIRMATION
         self._last_command = None
         self._report(f"deadman: {self._namespace}: {reason}; published hold at {time.time():.3f} s")
 
-        def is_over() -> bool:
+        def warn() -> bool:
             nonlocal next_warning
             if (now := time.monotonic()) >= next_warning:
                 next_warning = now + _WARNING
@@ -129,9 +134,9 @@ class Deadman:
                     f"deadman: {self._namespace}: the arm has not confirmed hold for {now - start:.0f} s. "
                     f"PRESS THE STOP BUTTON. Process {os.getpid()} continues to send hold"
                 )
-            return stopped()
+            return is_over()
 
-        if repeat_until_received(self._hold, self._empty, self._state.num_publishers, is_over):
+        if repeat_until_received(self._hold, self._empty, self._state.num_publishers, warn):
             self._is_held = True
             if next_warning > start + _CONFIRMATION:
                 self._report(f"deadman: {self._namespace}: the arm has confirmed hold now")

@@ -10,6 +10,7 @@ import select
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from textwrap import shorten
 
 from cyclonedds.__library__ import library_path
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
@@ -19,10 +20,9 @@ from cyclonedds.sub import DataReader
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.systems.ros.messages import JointState, dds_type_name, ros_type_name, type_hash
+from dvrk_drake.systems.ros.open_domain import domain_number
 from dvrk_drake.systems.ros.topic import DDS_PREFIX, Message, Publisher, Subscription, ros_qos
 
-#: Largest domain whose default UDP ports exist.
-MAX_DOMAIN = 232
 #: Number of messages that a latched topic keeps for subscribers that join later, as in the dVRK's ROS interface.
 _LATCHED = 100
 #: Time after which other processes consider a killed process as ended [s]. Cyclone DDS uses 10 s by default.
@@ -75,19 +75,20 @@ class RosDomain:
         Raises:
             DvrkDrakeError: The number is not valid, or the network of the domain cannot be used.
         """
-        text = os.environ.get("ROS_DOMAIN_ID", "") or "0" if domain is None else str(domain)
-        if not text.isdecimal() or int(text) > MAX_DOMAIN:
-            raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
-        self.name = f"ROS domain {text}"
+        number = domain_number(domain)
+        self.name = f"ROS domain {number}"
         try:
-            self.participant = _participant(int(text))
+            self.participant = _participant(number)
             self._publications = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
             self._subscriptions = BuiltinDataReader(self.participant, BuiltinTopicDcpsSubscription)
         except DDSException as error:
-            raise DvrkDrakeError(
-                f"{self.name} cannot be used; Cyclone DDS has printed the reason. Check the network and the variable "
-                f"{_CONFIG}"
-            ) from error
+            advice = "Check that the network is connected"
+            if configured := os.environ.get(_CONFIG):
+                advice = (
+                    f'{_CONFIG} is "{shorten(configured, 60)}"; allowed: an existing XML file, or XML, with existing '
+                    "network interfaces. Correct it or unset it"
+                )
+            raise DvrkDrakeError(f"{self.name} cannot be used. {advice}") from error
         self._alive = {
             reader: ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Alive)
             for reader in (self._publications, self._subscriptions)

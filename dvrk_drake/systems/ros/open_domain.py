@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from importlib.util import find_spec
-from textwrap import shorten
 from typing import TYPE_CHECKING
 
 from dvrk_drake.errors import DvrkDrakeError
@@ -13,9 +12,7 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.ros.domain import RosDomain
 
 #: Largest domain whose default UDP ports exist.
-_MAX_DOMAIN = 232
-#: Environment variable with the configuration of Cyclone DDS.
-_CONFIG = "CYCLONEDDS_URI"
+MAX_DOMAIN = 232
 
 
 def require_cyclonedds() -> None:
@@ -38,8 +35,8 @@ def domain_number(domain: int | None = None) -> int:
         DvrkDrakeError: The number is not valid.
     """
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0" if domain is None else str(domain)
-    if not text.isdecimal() or int(text) > _MAX_DOMAIN:
-        raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {_MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
+    if not text.isdecimal() or int(text) > MAX_DOMAIN:
+        raise DvrkDrakeError(f"ROS domain {text}: allowed: 0 to {MAX_DOMAIN} (--domain, or ROS_DOMAIN_ID)")
     return int(text)
 
 
@@ -50,18 +47,6 @@ def open_ros_domain(domain: int | None = None) -> RosDomain:
         DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
     """
     require_cyclonedds()
-    number = domain_number(domain)
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    try:
-        return RosDomain(number)
-    except DvrkDrakeError as error:
-        # The error of Cyclone DDS is not specific. Cyclone DDS prints the reason on stderr itself.
-        configured = os.environ.get(_CONFIG)
-        advice = "Check that the network is connected"
-        if configured:
-            advice = (
-                f'{_CONFIG} is "{shorten(configured, 60)}"; allowed: an existing XML file, or XML, with existing '
-                "network interfaces. Correct it or unset it"
-            )
-        raise DvrkDrakeError(f"ROS domain {number} cannot be used. {advice}") from error
+    return RosDomain(domain)
