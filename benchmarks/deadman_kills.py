@@ -129,6 +129,7 @@ class Bench:
                 os.kill(process.pid or 0, signal.SIGCONT)
                 process.kill()
             process.join()
+        time.sleep(1.0)  # The console must still confirm `hold` of the deadman process.
 
 
 @contextlib.contextmanager

@@ -30,6 +30,9 @@ ONE_PYTHON = (
     "experiments/test_tuning",
     *("processes/test_collector", "processes/test_trajectory", "processes/test_live_line", "processes/test_teacher"),
     "cli/test_collect",
+    *("systems/ros/test_arrival_clock", "systems/ros/test_confirmation", "systems/ros/test_crtk_bridge"),
+    *("systems/ros/test_deadman", "systems/ros/test_discovery", "systems/ros/test_domain", "systems/ros/test_joint"),
+    *("systems/ros/test_messages", "processes/test_crtk_coll", "processes/test_ros_", "processes/test_dvrk_console"),
 )
 
 

@@ -32,6 +32,7 @@ from pathlib import Path
 import pytest
 
 INSIDE = "DVRK_DRAKE_OWN_NETWORK"
+PROCESSES = ("--pid", "--mount-proc", "--kill-child")
 NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.255.0.0/16 dev lo"
 #: Maximum number of retries in one run of pytest, over all files and tests.
 MAX_RETRIES = 4
@@ -48,8 +49,17 @@ _RETRIES = pytest.StashKey[list]()
 
 
 def unshare():
-    """Returns the command that creates a network namespace. It keeps the permission for real-time scheduling."""
-    for command in (["unshare", "-n"], ["unshare", "-rn"]):
+    """Returns the command that creates a network namespace. It keeps the permission for real-time scheduling.
+
+    If permitted, the command also creates a process namespace, which ends all its processes with the command. A deadman
+    process whose arm has ended would otherwise remain.
+    """
+    for command in (
+        ["unshare", "-n", *PROCESSES],
+        ["unshare", "-rn", *PROCESSES],
+        ["unshare", "-n"],
+        ["unshare", "-rn"],
+    ):
         try:
             done = subprocess.run([*command, "sh", "-c", NETWORK], capture_output=True, timeout=60, check=False)
         except OSError:
@@ -109,7 +119,8 @@ def pytest_terminal_summary(terminalreporter, config):
 
 def _run(test_file, cache_folder):
     """Runs the tests that failed last (at first: all) and returns the names of the tests that failed now."""
-    command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh"]
+    # The shell remains, because it must wait for the orphans of the process namespace.
+    command = [*unshare(), "sh", "-c", f'{NETWORK} && "$@"; exit $?', "sh"]
     pytest_run = [
         sys.executable,
         "-m",

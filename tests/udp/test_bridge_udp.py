@@ -244,5 +244,9 @@ def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
             assert operator.last.guard_state == Status.STATE_FAULT
             assert not [name for name, *_ in monitor.receive() if name != "hold"]
             operator.reset(bridge)
+            before = bridge.output()
             wait_until(lambda: monitor.first(["servo_jp"], 0), "commands after the reset", bridge)
+            # If the computer is stalled, the guard changes to FAULT and remains there.
+            wait_until(lambda: re.search("effort, sender|fault: ", bridge.output()[len(before) :]), "efforts", bridge)
+            assert "fault: " not in bridge.output()[len(before) :], bridge.output()
             wait_for_mode(console, EFFORT, bridge)

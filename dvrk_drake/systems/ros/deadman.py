@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 TIMEOUT = 0.05
 #: Time between two checks [s].
 _POLL = 0.005
-#: Time without a confirmation of `hold` after which the process prints a warning [s]. Time between two warnings [s].
-_CONFIRMATION, _WARNING = 2.0, 10.0
+#: Time without a confirmation of `hold` after which the process prints a warning [s]. It prints the next warnings after
+#: 2, 4, 8, ... times this time.
+_CONFIRMATION = 2.0
 #: Longest time until a new deadman process is ready [s]. Longest time until it has ended [s].
 _START, _END = 20.0, 4.0
 #: Lines with which the process reports whether it receives the commands of the bridge and can hold the arm.
@@ -121,24 +122,23 @@ class Deadman:
 
     def _publish_hold(self, reason: str, is_over: Callable[[], bool]) -> None:
         self._hold.publish(self._empty)
-        start = time.monotonic()
-        next_warning = start + _CONFIRMATION
+        start, next_warning = time.monotonic(), _CONFIRMATION
         self._last_command = None
         self._report(f"deadman: {self._namespace}: {reason}; published hold at {time.time():.3f} s")
 
         def warn() -> bool:
             nonlocal next_warning
-            if (now := time.monotonic()) >= next_warning:
-                next_warning = now + _WARNING
+            if (waited := time.monotonic() - start) >= next_warning:
+                next_warning = 2 * waited
                 self._report(
-                    f"deadman: {self._namespace}: the arm has not confirmed hold for {now - start:.0f} s. "
+                    f"deadman: {self._namespace}: the arm has not confirmed hold for {waited:.0f} s. "
                     f"PRESS THE STOP BUTTON. Process {os.getpid()} continues to send hold"
                 )
             return is_over()
 
         if repeat_until_received(self._hold, self._empty, self._state.num_publishers, warn):
             self._is_held = True
-            if next_warning > start + _CONFIRMATION:
+            if next_warning > _CONFIRMATION:
                 self._report(f"deadman: {self._namespace}: the arm has confirmed hold now")
 
 
