@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, app
 from dvrk_drake.cli.support import interrupt_ends_process, mounted, print_warning, quiet_drake
+from dvrk_drake.errors import ControllerError
 
 
 @app.command(group=HARDWARE)
@@ -58,7 +60,7 @@ def bridge(
         url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
         stopped = stop_on_signals()
     print(f"connecting {connected.name} to LCM {url}; Ctrl-C ends the bridge, and the arm holds its pose", flush=True)
-    run_bridge(
+    is_confirmed = run_bridge(
         connected,
         configuration,
         url,
@@ -68,7 +70,9 @@ def bridge(
         report=lambda line: print(line, flush=True),
         ready=ready,
     )
-    print("bridge ended; hold was published", flush=True)
+    if not is_confirmed:
+        raise ControllerError("the bridge has ended, but the arm has not confirmed hold. The deadman process continues")
+    print("bridge ended; the arm has confirmed hold", flush=True)
 
 
 @app.command(group=HARDWARE)
@@ -87,12 +91,13 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     from dvrk_drake.systems.ros.crtk_client import find_arm
 
     def report(line: str) -> None:
-        # The terminal may be closed. This must not end the process.
         with contextlib.suppress(OSError):
             print(line, flush=True)
 
     namespace = find_arm(ros, load_arm(arm), topic, report=report)
     monitor = Deadman(ros, namespace, report)
     stopped = stop_on_signals()
+    # A closed terminal must not end this process.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     print(f"deadman of {namespace}; Ctrl-C ends it", flush=True)
     monitor.run(stopped)

@@ -30,7 +30,7 @@ def run_bridge(
     stopped: Callable[[], bool],
     report: Callable[[str], None],
     ready: Callable[[], None] = lambda: None,
-) -> None:
+) -> bool:
     """Connects an arm until `stopped` returns true. The arm then holds its pose.
 
     Args:
@@ -42,6 +42,9 @@ def run_bridge(
         stopped: Function that returns whether to stop.
         report: Function that is called with one line for each change of the state.
         ready: Function that is called before the networks are opened, e.g. to request real-time scheduling.
+
+    Returns:
+        Whether the arm has confirmed the last command, `hold`.
 
     Raises:
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
@@ -77,4 +80,5 @@ def run_bridge(
                         break
             bridge.update()
     finally:
-        bridge.close()
+        is_confirmed = bridge.close()
+    return is_confirmed

@@ -211,6 +211,5 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None, dialog: Dialog) -> Crt
 
 def _hold(client: CrtkClient, report: Callable[[str], None]) -> None:
     """Publishes `hold`, and reports if the arm does not confirm it."""
-    client.hold()
-    if not client.wait_until_received(_CONFIRMATION):
+    if not client.hold_until_confirmed(_CONFIRMATION):
         report(f"{client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")

@@ -46,7 +46,8 @@ class SubstituteClient:
         taken, self.other_hold = self.other_hold, False
         return taken
 
-    def wait_until_received(self, seconds):
+    def hold_until_confirmed(self, seconds):
+        self.hold()
         return self.confirms
 
     def use_gravity_compensation(self, on):

@@ -5,7 +5,7 @@ It prints a line for each `hold`.
 
 import sys
 
-STATES = ["DISABLED", "ENABLED", "PAUSED"]
+STATES = ["DISABLED", "PAUSED", "ENABLED"]
 STATE, MEASURED, COMMAND = "/MTML/operating_state", "/MTML/measured_js", "/MTML/servo_jf"
 HOLD = "/MTML/hold"
 

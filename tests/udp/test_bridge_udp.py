@@ -66,11 +66,19 @@ def wait_for_mode(console, mode, *processes):
 def start_efforts(arm, folder, console, *options):
     """Returns a bridge and a controller whose efforts act."""
     bridge, controller = start_bridge(arm, folder, *options), start_controller(arm)
-    # If the computer is stalled, the guard changes to FAULT and remains there.
-    wait_until(lambda: re.search("effort, sender|fault: ", bridge.output()), "efforts", bridge)
-    assert "fault: " not in bridge.output(), bridge.output()
-    wait_for_mode(console, EFFORT, bridge)
+    wait_for_efforts(console, bridge)
     return bridge, controller
+
+
+def wait_for_efforts(console, bridge, after=0):
+    """Waits until efforts act. `after` is a number of characters of the bridge's output."""
+    # If the computer is stalled, the guard changes to FAULT and remains there.
+    try:
+        wait_until(lambda: re.search("effort, sender|fault: ", bridge.output()[after:]), "efforts", bridge)
+    except AssertionError as error:
+        raise AssertionError(f"{error}; {bridge.output()}") from None
+    assert "fault: " not in bridge.output()[after:], bridge.output()
+    wait_for_mode(console, EFFORT, bridge)
 
 
 @inside
@@ -122,7 +130,7 @@ def test_efforts_act_and_other_bridge_is_refused(console, operator, tmp_path):
         wait_for_line(bridge, "hold", after=bridge.output().index("effort, sender"))
         wait_for_mode(console, POSITION, bridge)
         before = time.time_ns()
-        assert bridge.end(signal.SIGINT).splitlines()[-1] == "bridge ended; hold was published"
+        assert bridge.end(signal.SIGINT).splitlines()[-1] == "bridge ended; the arm has confirmed hold"
         assert bridge.poll() == 0
         wait_until(lambda: monitor.first(["hold"], before), "hold")
         assert "deadman: " not in bridge.output()[bridge.output().rindex("hold") :]
@@ -184,7 +192,7 @@ def test_pause_of_console_and_network_loss_lead_to_a_fault(console, operator, tm
         wait_for_line(bridge, "s old; allowed: 0 to 0.1 s", after=length)
         assert "the status could not be sent: Network is unreachable" in bridge.output()
         wait_for_mode(console, POSITION, bridge)
-        assert bridge.end(signal.SIGINT).splitlines()[-1] == "bridge ended; hold was published"
+        assert bridge.end(signal.SIGINT).splitlines()[-1] == "bridge ended; the arm has confirmed hold"
 
 
 def wait_one_second():
@@ -243,10 +251,7 @@ def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
             wait_until(lambda: len(operator.received) > count + 300, "statuses", bridge)
             assert operator.last.guard_state == Status.STATE_FAULT
             assert not [name for name, *_ in monitor.receive() if name != "hold"]
+            before = len(bridge.output())
             operator.reset(bridge)
-            before = bridge.output()
             wait_until(lambda: monitor.first(["servo_jp"], 0), "commands after the reset", bridge)
-            # If the computer is stalled, the guard changes to FAULT and remains there.
-            wait_until(lambda: re.search("effort, sender|fault: ", bridge.output()[len(before) :]), "efforts", bridge)
-            assert "fault: " not in bridge.output()[len(before) :], bridge.output()
-            wait_for_mode(console, EFFORT, bridge)
+            wait_for_efforts(console, bridge, before)

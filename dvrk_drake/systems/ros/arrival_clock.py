@@ -57,7 +57,7 @@ class ArrivalClock:
             reference = difference
         elif stamp == self._stamps[-1]:
             return self._last, ""
-        elif stamp < self._stamps[-1] or difference < reference - self._largest_change:
+        elif stamp < self._stamps[-1] or difference < self._offset - self._largest_change:
             change = 1e-6 * (stamp - self._stamps[-1])
             jump = f"the time stamp changed by {change:.3f} s since the previous message"
             self._stamps.clear()

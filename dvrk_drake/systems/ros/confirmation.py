@@ -4,44 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from dvrk_drake.systems.ros.topic import Publisher
-
-#: Time between two repetitions [s].
+#: Time between two attempts without confirmation [s].
 _INTERVAL = 0.25
 
 
-def repeat_until_received(
-    publisher: Publisher[Any], message: Any, is_present: Callable[[], object], is_over: Callable[[], bool]
-) -> bool:
-    """Waits until a published message is confirmed. Returns whether it is confirmed.
+def repeat_until_confirmed(attempt: Callable[[float], bool], is_over: Callable[[], bool]) -> bool:
+    """Repeats an attempt to send a message until two attempts in succession are confirmed. Returns whether they are.
 
-    The message is published again while it is not confirmed. A subscription that DDS discovers again after a loss of
-    the network does not receive the messages that were published before, but confirms them. After a repetition, two
-    messages in succession must therefore be confirmed.
+    One confirmation is not sufficient. A subscription that DDS discovers again after a loss of the network does not
+    receive the messages that were published before, but confirms them.
 
     Args:
-        publisher: Publisher of the message.
-        message: Message that was published last.
-        is_present: Function that returns whether DDS has a connection to the arm. Without subscriptions, DDS regards
-            each message as confirmed.
-        is_over: Function that returns whether to stop waiting. It is called after each attempt without confirmation.
-
-    Raises:
-        DvrkDrakeError: DDS cannot send the message.
+        attempt: Function that publishes the message, and waits for its confirmation at most the given time [s]. It
+            returns whether the arm is connected and has confirmed the message.
+        is_over: Function that returns whether to stop. It is called after each attempt without confirmation.
     """
-    missing = 1
-    while True:
+    missing = 2
+    while missing:
         begin = time.monotonic()
-        if publisher.wait_until_received(_INTERVAL) and is_present():
+        if attempt(_INTERVAL):
             missing -= 1
-            if not missing:
-                return True
-        else:
-            missing = 2
-            if is_over():
-                return False
-            time.sleep(max(0.0, begin + _INTERVAL - time.monotonic()))
-        publisher.publish(message)
+            continue
+        missing = 2
+        if is_over():
+            return False
+        time.sleep(max(0.0, begin + _INTERVAL - time.monotonic()))
+    return True

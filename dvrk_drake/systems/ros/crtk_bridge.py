@@ -136,23 +136,26 @@ class CrtkBridge:
         if is_new or (self._measured_utime and now >= self._last_step + _SILENCE):
             self._step(now)
 
-    def close(self) -> None:
+    def close(self) -> bool:
         """Commands the arm to hold its present pose, and ends the deadman process.
 
         If the arm does not confirm the command, the deadman process continues to send it.
+
+        Returns:
+            Whether the arm has confirmed the command.
 
         Raises:
             DvrkDrakeError: DDS cannot send the command.
         """
         is_confirmed = False
         try:
-            self._client.hold()
-            is_confirmed = self._client.wait_until_received(_CONFIRMATION)
+            is_confirmed = self._client.hold_until_confirmed(_CONFIRMATION)
             if not is_confirmed:
                 self._report(f"{self._client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
         finally:
             if self._deadman is not None:
                 self._deadman.close(is_confirmed=is_confirmed)
+        return is_confirmed
 
     def fileno(self) -> int:
         """Returns a file descriptor that is readable after a message of the arm has arrived."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.ros.confirmation import repeat_until_received
+from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
 from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement, JointStateReader, shown
@@ -194,17 +194,22 @@ class CrtkClient:
         """Sends a command such as "enable", "home" or "disable" to the state machine of the arm."""
         self._state_command.publish(StringStamped(Header.now(), command))
 
-    def wait_until_received(self, seconds: float) -> bool:
-        """Repeats the last `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
+    def hold_until_confirmed(self, seconds: float) -> bool:
+        """Publishes `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
 
         Raises:
             DvrkDrakeError: DDS cannot send the message.
         """
         end = time.monotonic() + seconds
-        return repeat_until_received(self._hold, Empty(), self._state.num_publishers, lambda: time.monotonic() >= end)
+
+        def attempt(longest: float) -> bool:
+            self.hold()
+            return self._hold.wait_until_received(longest) and not self.unheard_commands(["hold"])
+
+        return repeat_until_confirmed(attempt, lambda: time.monotonic() >= end)
 
     def unheard_commands(self, names: Sequence[str]) -> list[str]:
-        """Returns the command topics to which no process subscribes.
+        """Returns the command topics to which the DDS participant that publishes operating_state does not subscribe.
 
         Args:
             names: Names of the commands to check: servo_jp, servo_jf, move_jp or hold.
@@ -215,7 +220,8 @@ class CrtkClient:
             "move_jp": self._move_jp,
             "hold": self._hold,
         }
-        return [publishers[name].topic for name in names if not publishers[name].num_subscribers()]
+        arm = self._state.publisher_participants()
+        return [publishers[name].topic for name in names if not arm & publishers[name].subscriber_participants()]
 
     def other_publishers(self) -> list[str]:
         """Returns the topics on which another process of the domain could move the arm, see `other_publishers`."""

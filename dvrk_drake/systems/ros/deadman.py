@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.systems.ros.confirmation import repeat_until_received
+from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 #: Time without a command after which the arm is commanded to hold its pose [s].
 TIMEOUT = 0.05
-#: Time between two checks [s].
-_POLL = 0.005
+#: Time between two checks for commands, and between two checks of the connection to the arm [s].
+_POLL, _CONNECTION = 0.005, 0.05
 #: Time without a confirmation of `hold` after which the process prints a warning [s]. It prints the next warnings after
 #: 2, 4, 8, ... times this time.
 _CONFIRMATION = 2.0
@@ -44,7 +44,8 @@ class Deadman:
     The process that sends commands ends them with `hold`. Without further commands, the deadman then does nothing. It
     also does nothing while the arm is not enabled.
 
-    The deadman repeats `hold` without a time limit until the arm has confirmed it, e.g. after a loss of the network.
+    The deadman repeats `hold` without a time limit until the arm has confirmed it, e.g. after a loss of the network, or
+    until the arm is not enabled. DDS confirms that the arm's process has received the message, not that the arm holds.
     """
 
     def __init__(self, domain: RosDomain, namespace: str, report: Callable[[str], None]) -> None:
@@ -68,11 +69,11 @@ class Deadman:
         self._hold = domain.advertise(f"{namespace}/hold", Empty)
         self._last_command: float | None = None
         self._last_published = 0
-        self._is_held = False
+        self._is_enabled, self._is_confirmed = True, False
 
     def is_connected(self) -> bool:
         """Returns whether the arm receives `hold`, and a process publishes the commands."""
-        return bool(self._hold.num_subscribers() and all(command.num_publishers() for command in self._commands))
+        return self._has_arm() and all(command.num_publishers() for command in self._commands)
 
     def run(
         self,
@@ -83,63 +84,84 @@ class Deadman:
         """Monitors the commands until `stopped` returns true, or until the bridge process has ended and the arm holds.
 
         Args:
-            stopped: Function that returns whether to stop.
+            stopped: Function that returns whether to stop. With a bridge, it only ends the repetition of `hold`.
             bridge: File descriptor of a pipe from the bridge process. The end of this process closes the pipe. The
-                bridge process writes to it before its end if the arm has not confirmed the last `hold`. None: there is
-                no such pipe.
+                bridge process writes to it before its end if the arm has confirmed the last `hold` of the bridge. None:
+                there is no such pipe.
             report_connected: Function that is called with each change of `is_connected`.
         """
         pipes = [] if bridge is None else [bridge]
-        connected = False
+        connected, next_check = False, 0.0
 
         def is_over() -> bool:
-            nonlocal connected
-            if self.is_connected() != connected:
-                connected = not connected
-                report_connected(connected)
+            nonlocal connected, next_check
+            if (now := time.monotonic()) >= next_check:
+                next_check = now + _CONNECTION
+                if self.is_connected() != connected:
+                    connected = not connected
+                    report_connected(connected)
             return stopped()
 
-        while not is_over():
+        while not is_over() or pipes:
             ended = bool(select.select(pipes, [], [], _POLL)[0])
             self._update(time.monotonic())
             silence = 0.0 if self._last_command is None else time.monotonic() - self._last_command
             if silence > TIMEOUT:
-                self._publish_hold(f"no command for {1e3 * silence:.0f} ms", is_over)
+                self._hold_arm(f"no command for {1e3 * silence:.0f} ms", is_over)
             if ended:
-                if os.read(pipes[0], 1) or not self._is_held:
-                    self._publish_hold("the bridge has ended", is_over)
+                if not os.read(pipes[0], 1) and self._is_enabled and not self._is_confirmed:
+                    self._hold_arm("the bridge has ended", is_over)
                 return
 
     def _update(self, now: float) -> None:
         for subscription in self._commands:
             for _, published in subscription.take():
                 self._last_command, self._last_published = now, max(published, self._last_published)
-                self._is_held = False
+                self._is_confirmed = False
         holds = [published for _, published in self._ends.take()]
-        states = [state.state for state, _ in self._state.take()]
-        if (holds and max(holds) >= self._last_published) or (states and states[-1] != "ENABLED"):
-            self._last_command, self._is_held = None, True
+        self._update_state()
+        if (holds and max(holds) >= self._last_published) or not self._is_enabled:
+            self._last_command = None
 
-    def _publish_hold(self, reason: str, is_over: Callable[[], bool]) -> None:
-        self._hold.publish(self._empty)
-        start, next_warning = time.monotonic(), _CONFIRMATION
+    def _update_state(self) -> None:
+        for state, _ in self._state.take():
+            self._is_enabled = state.state == "ENABLED"
+
+    def _has_arm(self) -> bool:
+        # The bridge also subscribes to `hold`.
+        return bool(self._hold.subscriber_participants() & self._state.publisher_participants())
+
+    def _hold_arm(self, reason: str, is_over: Callable[[], bool]) -> None:
+        """Publishes `hold` until the arm has confirmed it."""
         self._last_command = None
-        self._report(f"deadman: {self._namespace}: {reason}; published hold at {time.time():.3f} s")
+        start, next_warning, report = time.monotonic(), _CONFIRMATION, self._report
 
-        def warn() -> bool:
+        def attempt(longest: float) -> bool:
+            nonlocal reason
+            try:
+                self._hold.publish(self._empty)
+            except DvrkDrakeError:
+                return False
+            if reason:
+                report(f"deadman: {self._namespace}: {reason}; published hold at {time.time():.3f} s")
+                reason = ""
+            return self._hold.wait_until_received(longest) and self._has_arm()
+
+        def is_unnecessary() -> bool:
             nonlocal next_warning
             if (waited := time.monotonic() - start) >= next_warning:
                 next_warning = 2 * waited
-                self._report(
+                report(
                     f"deadman: {self._namespace}: the arm has not confirmed hold for {waited:.0f} s. "
                     f"PRESS THE STOP BUTTON. Process {os.getpid()} continues to send hold"
                 )
-            return is_over()
+            self._update_state()
+            return is_over() or not self._is_enabled
 
-        if repeat_until_received(self._hold, self._empty, self._state.num_publishers, warn):
-            self._is_held = True
-            if next_warning > _CONFIRMATION:
-                self._report(f"deadman: {self._namespace}: the arm has confirmed hold now")
+        self._is_confirmed = repeat_until_confirmed(attempt, is_unnecessary)
+        if next_warning > _CONFIRMATION:
+            result = "the arm has confirmed hold now" if self._is_confirmed else "stopped to send hold"
+            report(f"deadman: {self._namespace}: {result}")
 
 
 class DeadmanProcess:
@@ -190,12 +212,12 @@ class DeadmanProcess:
         """Ends the process.
 
         Args:
-            is_confirmed: Whether the arm has confirmed `hold`. If not, the process continues to send `hold` until the
-                arm confirms it, also after the end of the bridge.
+            is_confirmed: Whether the arm has confirmed `hold`. If not, the process sends `hold` until the arm confirms
+                it, also after the end of the bridge.
         """
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
-            if not is_confirmed:
+            if is_confirmed:
                 self._process.stdin.write(b"\0")
             self._process.stdin.close()
         if not is_confirmed:

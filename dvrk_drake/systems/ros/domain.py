@@ -86,7 +86,7 @@ class RosDomain:
             if configured := os.environ.get(_CONFIG):
                 advice = (
                     f'{_CONFIG} is "{shorten(configured, 60)}"; allowed: an existing XML file, or XML, with existing '
-                    "network interfaces. Correct it or unset it"
+                    "network interfaces that are connected. Correct it or unset it"
                 )
             raise DvrkDrakeError(f"{self.name} cannot be used. {advice}") from error
         self._alive = {

@@ -12,6 +12,7 @@ import threading
 import weakref
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
+from uuid import UUID
 
 from cyclonedds.core import DDSException, Listener, Policy, Qos
 from cyclonedds.domain import DomainParticipant
@@ -131,6 +132,11 @@ class Publisher(Generic[Message]):
         """Returns the number of subscriptions that receive the messages."""
         return len(self._writer.get_matched_subscriptions())
 
+    def subscriber_participants(self) -> set[UUID]:
+        """Returns the DDS participants with subscriptions that receive the messages."""
+        data = map(self._writer.get_matched_subscription_data, self._writer.get_matched_subscriptions())
+        return {endpoint.participant_key for endpoint in data if endpoint is not None}
+
     def wait_until_received(self, seconds: float) -> bool:
         """Waits until all subscriptions have confirmed all messages, at most `seconds`. Returns whether they have."""
         try:
@@ -202,3 +208,8 @@ class Subscription(Generic[Message]):
     def num_publishers(self) -> int:
         """Returns the number of publishers whose messages are received."""
         return len(self._reader.get_matched_publications())
+
+    def publisher_participants(self) -> set[UUID]:
+        """Returns the DDS participants with publishers whose messages are received."""
+        data = map(self._reader.get_matched_publication_data, self._reader.get_matched_publications())
+        return {endpoint.participant_key for endpoint in data if endpoint is not None}

@@ -78,6 +78,13 @@ def test_delay_that_begins_later_is_detected_for_minutes(clocks):
     assert late == pytest.approx(99.8, abs=0.1)
 
 
+def test_long_gap_is_no_jump(clocks):
+    clock = ArrivalClock()
+    for pause in (1, 200_000, 1):
+        clocks.now += pause * MS
+        assert age(clock, clocks, START + clocks.now) == (pytest.approx(0.0), "")
+
+
 @pytest.mark.parametrize("drift", [1e-3, 2e-4, -2e-4, -1e-3])
 def test_drift_of_the_clocks_is_no_age(clocks, drift):
     clock = ArrivalClock()

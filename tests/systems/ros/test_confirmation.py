@@ -1,5 +1,6 @@
 """Messages that are repeated until the arm has received them, with a substitute publisher and over DDS."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -13,27 +14,11 @@ from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
 from dvrk_drake.systems.ros import confirmation
-from dvrk_drake.systems.ros.confirmation import repeat_until_received
+from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 from dvrk_drake.systems.ros.deadman import DeadmanProcess  # noqa: E402
 from dvrk_drake.systems.ros.messages import JointState, OperatingState  # noqa: E402
-
-
-class SubstitutePublisher:
-    """Publisher whose messages are confirmed as given, each confirmation "yes", "no" or "absent" for no arm."""
-
-    def __init__(self, *confirmations):
-        self.confirmations, self.present, self.published = list(confirmations), True, 0
-
-    def publish(self, message):
-        assert message == "hold"
-        self.published += 1
-
-    def wait_until_received(self, seconds):
-        confirmation = self.confirmations.pop(0) if self.confirmations else "no"
-        self.present = confirmation != "absent"
-        return confirmation != "no"
 
 
 def time_limit(seconds):
@@ -43,29 +28,20 @@ def time_limit(seconds):
 
 
 @outside
-@pytest.mark.parametrize(
-    ("confirmations", "published"),
-    [
-        (["yes"], 0),
-        (["no", "yes", "yes"], 2),
-        (["absent", "yes", "yes"], 2),
-        (["no", "yes", "absent", "no", "yes", "yes"], 5),
-    ],
-)
-def test_message_is_repeated_until_it_is_confirmed_after_a_loss(monkeypatch, confirmations, published):
+@pytest.mark.parametrize("attempts", ["yy", "nyy", "ynyy", "nynnyy"])
+def test_two_attempts_in_succession_must_be_confirmed(monkeypatch, attempts):
     monkeypatch.setattr(confirmation, "_INTERVAL", 0.0)
-    publisher = SubstitutePublisher(*confirmations)
-    assert repeat_until_received(publisher, "hold", lambda: publisher.present, time_limit(TIMEOUT))
-    assert (publisher.published, publisher.confirmations) == (published, [])
+    left = list(attempts)
+    assert repeat_until_confirmed(lambda longest: left.pop(0) == "y", time_limit(TIMEOUT))
+    assert not left
 
 
 @outside
-@pytest.mark.parametrize("confirmations", [[], ["no"] * 5, ["absent"] * 1000])
-def test_message_that_is_never_confirmed(monkeypatch, confirmations):
+@pytest.mark.parametrize("attempts", ["n", "yn"])
+def test_message_that_is_never_confirmed(monkeypatch, attempts):
     monkeypatch.setattr(confirmation, "_INTERVAL", 0.001)
-    publisher = SubstitutePublisher(*confirmations)
-    assert not repeat_until_received(publisher, "hold", lambda: publisher.present, time_limit(0.05))
-    assert publisher.published > 0
+    results = itertools.cycle(attempts)
+    assert not repeat_until_confirmed(lambda longest: next(results) == "y", time_limit(0.05))
 
 
 @outside
@@ -107,15 +83,21 @@ def test_message_is_received_after_a_loss_of_the_network():
     message = JointState(effort=[1.0])
     command.publish(message)
     assert command.wait_until_received(0.1), "without subscriptions, DDS regards each message as confirmed"
-    assert not repeat_until_received(command, message, state.num_publishers, time_limit(0.1))
+
+    def attempt(longest):
+        command.publish(message)
+        arm = command.subscriber_participants() & state.publisher_participants()
+        return command.wait_until_received(longest) and bool(arm)
+
+    assert not repeat_until_confirmed(attempt, time_limit(0.1))
     network("up")
-    assert repeat_until_received(command, message, state.num_publishers, time_limit(TIMEOUT))
+    assert repeat_until_confirmed(attempt, time_limit(TIMEOUT))
     assert domain.wait_until(lambda: message in [answer for answer, _ in measured.take()], TIMEOUT)
 
 
 @pytest.fixture
 def deadman():
-    """Deadman process of this process, which publishes the commands of a bridge. The network is lost."""
+    """Deadman process of this process, which publishes a command like a bridge. Then the network is lost."""
     domain = ros.RosDomain(1)
     commands = [domain.advertise(topic, JointState) for topic in (ros_arm.COMMAND, "/MTML/servo_jp")]
     process = DeadmanProcess("/MTML", 1)

@@ -11,10 +11,13 @@ from waiting import TIMEOUT
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
+from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.systems.ros import confirmation, deadman
 from dvrk_drake.systems.ros.deadman import Deadman
 
 ARM = "/MTML"
+#: Number of messages until hold is confirmed.
+TWICE = 2
 
 
 class SubstituteTopic:
@@ -34,7 +37,10 @@ class SubstituteTopic:
     def num_publishers(self):
         return self.connections
 
-    num_subscribers = num_publishers
+    def participants(self):
+        return {"arm"} if self.connections else {"bridge"}
+
+    subscriber_participants = publisher_participants = participants
 
     def wait_until_received(self, seconds):
         return self.confirms
@@ -70,17 +76,17 @@ class Bench:
 
 
 @pytest.mark.parametrize("name", ["servo_jf", "servo_jp"])
-def test_silence_after_a_command_leads_to_one_hold(name):
+def test_silence_after_a_command_leads_to_hold(name):
     bench = Bench()
     assert bench.run_for(3 * deadman.TIMEOUT) == 0, "nothing was commanded"
     bench.send(name, 1)
     start = time.monotonic()
-    assert bench.run(lambda: bench.hold.published) == 1
+    assert bench.run(lambda: bench.hold.published) == TWICE
     assert time.monotonic() - start >= deadman.TIMEOUT
     assert bench.lines[0].startswith(f"deadman: {ARM}: no command for ") and "published hold at" in bench.lines[0]
-    assert bench.run_for(3 * deadman.TIMEOUT) == 1, "the arm holds already"
+    assert bench.run_for(3 * deadman.TIMEOUT) == TWICE, "the arm holds already"
     bench.send(name, 2)
-    assert bench.run(lambda: bench.hold.published > 1) == 2
+    assert bench.run(lambda: bench.hold.published > TWICE) == 2 * TWICE
     assert len(bench.lines) == 2
 
 
@@ -104,20 +110,49 @@ def test_end_of_commands(name, stamp, message, held):
     if held:
         assert bench.run_for(3 * deadman.TIMEOUT) == 0
     else:
-        assert bench.run(lambda: bench.hold.published) == 1
+        assert bench.run(lambda: bench.hold.published) == TWICE
 
 
-@pytest.mark.parametrize("held", [False, True])
-def test_end_of_the_bridge_leads_to_hold(held):
+def run_until_bridge_ends(bench, last=b""):
+    """Returns how often `hold` was published. The bridge writes `last` before its end."""
+    bridge, end = os.pipe()
+    os.write(end, last)
+    os.close(end)
+    # Signals must not end the deadman before it has published hold.
+    bench.deadman.run(lambda: True, bridge, bench.connected.append)
+    os.close(bridge)
+    return bench.hold.published
+
+
+@pytest.mark.parametrize("messages", [[], ["servo_jf"], ["servo_jf", "hold"]])
+def test_end_of_the_bridge_leads_to_hold(messages):
+    """The deadman does not know whether the arm has received the `hold` of the bridge."""
+    bench = Bench()
+    for stamp, name in enumerate(messages):
+        bench.send(name, stamp)
+    assert run_until_bridge_ends(bench) == TWICE
+    assert "the bridge has ended; published hold at" in bench.lines[0]
+
+
+def test_bridge_whose_hold_is_confirmed_leads_to_nothing():
     bench = Bench()
     bench.send("servo_jf", 5)
-    if held:
-        bench.send("hold", 6)
-    bridge, end = os.pipe()
-    os.close(end)
-    assert bench.run(lambda: False, bridge) == (0 if held else 1)
-    os.close(bridge)
-    assert bench.lines == [] if held else "the bridge has ended; published hold at" in bench.lines[0]
+    bench.send("hold", 6)
+    assert run_until_bridge_ends(bench, b"\0") == 0
+    assert not bench.lines
+
+
+def test_end_of_the_bridge_of_a_disabled_arm_leads_to_nothing():
+    bench = Bench()
+    bench.send("operating_state", 1, state("DISABLED"))
+    assert run_until_bridge_ends(bench) == 0
+
+
+def test_hold_is_not_repeated_after_the_end_of_the_bridge():
+    bench = Bench()
+    bench.send("servo_jf", 1)
+    assert bench.run(lambda: bench.hold.published) == TWICE
+    assert run_until_bridge_ends(bench) == TWICE
 
 
 @pytest.fixture
@@ -134,9 +169,8 @@ def num_warnings(bench):
 @pytest.mark.usefixtures("fast")
 def test_hold_is_repeated_until_the_network_works_again():
     bench = Bench()
-    arm = bench.subscribed["operating_state"]
-    # Without a connection to the arm, DDS regards each message as confirmed.
-    arm.num_publishers = lambda: num_warnings(bench) >= 5
+    # Without a connection to the arm, DDS regards each message as confirmed. The bridge also subscribes to hold.
+    bench.hold.subscriber_participants = lambda: {"arm", "bridge"} if num_warnings(bench) >= 5 else {"bridge"}
     bench.send("servo_jf", 1)
     bench.run(lambda: bench.lines and "confirmed hold now" in bench.lines[-1])
     assert bench.hold.published > 5
@@ -156,18 +190,33 @@ def test_stop_ends_the_repetition_of_hold():
 
 
 @pytest.mark.usefixtures("fast")
-def test_hold_that_the_bridge_could_not_confirm_is_repeated():
+def test_disabled_arm_ends_the_repetition_of_hold():
     bench = Bench()
-    bench.subscribed["operating_state"].num_publishers = lambda: num_warnings(bench) >= 3
-    bench.send("servo_jf", 5)
-    bench.send("hold", 6)
-    bridge, end = os.pipe()
-    os.write(end, b"\0")
-    os.close(end)
-    bench.run(lambda: False, bridge)
-    os.close(bridge)
-    assert "the bridge has ended; published hold at" in bench.lines[0]
-    assert bench.lines[-1] == f"deadman: {ARM}: the arm has confirmed hold now"
+    bench.hold.confirms = False
+    bench.send("servo_jf", 1)
+
+    def disable_later():
+        if num_warnings(bench) == 2:
+            bench.send("operating_state", 9, state("DISABLED"))
+        return "stopped to send hold" in bench.lines[-1:][0] if bench.lines else False
+
+    bench.run(disable_later)
+    assert bench.lines[-1] == f"deadman: {ARM}: stopped to send hold"
+
+
+@pytest.mark.usefixtures("fast")
+def test_hold_that_cannot_be_published_is_repeated(monkeypatch):
+    bench = Bench()
+
+    def fail_at_first(message):
+        bench.hold.published += 1
+        if bench.hold.published < 4:
+            raise DvrkDrakeError("the message could not be sent")
+
+    monkeypatch.setattr(bench.hold, "publish", fail_at_first)
+    bench.send("servo_jf", 1)
+    assert bench.run(lambda: bench.hold.published > 4) == 3 + TWICE
+    assert "published hold at" in bench.lines[0]
 
 
 def test_changes_of_the_connection_are_reported():
