@@ -153,7 +153,7 @@ def test_invalid_configuration_of_dds_gives_advice(monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", "garbage")
     expected = (
         'ROS domain 7 cannot be used. CYCLONEDDS_URI is "garbage"; allowed: an existing XML file, or XML, with '
-        "existing network interfaces. Correct it or unset it"
+        "existing network interfaces that are connected. Correct it or unset it"
     )
     with pytest.raises(DvrkDrakeError) as error:
         open_ros_domain(7)
