@@ -29,10 +29,11 @@ ONE_PYTHON = (
     *("experiments/test_reproduction", "experiments/study/", "experiments/test_transparency"),
     "experiments/test_tuning",
     *("processes/test_collector", "processes/test_trajectory", "processes/test_live_line", "processes/test_teacher"),
-    "cli/test_collect",
+    *("cli/test_collect", "cli/test_formats_in_commands", "test_fuzz_files"),
     *("systems/ros/test_arrival_clock", "systems/ros/test_confirmation", "systems/ros/test_crtk_bridge"),
     *("systems/ros/test_deadman", "systems/ros/test_discovery", "systems/ros/test_domain", "systems/ros/test_joint"),
     *("systems/ros/test_messages", "processes/test_crtk_coll", "processes/test_ros_", "processes/test_dvrk_console"),
+    "processes/test_simulated_ros_arm",
 )
 
 
