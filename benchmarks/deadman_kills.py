@@ -152,7 +152,13 @@ def started(arm: str, console_arm: str, realtime: bool, jaw: float = 0.0) -> Ite
 
 def measure(console: Console, bench: Bench, names: tuple[str, ...], number: int, kills: int) -> dict[str, list[float]]:
     """Returns times from a signal to the message and to the mode of the console [s], and counts of other events."""
-    found: dict[str, list[float]] = {"message": [], "mode": [], "early": [], "remains in effort mode": []}
+    found: dict[str, list[float]] = {
+        "message": [],
+        "mode": [],
+        "early": [],
+        "remains in effort mode": [],
+        "old effort": [],
+    }
     while len(found["mode"]) < kills:
         bench.start()
         if not bench.wait_for_mode(EFFORT, LONGEST):
@@ -181,8 +187,9 @@ def measure(console: Console, bench: Bench, names: tuple[str, ...], number: int,
             bench.send(names, signal.SIGCONT)
             # Commands act again only after the start check, which takes 0.25 s.
             time.sleep(0.1)
-            if EFFORT in console.modes()[num_modes:]:
-                found["remains in effort mode"].append(1.0)
+            # A bridge that was stopped while it published an effort publishes this effort now, and then hold.
+            if modes := console.modes()[num_modes:]:
+                found["remains in effort mode" if modes[-1] == EFFORT else "old effort"].append(1.0)
             # The measurements that waited for the stopped bridge are too old, which is a fault.
             bench.end()
         print(f"{len(found['mode'])}: {1e3 * found['mode'][-1]:.1f} ms", file=sys.stderr, flush=True)
@@ -226,9 +233,9 @@ def main() -> None:
         title = f"MTML, {scheduling} scheduling, {options.kills} signals per row"
         print(f"{title}: time [ms] from a signal to the command and to position control")
         times = [f"{name}, {which}" for name in ("command", "position control") for which in ("p50", "max")]
-        columns = ("scheduling, signal", *times, "held before the signal", "remained in effort control")
+        columns = ("scheduling, signal", *times, "held before the signal", "remained in effort control", "old effort")
         print(f"| {' | '.join(columns)} |")
-        print("|---|---|---|---|---|---|---|")
+        print("|---|---|---|---|---|---|---|---|")
         with started("mtml", "MTML", options.realtime) as (console, bench):
             for condition, (names, number) in CONDITIONS.items():
                 if options.condition not in (None, condition):
@@ -239,7 +246,7 @@ def main() -> None:
                     for values in (sorted(found["message"]), sorted(found["mode"]))
                     for value in (values[len(values) // 2], values[-1])
                 ]
-                counts = (len(found["early"]), len(found["remains in effort mode"]))
+                counts = [len(found[key]) for key in ("early", "remains in effort mode", "old effort")]
                 print(f"| {scheduling}, {condition} | {' | '.join([*times, *map(str, counts)])} |", flush=True)
     if options.jaw_seconds:
         print(f"\nPSM1, {scheduling} scheduling: changes of the control space in {options.jaw_seconds:g} s")

@@ -245,6 +245,9 @@ class CrtkBridge:
         elif is_effort:
             self._send_jaw("servo_jf", output.effort)
             client.servo_jf(output.effort)
+            if self._clock.now() >= now + _LATE:
+                # The process was suspended after the check above, so this effort is old.
+                client.hold()
         elif output.control_mode != lcmt_dvrk_command.OFF:
             self._send_jaw("servo_jp", output.position)
             client.servo_jp(output.position, output.velocity)

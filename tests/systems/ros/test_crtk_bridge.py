@@ -355,6 +355,20 @@ def test_key_signs_statuses_and_verifies_commands(monkeypatch, tmp_path):
     assert bench.tick().status.num_accepted == 10
 
 
+def test_hold_follows_an_effort_that_was_published_late(bench, monkeypatch):
+    bench.started()
+    servo_jf = bench.client.servo_jf
+
+    def suspended(effort):
+        bench.now += 100_000_000
+        servo_jf(effort)
+
+    monkeypatch.setattr(bench.client, "servo_jf", suspended)
+    bench.clear()
+    bench.run(1)
+    assert bench.names()[:2] == ["servo_jf", "hold"]
+
+
 def test_close_publishes_hold_and_ends_the_deadman(bench):
     bench.started().clear()
     bench.bridge.close()
