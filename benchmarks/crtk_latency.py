@@ -9,6 +9,7 @@ the last joint contain the number of the measurement. These paths are measured i
     echo                 the same with the encoder of this package
     controller on LCM    without DDS: this process publishes the status, and the controller answers it over LCM
     bridge               `dvrk-drake bridge`, and the same controller
+    polling bridge       the same with --poll
 
 With --core, the bridge uses only this processor core, as with `taskset`.
 
@@ -99,13 +100,14 @@ def controller(realtime: bool) -> None:
         network.handle()
 
 
-def bridge(folder: str, realtime: bool, core: int | None) -> None:
+def bridge(folder: str, realtime: bool, core: int | None, poll: bool) -> None:
     """Runs the bridge with a guard that tolerates an arm without efforts."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     driver = Path(folder, "driver.yaml")
     driver.write_text(LENIENT_DRIVER)
-    cli.main(["bridge", "--arm", "mtml", "--driver", str(driver), *(["--realtime"] if realtime else [])])
+    options = [option for option, used in (("--realtime", realtime), ("--poll", poll)) if used]
+    cli.main(["bridge", "--arm", "mtml", "--driver", str(driver), *options])
 
 
 class Arm:
@@ -179,9 +181,9 @@ def start(*mains: tuple[Any, ...]) -> list[BaseProcess]:
 
 
 def end(processes: list[BaseProcess]) -> None:
-    """Ends processes."""
+    """Ends processes. A bridge first holds the arm and ends its deadman process."""
     for process in processes:
-        process.kill()
+        process.terminate()
         process.join()
 
 
@@ -196,15 +198,16 @@ def guard_counters() -> str:
 
 def measure(name: str, seconds: float, realtime: bool, folder: str, core: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Measures one path over DDS. Returns times of sending and round-trip times [s]."""
-    domain, namespace = RosDomain(), "/MTML" if name == "bridge" else f"/ECHO_{name[-3:].strip().upper()}"
+    is_bridge = name.endswith("bridge")
+    domain, namespace = RosDomain(), "/MTML" if is_bridge else f"/ECHO_{name[-3:].strip().upper()}"
     arm = Arm(domain, namespace)
-    if name == "bridge":
-        processes = start((bridge, folder, realtime, core), (controller, realtime))
+    if is_bridge:
+        processes = start((bridge, folder, realtime, core, name != "bridge"), (controller, realtime))
     else:
         processes = start((echo, namespace, realtime, name != "echo"))
     try:
         arm.run(seconds, needs_answer=True)
-        if name == "bridge":
+        if is_bridge:
             lost = f"lost on DDS: {arm.num_lost()} efforts; guard: {guard_counters()} commands"
             print(lost, file=sys.stderr, flush=True)
     finally:
@@ -254,7 +257,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     p50 = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("echo of cyclonedds", "echo", "controller on LCM", "bridge"):
+        for name in ("echo of cyclonedds", "echo", "controller on LCM", "bridge", "polling bridge"):
             if name == "controller on LCM":
                 sent, trips = measure_lcm(options.seconds, options.realtime)
             else:

@@ -27,6 +27,7 @@ def bridge(
     key: Key = None,
     gravity: Gravity = None,
     realtime: Realtime = False,
+    poll: Annotated[bool, Parameter(negative="")] = False,
 ) -> None:
     """Connect a dVRK arm on ROS 2 to LCM, with the command guard in between.
 
@@ -35,6 +36,8 @@ def bridge(
 
     Args:
         driver: Configuration file of the driver (docs/lcm.md). Default: the default configuration.
+        poll: Poll for messages while a controller commands the arm. The delay decreases, but the bridge uses a
+            processor core.
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.bridge import run_bridge
@@ -66,6 +69,7 @@ def bridge(
         url,
         topic=topic,
         domain=domain,
+        polls=poll,
         stopped=stopped,
         report=lambda line: print(line, flush=True),
         ready=ready,

@@ -18,6 +18,9 @@ from dvrk_drake.systems.ros.open_domain import require_cyclonedds
 _QUEUE, _MESSAGES_PER_STEP = 200, 50
 #: Longest wait for a message between two updates of the bridge [s].
 _POLL = 0.002
+#: Pause of a bridge that polls [s], after an answer and while no controller commands the arm. A thread with real-time
+#: scheduling must pause, because Linux stops it for 50 ms per second otherwise (sched_rt_runtime_us).
+_PAUSE = 0.0002
 
 
 def run_bridge(
@@ -27,6 +30,7 @@ def run_bridge(
     *,
     topic: str | None,
     domain: int | None,
+    polls: bool = False,
     stopped: Callable[[], bool],
     report: Callable[[str], None],
     ready: Callable[[], None] = lambda: None,
@@ -39,6 +43,8 @@ def run_bridge(
         url: URL of the LCM network.
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+        polls: Whether to poll for messages while a controller commands the arm. The delay decreases, but the bridge
+            uses a processor core.
         stopped: Function that returns whether to stop.
         report: Function that is called with one line for each change of the state.
         ready: Function that is called before the networks are opened, e.g. to request real-time scheduling.
@@ -69,16 +75,21 @@ def run_bridge(
                 problem = f"LCM {url}: the status could not be sent: {error.strerror}"
                 report(problem)
 
-    bridge = connect_bridge(arm, driver, send_status, topic=topic, domain=domain, report=report, stopped=stopped)
+    bridge = connect_bridge(
+        arm, driver, send_status, topic=topic, domain=domain, report=report, stopped=stopped, polled=polls
+    )
+    timeout = _PAUSE if polls else _POLL
     try:
         network.subscribe(command_channel(arm), lambda channel, data: bridge.put(data)).set_queue_capacity(_QUEUE)
         while not stopped():
-            readable, _, _ = select.select([bridge.fileno(), network.fileno()], [], [], _POLL)
+            readable, _, _ = select.select([bridge.fileno(), network.fileno()], [], [], timeout)
             if network.fileno() in readable:
                 for _ in range(_MESSAGES_PER_STEP):
                     if not handle_message(network, 0.0):
                         break
-            bridge.update()
+            is_answer = bridge.update()
+            if polls:
+                timeout = 0.0 if bridge.is_commanded and not is_answer else _PAUSE
     finally:
         is_confirmed = bridge.close()
     return is_confirmed

@@ -147,7 +147,8 @@ def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
 def test_random_commands_of_others_stop_the_bridge(arm, tmp_path):
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    operator, bridge, controller = Operator("mtml"), start_bridge("mtml", tmp_path), start_controller("mtml")
+    operator, controller = Operator("mtml"), start_controller("mtml")
+    bridge = start_bridge("mtml", tmp_path, "--poll")
     other, generator = RosDomain(), np.random.default_rng(6)
     try:
         wait_for_line(bridge, "effort, sender")

@@ -118,15 +118,24 @@ class CrtkBridge:
         self._inbox.put(data)
         self._has_commands = True
 
-    def update(self) -> None:
+    @property
+    def is_commanded(self) -> bool:
+        """True if a controller commands positions or efforts."""
+        return self.guard.state in (lcmt_dvrk_status.STATE_POSITION, lcmt_dvrk_status.STATE_EFFORT)
+
+    def update(self) -> bool:
         """Receives measurements, steps the guard if something has arrived, and publishes its output.
 
         Call this method when a message has arrived, and at least every 5 ms.
 
+        Returns:
+            Whether the guard was stepped with a command that answers the last measurement.
+
         Raises:
             DvrkDrakeError: DDS cannot send a command to the arm.
         """
-        if self._has_commands and self._awaits_answer:
+        is_answer = self._has_commands and self._awaits_answer
+        if is_answer:
             self._answer(self._clock.now())
         self._client.domain.clear()
         is_new = self._client.receive_measurement()
@@ -135,6 +144,7 @@ class CrtkBridge:
             self._measure(now)
         if is_new or (self._measured_utime and now >= self._last_step + _SILENCE):
             self._step(now)
+        return is_answer
 
     def close(self) -> bool:
         """Commands the arm to hold its present pose, and ends the deadman process.
@@ -185,7 +195,7 @@ class CrtkBridge:
     def _step(self, now: int) -> None:
         """Steps the guard after a measurement, or after a silence, and sends a status."""
         guard, client = self.guard, self._client
-        acts = guard.state in (lcmt_dvrk_status.STATE_POSITION, lcmt_dvrk_status.STATE_EFFORT)
+        acts = self.is_commanded
         if acts:
             # The controller computes its answer during this step. The status has the guard's state after the last step.
             self._send_status(guard.output)
@@ -348,6 +358,7 @@ def connect_bridge(
     domain: int | None = None,
     report: Callable[[str], None] = lambda line: None,
     stopped: Callable[[], bool] = lambda: False,
+    polled: bool = False,
 ) -> CrtkBridge:
     """Finds an arm on ROS 2 and connects a bridge with its deadman process.
 
@@ -359,6 +370,7 @@ def connect_bridge(
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         report: Function that is called with one line for each change of the state.
         stopped: Function that returns whether to end the search for the arm.
+        polled: Whether the caller calls `CrtkBridge.update` all the time; see `CrtkClient`.
 
     Returns:
         Bridge. Call `CrtkBridge.close` at the end.
@@ -368,7 +380,8 @@ def connect_bridge(
     """
     compile_guard(arm, driver)
     ros = open_ros_domain(domain)
-    client = connect_client(ros, arm, topic, ("servo_jp", "servo_jf", "hold"), report=report, stopped=stopped)
+    commands = ("servo_jp", "servo_jf", "hold")
+    client = connect_client(ros, arm, topic, commands, report=report, stopped=stopped, polled=polled)
     deadman = DeadmanProcess(client.namespace, domain)
     report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
     return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)

@@ -89,6 +89,15 @@ def test_answer_is_stepped_at_most_once_per_measurement(bench):
     assert bench.status.num_accepted + bench.status.num_refused >= before + 4
 
 
+def test_update_returns_whether_it_answered(bench):
+    assert not bench.ready().bridge.is_commanded
+    assert bench.started().bridge.is_commanded
+    bench.tick()
+    bench.bridge.put(bench.command())
+    # A bridge that polls spins until this answer, and pauses after it.
+    assert [bench.bridge.update(), bench.bridge.update()] == [True, False]
+
+
 def test_unanswered_efforts_are_published_one_period_later(bench):
     bench.started().clear()
     bench.tick()
