@@ -46,6 +46,7 @@ class DynamicIdentification(Identification):
         measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N]. One second at each end of
             the motion is omitted.
         predicted: Predicted efforts (r, n) of the actuators at the same rows, after the same low-pass filter [N m, N].
+        held_out: Efforts (r, n) that cross-validation predicts for the rows of each held-out fold [N m, N].
         dry_friction: Coordinate -> sum of its Coulomb and presliding friction, and standard error of this sum [N m, N].
         nominal_mass: Total mass of the links in the SDF [kg].
     """
@@ -54,6 +55,7 @@ class DynamicIdentification(Identification):
     period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
+    held_out: NDArray[np.float64]
     dry_friction: dict[str, tuple[float, float]]
     nominal_mass: float
 
@@ -92,16 +94,18 @@ def identify_dynamic(
     problem, effects = selection.problem, selection.effects
     fit = problem.consistent(effects, selection.weights)
     held_out = cross_validate(selection, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
-    _refuse_worse_than_zero(recording, grid, np.sqrt(held_out / np.maximum(problem.efforts, np.finfo(float).tiny)))
-    error = residuals(problem, effects, fit)
+    measured = problem.columns.tau
+    squares = np.sum((measured - held_out) ** 2, axis=0)
+    _refuse_worse_than_zero(recording, grid, np.sqrt(squares / np.maximum(problem.efforts, np.finfo(float).tiny)))
+    predicted = problem.predict(effects, fit.x)
+    error = measured - predicted
     covariance = parameter_covariance(problem, fit, error, grid.rate, grid.settings.effort_cut_off, period)
     estimates = DynamicEstimates(problem, fit, covariance)
-    section = _section(problem, effects, fit, covariance, held_out, grid, tau, period)
+    section = _section(problem, effects, fit, covariance, squares, grid, tau, period)
     section.links = estimates.links()
     section.base_parameters, section.correlations = estimates.base_parameters()
     model = _model(recording, arm, section, covariance)
     progress(1.0)
-    predicted = problem.columns.tau - error
     nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
     return DynamicIdentification(
         model=model,
@@ -109,8 +113,9 @@ def identify_dynamic(
         num_rows=len(recording),
         grid=grid,
         period=period,
-        measured=problem.columns.tau,
+        measured=measured,
         predicted=predicted,
+        held_out=held_out,
         dry_friction=estimates.dry_friction(),
         nominal_mass=nominal,
     )
@@ -157,23 +162,6 @@ def motion_problem(
     duration = len(columns.tau) / grid.rate
     independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
     return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(mandatory))
-
-
-def residuals(problem: DynamicProblem, effects: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
-    """Returns the effort residuals (r, n) of a fit at the rows of `problem` [N m, N].
-
-    The rows used for the fit may be different.
-
-    Args:
-        problem: Problem that contains the rows.
-        effects: Indices (e,) of the effects in the fit.
-        fit: Fit that includes these effects.
-    """
-    columns, p = problem.columns, problem.num_rigid
-    drive = np.column_stack(
-        [columns.shapes[i][:, effects] @ (columns.rows[effects, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]
-    )
-    return columns.tau - problem.rigid @ (columns.base @ fit.x[:p]) - drive
 
 
 def _section(

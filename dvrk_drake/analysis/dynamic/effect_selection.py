@@ -78,7 +78,7 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
 def cross_validate(
     selection: EffectSelection, phi: NDArray[np.float64], progress: Callable[[float], object] = lambda _: None
 ) -> NDArray[np.float64]:
-    """Returns the sums of squared prediction errors (n,) of the actuators over all held-out folds.
+    """Returns the predicted efforts (r, n) of the actuators, each from a fit without the fold of its row [N m, N].
 
     One group of `NUM_HELD_OUT_FOLDS` adjacent folds is held out at a time. The effects are selected again without the
     held-out folds. The direction of gravity and the physically consistent parameters are also estimated again.
@@ -102,7 +102,7 @@ def cross_validate(
     columns = (problem.actuator_columns(i, used, tilt_efforts) for i in range(len(problem.efforts)))
     size, b = problem.rigid.shape[2] + len(used) + tilts, problem.rigid.shape[2]
     equations = NormalEquations.of(columns, size, problem.columns.tau, problem.fold, problem.edge)
-    errors = np.zeros(len(problem.efforts))
+    predicted = np.empty_like(problem.columns.tau)
     for first, (effects, weights, tilt) in zip(firsts, results, strict=True):
         progress(0.4 + 0.6 * first / equations.folds)
         # Correct the efforts for the difference between the tilt estimated from all folds and the tilt estimated
@@ -113,8 +113,10 @@ def cross_validate(
         T[-1 - tilts :, -1] = np.append(problem.tilt[:tilts] - tilt, 1.0)
         training = equations.without_fold(first, NUM_HELD_OUT_FOLDS).weighted(weights)
         y = ConsistentProgram(problem, effects).solve(T.T @ training @ T)
-        errors += equations.of_fold(first, NUM_HELD_OUT_FOLDS).squares(T @ np.append(-y, 1.0))
-    return errors
+        rows = np.isin(problem.fold, np.arange(first, first + NUM_HELD_OUT_FOLDS) % equations.folds)
+        predicted[rows] = problem.predict(effects, y, rows)
+        predicted[rows] += np.tensordot(tilt - problem.tilt[:tilts], tilt_efforts[:, rows], axes=(0, 0))
+    return predicted
 
 
 def _select_without(

@@ -41,14 +41,11 @@ class SquareSums:
             sums[own[:, None], own] += weight * block
         return sums
 
-    def squares(self, combination: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the sums of squares (n,) of a linear combination of all columns, for coefficients (k + 1,)."""
-        coefficients = [combination[own] for own in self.own]
-        return np.array([max(x @ block @ x, 0.0) for x, block in zip(coefficients, self.blocks, strict=True)])
-
     def squared_errors(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the sums of squared residuals (n,) of the actuators for unknowns x (k,)."""
-        return self.squares(np.append(-x, 1.0))
+        combination = np.append(-x, 1.0)
+        coefficients = [combination[own] for own in self.own]
+        return np.array([max(c @ block @ c, 0.0) for c, block in zip(coefficients, self.blocks, strict=True)])
 
     def dense(self) -> NDArray[np.float64]:
         """Returns the products (n, k + 1, k + 1) as a dense array."""

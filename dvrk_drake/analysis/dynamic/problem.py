@@ -197,6 +197,21 @@ class DynamicProblem:
             np.empty((0, *self.columns.tau.shape)) if tilt_efforts is None else tilt_efforts,
         )
 
+    def predict(
+        self, effects: NDArray[np.int_], x: NDArray[np.float64], rows: slice | NDArray[np.bool_] = slice(None)
+    ) -> NDArray[np.float64]:
+        """Returns the predicted efforts (r, n) of the actuators at some of the rows [N m, N].
+
+        Args:
+            effects: Indices (e,) of the effects.
+            x: Rigid-body parameters and effect coefficients (p + e,).
+            rows: Rows of the result, a slice or a mask.
+        """
+        columns, p = self.columns, self.num_rigid
+        coefficients = columns.rows[effects] * x[p:, None]
+        drive = [shape[rows][:, effects] @ own for shape, own in zip(columns.shapes, coefficients.T, strict=True)]
+        return np.asarray(self.rigid[rows] @ (columns.base @ x[:p]) + np.column_stack(drive))
+
     def to_base(self, num_effects: int) -> NDArray[np.float64]:
         """Returns the matrix (b + e, p + e) that maps x (p + e,) to base parameters and effect coefficients."""
         return scipy.linalg.block_diag(self.columns.base, np.eye(num_effects))

@@ -130,8 +130,7 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     grid = motion_grid(recording, arm, dynamics.section.signals)
     measured, predicted = grid.filter_efforts(tau), grid.filter_efforts(_efforts(model, grid))
-    a = grid.efforts_at_rows(arm.transmission.position(grid.q))[grid.inner]
-    v = grid.efforts_at_rows(arm.transmission.velocity(grid.v))[grid.inner]
+    t, a, v = grid.actuator_motion()
     period = period_of(grid)
     floor: list[float | None] = [None] * arm.num_joints
     if period is not None:
@@ -141,7 +140,6 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         _actuator_error(name, measured[:, i], predicted[:, i], a[:, i], v[:, i], floor[i], float(arm.effort_limits[i]))
         for i, name in enumerate(arm.joint_names)
     ]
-    t = grid.row_times[grid.inner]
     return DynamicValidation(
         model=model,
         recording=recording,
@@ -170,6 +168,22 @@ def _actuator_error(
 ) -> ActuatorError:
     error = measured - predicted
     effort, size = float(np.sqrt(np.mean(measured**2))), float(np.sqrt(np.mean(error**2)))
+    relative = size / effort if effort > 0 else None
+    verdict = judge(effort, size, effort_limit, in_motion=True)
+    return ActuatorError(name, effort, size, relative, *error_shares(error, q, v), repeatability, verdict)
+
+
+def error_shares(
+    error: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+) -> tuple[float, float, float, float]:
+    """Returns the shares of the squared effort error of one actuator: bias, friction-like, position-dependent, other.
+
+    `ActuatorError` defines the shares. Their sum is 1.
+
+    Args:
+        error: Measured minus predicted efforts (r,) [N m, N].
+        q, v: Positions [rad, m] and velocities (r,) of the actuator.
+    """
     width = _FRICTION_WIDTH * float(np.sqrt(np.mean(v**2))) or 1.0
     travel = (q - q.min()) / (float(np.ptp(q)) or 1.0)
     kinds = [
@@ -187,8 +201,4 @@ def _actuator_error(
         shares.append((unexplained - remaining) / total)
         unexplained = remaining
     bias, friction, position = shares
-    relative = size / effort if effort > 0 else None
-    verdict = judge(effort, size, effort_limit, in_motion=True)
-    return ActuatorError(
-        name, effort, size, relative, bias, friction, position, unexplained / total, repeatability, verdict
-    )
+    return bias, friction, position, unexplained / total

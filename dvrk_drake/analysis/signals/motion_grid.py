@@ -137,6 +137,12 @@ class MotionGrid:
         """Interpolates efforts (m, n) of the actuators from the grid to the rows (r, n), with the effort delays."""
         return np.column_stack([self.at_rows(tau[:, i], i) for i in range(tau.shape[1])])
 
+    def actuator_motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Returns times (k,) [s], and positions and velocities (k, n) of the actuators, at the rows in `inner`."""
+        positions = self.efforts_at_rows(self.arm.transmission.position(self.q))
+        velocities = self.efforts_at_rows(self.arm.transmission.velocity(self.v))
+        return self.row_times[self.inner], positions[self.inner], velocities[self.inner]
+
 
 def default_settings(arm: Arm) -> SignalSettings:
     """Returns the signal settings of the arm file."""

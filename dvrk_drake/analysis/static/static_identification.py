@@ -60,12 +60,15 @@ class StaticIdentification(Identification):
         excluded: Excluded measurements and the reasons for the exclusion.
         residuals: Measured minus fitted efforts (m, n) [N m, N].
         leave_one_out_residuals: Measured efforts minus predictions (m, n) of a fit to all other poses [N m, N].
+        cross_validation_residuals: Measured efforts minus predictions (m, n) for the poses of each held-out fold, see
+            `JointStatistics` [N m, N]. For the method "paper", they are `leave_one_out_residuals`.
         measured: Mask (m, n) of the efforts that are holding torques.
     """
 
     excluded: list[ExcludedMeasurement]
     residuals: NDArray[np.float64]
     leave_one_out_residuals: NDArray[np.float64]
+    cross_validation_residuals: NDArray[np.float64]
     measured: NDArray[np.bool_]
 
 
@@ -116,7 +119,6 @@ def identify_static(
     usable = usable_measurements(tau.shape, excluded) & measured
     effects: tuple[ActuatorEffect, ...] = ()
     feedforward_scale = np.ones(arm.num_joints)
-    validated = np.full_like(tau, np.nan)
     if method == "paper":
         if rank < Y.shape[2]:
             raise IdentificationError(
@@ -168,6 +170,7 @@ def identify_static(
         excluded=excluded,
         residuals=fit.residuals,
         leave_one_out_residuals=fit.leave_one_out_residuals,
+        cross_validation_residuals=validated,
         measured=measured,
     )
 

@@ -221,3 +221,12 @@ def test_recordings_that_are_not_motions_are_rejected():
         identify_dynamic(Recording(q=q, tau=0 * q), arm)
     with pytest.raises(RecordingError, match=r"2\.0 s at 200 Hz. A dynamic model requires"):
         identify_dynamic(Recording(q=q + np.arange(400)[:, None] * 1e-6, tau=0 * q, t=np.arange(400) / 200), arm)
+
+
+def test_held_out_efforts_have_the_cross_validated_error(case):
+    _, _, _, result = case
+    error = np.sqrt(np.mean((result.measured - result.held_out) ** 2, axis=0))
+    stated = [a.rms_cross_validation for a in result.model.dynamics.actuators]
+    np.testing.assert_allclose(error, stated, rtol=1e-9, atol=1e-12)
+    # Each row is predicted without its fold, so the held-out efforts are not those of the fit.
+    assert np.all(np.max(np.abs(result.held_out - result.predicted), axis=0) > 0)
