@@ -24,7 +24,7 @@ from cyclopts import (
 
 from dvrk_drake.cli import collect, demo, export, identify, lcm, model, recordings, ros, simulate, simulated_arm
 from dvrk_drake.cli.app import app
-from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
+from dvrk_drake.cli.support import command_words, folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
 # The matrices are small. Several BLAS threads would mostly wait for each other: minutes on a busy computer.
@@ -67,6 +67,7 @@ def run(arguments: Sequence[str] | None) -> int:
     except CycloptsError as error:
         print(_usage_error(error, words), file=sys.stderr)
         return 2
+    command_words[:] = words
     try:
         if arguments is None:
             gc.disable()  # modules are never freed, and garbage collection takes a tenth of the import time

@@ -153,6 +153,8 @@ def _refuse_twice(path: str) -> None:
 #: Maximum number of progress bars on a terminal. Finished steps are removed first.
 MAX_BARS = 6
 
+#: Words of the running command, without the name of the program.
+command_words: list[str] = []
 #: Paths of the outputs of the running command.
 _outputs: set[Path] = set()
 #: Folders that the running command created. Each folder precedes its parent.

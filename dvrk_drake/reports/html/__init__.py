@@ -1,0 +1,1 @@
+"""HTML reports: the page builder, and one module per kind of result."""

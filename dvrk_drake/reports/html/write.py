@@ -1,0 +1,37 @@
+"""Writes the HTML report of a result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.reports.html.provenance import Provenance
+
+#: Mapping from the name of a result's class to the module of its report and the function in it that returns the page:
+#: `function(result, provenance) -> Page`. Modules are imported when they are needed.
+_MAKERS: dict[str, tuple[str, str]] = {}
+
+
+def write_report(
+    result: Any, path: str | Path, *, inputs: Iterable[str | Path] = (), command: Sequence[str] = ()
+) -> None:
+    """Writes the HTML report of a result, one self-contained file.
+
+    Args:
+        result: Result of a function of this package, e.g. `identify`.
+        path: File to write, e.g. "report.html".
+        inputs: Input files. The report states their names and SHA-256.
+        command: Words of the command line that computed the result, without the name of the program.
+
+    Raises:
+        DvrkDrakeError: There is no report for this type, or the file cannot be written.
+    """
+    name = type(result).__name__
+    if name not in _MAKERS:
+        raise DvrkDrakeError(f"there is no report for {name}; allowed: {', '.join(sorted(_MAKERS))}")
+    module, function = _MAKERS[name]
+    make = getattr(import_module(f"dvrk_drake.reports.html.{module}"), function)
+    make(result, Provenance.of(inputs, command)).write(path)
