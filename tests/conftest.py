@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from chromium import chromium_browser, open_page  # noqa: F401
 from own_network import pytest_terminal_summary  # noqa: F401
 
 # Must be set before numpy is imported. The matrices are small and each core already has a test worker, so additional

@@ -1,15 +1,27 @@
 "use strict";
 // Draws the plots, and links the time cursor of the plots with the animations of Meshcat.
-(function () {
+(async function () {
   // Width of the text of a printed A4 page with margins of 14 mm [px].
   const PRINT_WIDTH = 680;
-  const plots = [...document.querySelectorAll("script[data-plot]")].map((script) => {
-    const figure = JSON.parse(script.textContent);
-    const element = document.getElementById(script.dataset.plot);
-    const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
-    Plotly.newPlot(element, figure.data, figure.layout, config);
-    return element;
-  });
+  const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
+
+  // Returns the text of an element whose content is Base64 of gzip.
+  async function unpack(element) {
+    const bytes = Uint8Array.from(atob(element.textContent), (c) => c.charCodeAt(0));
+    return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+  }
+
+  const plotly = document.getElementById("plotly");
+  const script = document.createElement("script");
+  script.textContent = await unpack(plotly);
+  plotly.replaceWith(script);
+  const plots = [];
+  for (const packed of document.querySelectorAll("script[data-plot]")) {
+    const figure = JSON.parse(await unpack(packed));
+    const element = document.getElementById(packed.dataset.plot);
+    await Plotly.newPlot(element, figure.data, figure.layout, CONFIG);
+    plots.push(element);
+  }
   const timePlots = plots.filter((plot) => "time" in plot.dataset);
   const views = [...document.querySelectorAll("figure.meshcat")].map((figure) => ({
     figure,
@@ -22,6 +34,7 @@
     animator: null,
     shown: -1,
   }));
+  for (const view of views) view.frame.srcdoc = await unpack(view.figure.querySelector(".scene"));
   let time = null; // of the cursor [s]; null while there is no animation
 
   const viewerOf = (view) => view.frame.contentWindow && view.frame.contentWindow.viewer;
@@ -167,4 +180,5 @@
     }
   });
   window.addEventListener("afterprint", () => plots.forEach((plot) => Plotly.relayout(plot, { width: null, autosize: true })));
+  document.documentElement.dataset.ready = "yes";
 })();

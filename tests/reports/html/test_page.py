@@ -1,0 +1,185 @@
+"""The page builder, in a browser: plots, time cursor with the animation, layout, printing."""
+
+import hashlib
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from plotly.subplots import make_subplots
+from pydrake.geometry import Box, Meshcat, MeshcatAnimation, MeshcatParams
+from pydrake.math import RigidTransform
+from report_checks import check_report, printed_text
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.reports.html.page import Command, Page, Plot, Provenance, Section, Table, Text, Verdict
+from dvrk_drake.reports.html.page import Meshcat as MeshcatBlock
+
+#: Duration of the animation [s]. The box moves along x with 0.1 m/s.
+DURATION, SPEED = 4.0, 0.1
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """HTML page of Meshcat with a moving box."""
+    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    meshcat.SetObject("box", Box(0.1, 0.1, 0.1))
+    animation = MeshcatAnimation(frames_per_second=20)
+    for frame in range(int(20 * DURATION) + 1):
+        animation.SetTransform(frame, "box", RigidTransform([SPEED * frame / 20, 0.0, 0.0]))
+    meshcat.SetAnimation(animation)
+    return meshcat.StaticHtml()
+
+
+def effort_figure():
+    """Returns a figure with two panels over time."""
+    t = np.linspace(0.0, DURATION, 401)
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, subplot_titles=["shoulder", "elbow"])
+    for row in (1, 2):
+        figure.add_scatter(x=t, y=np.sin(row * t), name=f"measured {row}", row=row, col=1)
+    return figure.update_xaxes(title="t [s]", row=2).update_yaxes(title="effort [N m]").update_layout(height=480)
+
+
+@pytest.fixture(scope="module")
+def report(scene, tmp_path_factory):
+    """Path of a page with all kinds of blocks."""
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "poses.csv").write_text("q1,tau1\n0,1\n")
+    rows = [("shoulder", 0.0361, Verdict("good", "good")), ("elbow", 1.25, Verdict("do not use", "bad", "0.1 < 0.2"))]
+    page = Page(
+        title="MTML & <friends>",
+        subtitle="1 of 2 joints is usable.",
+        level="warning",
+        sections=[
+            Section("Verdict per joint", [Table(("joint", "error [N m]", "verdict"), rows, caption="Error")]),
+            Section("Efforts", [MeshcatBlock(scene), Plot(effort_figure(), "Efforts over time", time=True)]),
+            Section("Errors", [Plot(go.Figure(go.Bar(x=["a", "b"], y=[1, 2])), "Errors"), Text("Note", "warning")]),
+            Section("Next step", [Command("dvrk-drake validate model.yaml", "Validates the model.")]),
+        ],
+        provenance=Provenance.of([folder / "poses.csv"], ["identify", "my poses.csv"]),
+    )
+    page.write(folder / "report.html")
+    return folder / "report.html"
+
+
+@pytest.fixture
+def opened(open_page, report):
+    """The page and the frame of the 3D view, after the animation was loaded."""
+    opened = open_page(report)
+    opened.wait_for("!document.querySelector('.player').hidden")
+    return opened, opened.page.frames[1]
+
+
+def test_page_has_no_errors_requests_or_overlaps(open_page, report):
+    check_report(open_page, report)
+
+
+def box_at(opened, frame):
+    """Returns the time [s] of the animation, from the position of the box."""
+    return opened.translation("/drake/box", frame)[0] / SPEED
+
+
+def click_at(opened, t):
+    """Clicks in the plot with the cursor at time t [s]."""
+    x, y = opened.page.evaluate(
+        """(t) => {
+          const plot = document.querySelector("[data-time]"), axis = plot._fullLayout.xaxis;
+          plot.scrollIntoView({block: "center", behavior: "instant"});
+          const box = plot.getBoundingClientRect();
+          return [box.left + axis._offset + axis.l2p(t), box.top + plot._fullLayout._size.t + 20];
+        }""",
+        t,
+    )
+    opened.page.mouse.click(x, y)
+
+
+def test_click_in_a_time_plot_moves_the_animation(opened):
+    opened, frame = opened
+    assert box_at(opened, frame) == pytest.approx(0.0, abs=0.02)
+    for t in (3.0, 1.0):
+        click_at(opened, t)
+        # One pixel of the plot is about 0.01 s.
+        assert box_at(opened, frame) == pytest.approx(t, abs=0.05)
+        assert opened.page.locator(".time").text_content().startswith(f"{t:.1f}"[:2])
+
+
+def test_dragging_the_cursor_moves_the_animation(opened):
+    opened, frame = opened
+    click_at(opened, 1.0)
+    box = opened.page.locator(".cursor:visible").first.bounding_box()
+    opened.page.mouse.move(box["x"] + 5, box["y"] + 40)
+    opened.page.mouse.down()
+    opened.page.mouse.move(box["x"] + 105, box["y"] + 40, steps=4)
+    opened.page.mouse.up()
+    length = opened.page.evaluate("document.querySelector('[data-time]')._fullLayout.xaxis._length")
+    assert box_at(opened, frame) == pytest.approx(1.0 + 100 * DURATION / length, abs=0.05)
+
+
+def test_playing_animation_moves_the_cursor(opened):
+    opened, frame = opened
+    left = "document.querySelector('.cursor').getBoundingClientRect().left"
+    start = opened.page.evaluate(left)
+    opened.page.locator(".play").click()
+    opened.wait_for(f"{left} > {start + 20}")
+    assert box_at(opened, frame) > 0.05
+    opened.page.locator(".play").click()
+    stopped = opened.page.locator(".time").text_content()
+    opened.page.wait_for_timeout(300)
+    assert opened.page.locator(".time").text_content() == stopped
+
+
+def test_zoom_of_a_plot(opened):
+    opened, _ = opened
+    box = opened.page.locator("[data-time] .nsewdrag").first.bounding_box()
+    opened.page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 20)
+    opened.page.mouse.down()
+    opened.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 25, steps=5)
+    opened.page.mouse.up()
+    opened.wait_for("document.querySelector('[data-time]').layout.xaxis.range[1] < 2.2")
+    assert opened.page.evaluate("document.querySelector('[data-time]').layout.xaxis.range[0]") > 0.8
+    # The cursor at 0 s is outside the zoomed range.
+    assert opened.page.locator(".cursor:visible").count() == 0
+
+
+def test_copy_button_copies_the_command(opened):
+    opened, _ = opened
+    opened.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    opened.page.locator(".copy").click()
+    assert opened.page.evaluate("navigator.clipboard.readText()") == "dvrk-drake validate model.yaml"
+
+
+def test_printed_page_has_text_tables_and_plots(opened, tmp_path):
+    opened, _ = opened
+    text = printed_text(opened, tmp_path)
+    if text is None:
+        pytest.skip("needs pdftotext (apt-get install poppler-utils)")
+    for part in ("MTML & <friends>", "do not use", "0.1 < 0.2", "shoulder", "effort [N m]", "SHA-256", "validate"):
+        assert part in text
+    # The frame of the 3D view does not print, so its picture does.
+    assert opened.page.evaluate(
+        """() => {
+          const printed = document.querySelector("canvas.printed");
+          const pixels = printed.getContext("2d").getImageData(0, 0, printed.width, printed.height).data;
+          return new Set(pixels).size > 10;
+        }"""
+    )
+
+
+def test_page_states_hash_and_command(report):
+    html = report.read_text()
+    assert hashlib.sha256(b"q1,tau1\n0,1\n").hexdigest() in html
+    assert "dvrk-drake identify &#39;my poses.csv&#39;" in html
+    assert "MTML &amp; &lt;friends&gt;" in html and "<friends>" not in html
+
+
+def test_columns_of_numbers_are_aligned_right():
+    table = Table(("a", "b", "c", "d"), [("joint", 1.5, "-0.2", "3..5 %"), ("1 mm", 2, "12", "")])
+    assert table.alignment == ["name", "number", "number", "number"]
+    with pytest.raises(ValueError, match="a row has 1 cells, the header has 2"):
+        Table(("a", "b"), [("1",)])
+
+
+def test_failed_write_leaves_no_file(tmp_path):
+    page = Page("title", "answer", [], Provenance.of())
+    with pytest.raises((DvrkDrakeError, OSError)):
+        page.write(tmp_path / "missing" / "report.html")
+    assert not list(tmp_path.iterdir())

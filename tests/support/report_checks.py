@@ -1,0 +1,41 @@
+"""Checks that every HTML report must pass in a browser."""
+
+import subprocess
+
+#: Boxes of a report that must not overlap: text, tables, plots, 3D views, and the text inside plots.
+BOXES = "nav, h1, h2, p, figcaption, summary, table, iframe, .canvas, .player, .line"
+PLOT_TEXT = ".canvas text"
+
+
+def check_report(open_page, path):
+    """Opens a report at both sizes and checks it.
+
+    Checks errors, requests, overlaps, the width of the page, the smallest text of the plots, and the size of the file.
+
+    Returns:
+        The page, 1280 px wide.
+    """
+    for width in (1920, 1280):
+        opened = open_page(path, width=width)
+        opened.wait_for("document.documentElement.dataset.ready === 'yes'")
+        assert not opened.errors and not opened.requests
+        assert not opened.overlaps(BOXES)
+        assert not opened.overlaps(PLOT_TEXT)
+        assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "must not scroll sideways"
+        sizes = opened.page.evaluate(
+            "[...document.querySelectorAll('.canvas text')].map((text) => parseFloat(getComputedStyle(text).fontSize))"
+        )
+        assert min(sizes, default=12) >= 12, "9 pt are 12 px"
+    assert path.stat().st_size < 10e6
+    return opened
+
+
+def printed_text(opened, tmp_path):
+    """Returns the text of the printed page, or None without pdftotext."""
+    file = tmp_path / "report.pdf"
+    opened.page.pdf(path=file, format="A4", print_background=True)
+    try:
+        done = subprocess.run(["pdftotext", "-layout", file, "-"], capture_output=True, text=True, check=True)
+    except FileNotFoundError:
+        return None
+    return done.stdout
