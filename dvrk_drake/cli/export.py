@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Group, Parameter
 
 from dvrk_drake.cli.app import MODEL, Arm, Json, Model, Overwrite, Plots, Verbose, app, one_of
+from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import Steps, check_output, load_model, plots_folder, print_written, write_json
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
@@ -121,6 +122,7 @@ def compare_gc(
     arm: SourceArm = None,
     json: Json = None,
     plots: Plots = None,
+    report: Report = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
@@ -138,6 +140,7 @@ def compare_gc(
 
     if json is not None:
         check_output(json, file, model or "", overwrite=overwrite)
+    check_report(report, file, model or "", overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     installed = GravityCompensationFile.load(file)
     loaded, origin = load_model(model, arm), model or arm or ""
@@ -160,3 +163,8 @@ def compare_gc(
         print_written(folder)
     if json is not None:
         print_written(json)
+    if report is not None:
+        from dvrk_drake.reports.html.compensation import compensation_page
+
+        inputs = [file, *([model] if model else [])]
+        write_page(report, lambda provenance: compensation_page(comparison, provenance, file, origin), *inputs)

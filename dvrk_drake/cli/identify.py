@@ -22,6 +22,7 @@ from dvrk_drake.cli.app import (
     app,
     one_of,
 )
+from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
@@ -239,6 +240,7 @@ def payload(
     gravity: Gravity = None,
     locked: Locked = None,
     json: Json = None,
+    report: Report = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
@@ -260,6 +262,7 @@ def payload(
         raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
     if json is not None:
         check_output(json, reference, loaded, overwrite=overwrite)
+    check_report(report, reference, loaded, model or "", overwrite=overwrite)
     identified = None if model is None else dvrk.IdentifiedModel.load(model)
     recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
@@ -274,3 +277,8 @@ def payload(
     print_warnings(console, [warning for warning in result.warnings if warning.kind == "other link"])
     if json is not None:
         print_written(json)
+    if report is not None:
+        from dvrk_drake.reports.html.payload import payload_page
+
+        inputs = [reference, loaded, *([model] if model else [])]
+        write_page(report, lambda origin: payload_page(result, origin, model), *inputs)

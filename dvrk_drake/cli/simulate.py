@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli.app import SIMULATE, Arm, FileOptions, Overwrite, Plots, Set, Verbose, app, one_of, whole_number
+from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_written, quiet_drake, until_stopped
 from dvrk_drake.errors import ModelError, ScenarioError, StudyError
 from dvrk_drake.progress import step_progress
@@ -94,7 +95,10 @@ def study(
     ] = None,
     scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_EXECUTOR)] = None,
     plots: Plots = None,
-    overwrite: Annotated[Overwrite, Parameter(help="Write into the --plots folder even if it is not empty.")] = False,
+    report: Report = None,
+    overwrite: Annotated[
+        Overwrite, Parameter(help="Replace the --report file, and write into a --plots folder that is not empty.")
+    ] = False,
     verbose: Verbose = False,
 ) -> None:
     """Simulate a scenario with many poses, seeds and variations.
@@ -115,6 +119,7 @@ def study(
     if not output.endswith((".csv", ".parquet")):
         raise StudyError(f"{output}: must end in .csv or .parquet")
     check_output(output, overwrite=True)
+    check_report(report, study, overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     step = f"simulating {len(loaded.cases)} runs"
     with Steps(step) as steps:
@@ -134,6 +139,10 @@ def study(
 
         plot_study(folder / "study.png", loaded, rows)
         print_written(folder)
+    if report is not None:
+        from dvrk_drake.reports.html.study import study_page
+
+        write_page(report, lambda origin: study_page(loaded, rows, origin, study), study, output)
 
 
 @app.command(group=SIMULATE)
@@ -149,6 +158,7 @@ def tune(
     ] = "both",
     output: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
     plots: Plots = None,
+    report: Report = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
@@ -169,6 +179,7 @@ def tune(
     tuned = load_arm(arm)
     if output is not None:
         check_output(output, arm, overwrite=overwrite)
+    check_report(report, arm, overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     methods: list[Method] = ["paper", "model"] if method == "both" else [method]
     step = f"tuning {tuned.name}"
@@ -185,6 +196,10 @@ def tune(
 
         plot_steps(folder / "steps.png", tuning.comparison)
         print_written(folder)
+    if report is not None:
+        from dvrk_drake.reports.html.tuning import tuning_page
+
+        write_page(report, lambda origin: tuning_page(tuning, origin, output))
 
 
 @app.command(group=SIMULATE)
@@ -200,6 +215,7 @@ def transparency(
     frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
     output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
     plots: Plots = None,
+    report: Report = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
@@ -233,6 +249,7 @@ def transparency(
         if not output.endswith(".csv"):
             raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
         check_output(output, path or "", *(model or []), overwrite=overwrite)
+    check_report(report, path or "", *(model or []), overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     forces = []
     names = [f"compensation by {one.name}" if one.model else "no compensation" for one in compensations]
@@ -254,6 +271,11 @@ def transparency(
 
         plot_transparency(folder / "transparency.png", moved_arm, forces)
         print_written(folder)
+    if report is not None:
+        from dvrk_drake.reports.html.transparency import transparency_page
+
+        inputs = [*([path] if path else []), *(model or [])]
+        write_page(report, lambda origin: transparency_page(moved_arm, forces, origin), *inputs)
 
 
 def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> list[Compensation]:

@@ -229,7 +229,7 @@ def print_comparison(
     print_answer(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). Poses with a torque "
-        f"at limit, runaway or opposed: {marked:.3g} % (--verbose explains these columns).",
+        f"at limit, runaway or opposed: {marked:.3g} %{'' if verbose else ' (--verbose explains these columns)'}.",
         _next_step(comparison.model, model_name),
         "yellow" if marked else "green",
     )

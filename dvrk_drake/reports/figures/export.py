@@ -15,11 +15,12 @@ from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
 FILE_COLOUR = "#d1495b"
 
 #: Mapping from a problem to the colour of the curve that shows the share of poses with this problem.
-_PROBLEM_COLOURS = {"torque limit active": "#edae49", "opposite sign": "#d1495b", "runaway": "#5b3a8c"}
+PROBLEM_COLOURS = {"torque limit active": "#edae49", "opposite sign": "#d1495b", "runaway": "#5b3a8c"}
 
 _BINS = 60
 
-_NUM_PANELS = 6  # the file has no torque for joint 7
+#: Number of panels. The file has no torque for joint 7.
+NUM_PANELS = 6
 
 
 def plot_compensation(path: str | Path, comparison: CompensationComparison, title: str) -> None:
@@ -40,7 +41,7 @@ def plot_compensation(path: str | Path, comparison: CompensationComparison, titl
     """
     figure = plt.figure(figsize=(16, 9.5), layout="constrained")
     grid = figure.add_gridspec(4, 3, height_ratios=[3, 1, 3, 1])
-    for j in range(_NUM_PANELS):
+    for j in range(NUM_PANELS):
         row, column = 2 * (j // 3), j % 3
         torque_axes = figure.add_subplot(grid[row, column])
         share_axes = figure.add_subplot(grid[row + 1, column], sharex=torque_axes)
@@ -54,7 +55,7 @@ def plot_compensation(path: str | Path, comparison: CompensationComparison, titl
 
 def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None:
     joint, file = comparison.joints[j], comparison.file
-    edges, centres, members = _bins(comparison, j)
+    edges, centres, members = position_bins(comparison, j)
     if file.sweep is not None:
         span = np.clip(file.sweep[:, j], edges[0], edges[-1])
         axes.axvspan(*span, color="0.92", label="positions in the recording of the file")
@@ -76,9 +77,9 @@ def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None
 
 
 def _draw_shares(axes: Axes, comparison: CompensationComparison, j: int) -> None:
-    _, centres, members = _bins(comparison, j)
+    _, centres, members = position_bins(comparison, j)
     flags = (comparison.clipped, comparison.opposed, comparison.runaway)
-    for (label, colour), flag in zip(_PROBLEM_COLOURS.items(), flags, strict=True):
+    for (label, colour), flag in zip(PROBLEM_COLOURS.items(), flags, strict=True):
         axes.plot(centres, [100 * flag[m, j].mean() for m in members], color=colour, label=f"{label} [% of poses]")
     axes.set_ylim(-3, 103)
     axes.set_ylabel("poses [%]")
@@ -86,7 +87,7 @@ def _draw_shares(axes: Axes, comparison: CompensationComparison, j: int) -> None
     axes.grid(alpha=0.3)
 
 
-def _bins(
+def position_bins(
     comparison: CompensationComparison, j: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.int_]]]:
     """Returns the edges of all bins of q_j, the centres of the bins that contain poses, and the poses in each bin."""

@@ -118,11 +118,13 @@ class Plot:
         figure: Plotly figure. The page applies its own template. The height of the layout is kept, default 380 px.
         caption: Sentence above the plot that says what to see.
         time: Whether all x axes are the time [s] of the animations on the page. The plot then has the time cursor.
+        half: Whether two plots are beside each other on wide screens.
     """
 
     figure: go.Figure
     caption: str
     time: bool = False
+    half: bool = False
     kind: ClassVar[str] = "plot"
 
     def json(self) -> str:

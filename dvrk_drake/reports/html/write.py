@@ -12,7 +12,11 @@ from dvrk_drake.reports.html.provenance import Provenance
 
 #: Mapping from the name of a result's class to the module of its report and the function in it that returns the page:
 #: `function(result, provenance) -> Page`. Modules are imported when they are needed.
-_MAKERS: dict[str, tuple[str, str]] = {}
+_MAKERS = {
+    "CompensationComparison": ("compensation", "compensation_page"),
+    "PayloadIdentification": ("payload", "payload_page"),
+    "Tuning": ("tuning", "tuning_page"),
+}
 
 
 def write_report(

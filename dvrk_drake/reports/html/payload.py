@@ -1,0 +1,91 @@
+"""HTML report of an estimated payload."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, PayloadIdentification
+from dvrk_drake.reports.html.page import Page, Plot, Section, Text
+from dvrk_drake.reports.html.plot_style import FITTED_COLOUR, MEASURED_COLOUR, REFERENCE_COLOUR
+from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.html.terminal import printed_by
+from dvrk_drake.reports.payload import print_payload
+
+
+def payload_page(result: PayloadIdentification, provenance: Provenance, model_path: str | None = None) -> Page:
+    """Returns the report of an estimated payload.
+
+    Args:
+        result: Result of `dvrk_drake.payload`.
+        provenance: Origin of the report.
+        model_path: Path of the model. None if the model was identified from the reference recording.
+    """
+    printed = printed_by(print_payload, result, model_path=model_path, verbose=True)
+    tables = printed.blocks if result.payload.found else [Text("No payload was found on this link."), *printed.blocks]
+    warnings = [Text(str(warning), "warning") for warning in result.warnings]
+    count = 1 if result.payload.found else 2
+    sections = [
+        Section("Estimate", [*tables[:count], *warnings]),
+        Section("Links", [_link_plot(result.estimates, result.payload), *tables[count:]]),
+        Section("Efforts", [_effort_plot(result.payload)]),
+    ]
+    return Page(
+        f"Payload of {result.model.arm.name}",
+        printed.answer,
+        [*sections, *printed.next_section],
+        provenance,
+        printed.level,
+    )
+
+
+def _link_plot(estimates: Sequence[Payload], chosen: Payload) -> Plot:
+    """Returns the cross-validated error and the mass with its interval for a payload on each link."""
+    figure = make_subplots(rows=1, cols=2, shared_yaxes=True, horizontal_spacing=0.06)
+    names = [payload.link for payload in estimates]
+    colours = [FITTED_COLOUR if payload is chosen else REFERENCE_COLOUR for payload in estimates]
+    markers = {"size": 10, "color": colours}
+    errors = [100 * payload.relative_error for payload in estimates]
+    figure.add_scatter(x=errors, y=names, mode="markers", marker=markers, name="error", row=1, col=1)
+    found = [payload.found for payload in estimates]
+    figure.add_scatter(
+        x=[p.body.mass if ok else None for p, ok in zip(estimates, found, strict=True)],
+        y=names,
+        error_x={"array": [p.quantile * p.mass_error for p in estimates], "thickness": 2, "width": 6},
+        mode="markers",
+        marker=markers,
+        name="mass",
+        row=1,
+        col=2,
+    )
+    figure.update_xaxes(title="cross-validated error / error without payload [%]", row=1, col=1)
+    figure.update_xaxes(title=f"mass with {100 * CONFIDENCE:.0f} % interval [kg]", rangemode="tozero", row=1, col=2)
+    figure.update_yaxes(autorange="reversed", type="category")
+    figure.update_layout(height=120 + 32 * len(estimates), showlegend=False, margin={"t": 16})
+    return Plot(figure, "Error and mass for a payload on each link, best link first; no mass: no payload found")
+
+
+def _effort_plot(payload: Payload) -> Plot:
+    """Returns the RMS change of the efforts, the effort of the payload and the residual, as shares of the change."""
+    names = [actuator.name for actuator in payload.actuators]
+    figure = go.Figure()
+    for name, colour, symbol, values in (
+        ("payload", FITTED_COLOUR, "circle", [actuator.payload for actuator in payload.actuators]),
+        ("residual", MEASURED_COLOUR, "diamond", [actuator.left for actuator in payload.actuators]),
+    ):
+        shares = [100 * v / a.change if a.change else None for v, a in zip(values, payload.actuators, strict=True)]
+        figure.add_scatter(
+            x=shares,
+            y=names,
+            mode="markers",
+            name=name,
+            marker={"size": 10, "color": colour, "symbol": symbol},
+            customdata=[[v, a.change] for v, a in zip(values, payload.actuators, strict=True)],
+            hovertemplate="%{x:.1f} %: %{customdata[0]:.4g} of %{customdata[1]:.4g} N m (N if prismatic)",
+        )
+    figure.update_xaxes(title="RMS effort / RMS change of the effort [%]", rangemode="tozero")
+    figure.update_yaxes(autorange="reversed", type="category")
+    figure.update_layout(height=130 + 32 * len(names))
+    return Plot(figure, f"Share of the change that a payload on {payload.link} explains, for each actuator")
