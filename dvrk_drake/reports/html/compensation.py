@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import plotly.graph_objects as go
 
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
 from dvrk_drake.reports.export import print_comparison
+from dvrk_drake.reports.figures.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
 from dvrk_drake.reports.figures.export import NUM_PANELS, PROBLEM_COLOURS, position_bins
 from dvrk_drake.reports.html.page import Page, Plot, Section, Text
-from dvrk_drake.reports.html.plot_style import FITTED_COLOUR, LIMIT_COLOUR, MEASURED_COLOUR, joint_panels, transparent
+from dvrk_drake.reports.html.plot_style import joint_panels, transparent
 from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.html.terminal import printed_by
 
@@ -30,7 +33,7 @@ def compensation_page(
     printed = printed_by(print_comparison, file_name, model_name, comparison, verbose=True)
     warnings = [Text(f"{file_name}: {warning}.", "warning") for warning in comparison.warnings]
     return Page(
-        f"{file_name} compared with {model_name}",
+        f"{Path(file_name).name} compared with {model_name}",
         printed.answer,
         [
             Section("Differences per joint", [*warnings, *printed.blocks]),
@@ -50,10 +53,10 @@ def _torque_plot(comparison: CompensationComparison) -> Plot:
         edges, centres, members = position_bins(comparison, j)
         if comparison.file.sweep is not None:
             low, high = np.clip(comparison.file.sweep[:, j], edges[0], edges[-1])
-            figure.add_vrect(low, high, fillcolor="#eceff2", line_width=0, layer="below", **place)
+            figure.add_vrect(low, high, fillcolor=NEUTRAL, opacity=0.35, line_width=0, layer="below", **place)
         for torque, colour, label in (
-            (comparison.file_torque, MEASURED_COLOUR, "file, without torque limits"),
-            (comparison.model_torque, FITTED_COLOUR, "model"),
+            (comparison.file_torque, REFERENCE, "file, without torque limits"),
+            (comparison.model_torque, FITTED, "model"),
         ):
             low, middle, high = (np.array([f(torque[m, j]) for m in members]) for f in (np.min, np.mean, np.max))
             shared = {"legendgroup": label, "hoverinfo": "skip"}
@@ -67,7 +70,7 @@ def _torque_plot(comparison: CompensationComparison) -> Plot:
                 **place,
             )
         for limit in (joint.clip_lower, joint.clip_upper):
-            figure.add_hline(limit, line={"color": LIMIT_COLOUR, "dash": "dash", "width": 1}, **place)
+            figure.add_hline(limit, line={"color": LIMIT, "dash": "dash", "width": 1}, **place)
         figure.update_yaxes(title="torque [N m]", **place)
     sweep = "; grey: positions in the recording of the file" if comparison.file.sweep is not None else ""
     return Plot(

@@ -27,6 +27,7 @@ result (`dvrk_drake.reports.html.write`).
 from __future__ import annotations
 
 import gzip
+import re
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -240,6 +241,11 @@ def _packed(text: str) -> str:
     return b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
+def _heading(text: str) -> str:
+    """Returns a heading whose units in brackets are not broken into lines."""
+    return re.sub(r"\[[^]]*\]", lambda unit: unit[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
+
+
 @cache
 def _plotly_script() -> str:
     return _packed(get_plotlyjs())
@@ -260,6 +266,6 @@ def _environment() -> Environment:
     )
     environment.globals["file"] = lambda name: Markup(_template(name))
     environment.globals["plotly"] = _plotly_script
-    environment.filters |= {"show": _show, "packed": _packed}
+    environment.filters |= {"show": _show, "heading": _heading, "packed": _packed}
     environment.tests["verdict"] = lambda cell: isinstance(cell, Verdict)
     return environment

@@ -8,8 +8,8 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, PayloadIdentification
+from dvrk_drake.reports.figures.colours import FITTED, HELD_OUT, REFERENCE
 from dvrk_drake.reports.html.page import Page, Plot, Section, Text
-from dvrk_drake.reports.html.plot_style import FITTED_COLOUR, MEASURED_COLOUR, REFERENCE_COLOUR
 from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.html.terminal import printed_by
 from dvrk_drake.reports.payload import print_payload
@@ -45,7 +45,7 @@ def _link_plot(estimates: Sequence[Payload], chosen: Payload) -> Plot:
     """Returns the cross-validated error and the mass with its interval for a payload on each link."""
     figure = make_subplots(rows=1, cols=2, shared_yaxes=True, horizontal_spacing=0.06)
     names = [payload.link for payload in estimates]
-    colours = [FITTED_COLOUR if payload is chosen else REFERENCE_COLOUR for payload in estimates]
+    colours = [FITTED if payload is chosen else REFERENCE for payload in estimates]
     markers = {"size": 10, "color": colours}
     errors = [100 * payload.relative_error for payload in estimates]
     figure.add_scatter(x=errors, y=names, mode="markers", marker=markers, name="error", row=1, col=1)
@@ -72,8 +72,8 @@ def _effort_plot(payload: Payload) -> Plot:
     names = [actuator.name for actuator in payload.actuators]
     figure = go.Figure()
     for name, colour, symbol, values in (
-        ("payload", FITTED_COLOUR, "circle", [actuator.payload for actuator in payload.actuators]),
-        ("residual", MEASURED_COLOUR, "diamond", [actuator.left for actuator in payload.actuators]),
+        ("payload", FITTED, "circle", [actuator.payload for actuator in payload.actuators]),
+        ("residual", HELD_OUT, "diamond", [actuator.left for actuator in payload.actuators]),
     ):
         shares = [100 * v / a.change if a.change else None for v, a in zip(values, payload.actuators, strict=True)]
         figure.add_scatter(

@@ -1,4 +1,4 @@
-"""Plotly template of the reports. The colours of the roles are those of `reports.figures.style`."""
+"""Plotly template of the reports. The colours are those of `reports.figures.colours`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
+
+from dvrk_drake.reports.figures.colours import SERIES
 
 #: Fonts of the page and of its plots. No font is loaded.
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
@@ -24,9 +26,6 @@ _AXIS = {
     "tickfont": {"size": SMALLEST_TEXT},
     "title": {"font": {"size": 13}, "standoff": 8},
 }
-#: Colours of the roles, and of series without a role (Okabe and Ito), which deuteranopes can distinguish.
-MEASURED_COLOUR, FITTED_COLOUR, REFERENCE_COLOUR, LIMIT_COLOUR = "#d1495b", "#1f6f8b", "#8d99a5", "#1b2733"
-_SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#8a6d00", "#1b2733")
 #: Template of all plots: legend above the data, white background, visible axis lines.
 TEMPLATE = go.layout.Template(
     layout={
@@ -45,6 +44,7 @@ TEMPLATE = go.layout.Template(
             "x": 0.0,
             "font": {"size": SMALLEST_TEXT},
         },
+        "colorway": list(SERIES),
         "annotationdefaults": {"font": {"size": 13}},
         "xaxis": _AXIS,
         "yaxis": _AXIS,
@@ -54,7 +54,7 @@ TEMPLATE = go.layout.Template(
 
 def series_colour(i: int) -> str:
     """Returns the colour of the i-th series of a plot in which the series have no roles."""
-    return _SERIES[i % len(_SERIES)]
+    return SERIES[i % len(SERIES)]
 
 
 def transparent(colour: str, opacity: float) -> str:
@@ -72,17 +72,17 @@ def joint_panels(names: Sequence[str], x_title: str = "", x_titles: Sequence[str
         x_titles: Titles of the x axes of all panels, if the panels have different x axes.
     """
     rows = -(-len(names) // 2)
-    gap = 70.0 if x_titles else 46.0
+    height, gap = (240.0, 92.0) if x_titles else (200.0, 46.0)  # of a panel and between panels [px]
     figure = make_subplots(
         rows=rows,
         cols=2,
         subplot_titles=list(names),
         shared_xaxes="all" if x_title else False,
-        vertical_spacing=gap / (rows * 200),
+        vertical_spacing=gap / (rows * height),
         horizontal_spacing=0.09,
     )
     for j in range(len(names)):
         title = x_titles[j] if x_titles else x_title if j >= len(names) - 2 else ""
         # With an odd number of panels, the last panel of the right column is one row higher.
         figure.update_xaxes(title=title, showticklabels=bool(title) or bool(x_titles), row=1 + j // 2, col=1 + j % 2)
-    return figure.update_layout(height=110 + 200 * rows)
+    return figure.update_layout(height=110 + height * rows)

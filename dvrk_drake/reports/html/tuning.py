@@ -7,8 +7,9 @@ import plotly.graph_objects as go
 
 from dvrk_drake.experiments.tuning.bench import band
 from dvrk_drake.experiments.tuning.tuning import Comparison, Tuning
+from dvrk_drake.reports.figures.colours import LIMIT, REFERENCE
 from dvrk_drake.reports.html.page import Block, Page, Plot, Section
-from dvrk_drake.reports.html.plot_style import LIMIT_COLOUR, REFERENCE_COLOUR, joint_panels, series_colour
+from dvrk_drake.reports.html.plot_style import joint_panels, series_colour
 from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.html.terminal import printed_by
 from dvrk_drake.reports.tuning import print_tuning
@@ -58,9 +59,7 @@ def _step_plot(comparison: Comparison) -> Plot:
                 line=line, row=row, col=column,
             )  # fmt: skip
         half = 1e3 * band(arm)[j]
-        figure.add_hrect(
-            goal - half, goal + half, fillcolor=REFERENCE_COLOUR, opacity=0.25, line_width=0, row=row, col=column
-        )
+        figure.add_hrect(goal - half, goal + half, fillcolor=REFERENCE, opacity=0.25, line_width=0, row=row, col=column)
         # Limits the axis, so that an unstable response does not flatten the other curves.
         unit = "mm" if arm.prismatic[j] else "mrad"
         figure.update_yaxes(title=f"displacement [{unit}]", range=[-0.1 * goal, 1.6 * goal], row=row, col=column)
@@ -87,6 +86,6 @@ def _effort_plot(comparison: Comparison) -> Plot:
                 col=column,
             )
         for limit in (-100, 100):
-            figure.add_hline(limit, line={"color": LIMIT_COLOUR, "dash": "dash", "width": 1}, row=row, col=column)
+            figure.add_hline(limit, line={"color": LIMIT, "dash": "dash", "width": 1}, row=row, col=column)
         figure.update_yaxes(title="effort / limit [%]", row=row, col=column)
     return Plot(figure, "Commanded efforts during the step, as shares of the effort limits (dashed)")
