@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording, write_recording
     from dvrk_drake.recordings.samples import write_samples
+    from dvrk_drake.reports.html.write import write_report
     from dvrk_drake.systems.arm_station import ArmStation
     from dvrk_drake.systems.arm_view import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
@@ -55,6 +56,7 @@ _MODULES = {
     "start_meshcat": "systems.arm_view",
     "validate": "analysis.validation",
     "write_recording": "recordings.recording",
+    "write_report": "reports.html.write",
     "write_samples": "recordings.samples",
 }
 
@@ -81,6 +83,7 @@ __all__ = [
     "start_meshcat",
     "validate",
     "write_recording",
+    "write_report",
     "write_samples",
 ]
 

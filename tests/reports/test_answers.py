@@ -11,19 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from loaded_arm import two_days
+from report_results import operator_forces, study_results, tuning_result
 
 import dvrk_drake as dvrk
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.experiments.demo.demo import DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
-from dvrk_drake.experiments.study.measures import Measure
-from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
-from dvrk_drake.experiments.study.table import Row
-from dvrk_drake.experiments.transparency import OperatorForces
-from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointProperties
-from dvrk_drake.experiments.tuning.procedure import JointProcedure, Ultimate
-from dvrk_drake.experiments.tuning.sampled_loop import Margins
-from dvrk_drake.experiments.tuning.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.reports import (
@@ -108,45 +101,15 @@ def simulated(console, verbose, settings):
 
 
 def studied(console, verbose):
-    what = Study(
-        scenario="mtml",
-        random_poses=RandomPoses(6, seed=3),
-        seeds=[1, 2],
-        variations=[Variation("exact"), Variation("another one", ["controller.parameter_error=0.2"])],
-        measures=[Measure("held"), Measure("drift"), Measure("effort_share")],
-    )
-    rows = {c.index: Row({"held": c.index % 3 > 0, "drift": 1e-3 * c.index, "effort_share": 0.1}) for c in what.cases}
-    rows[5] = Row({}, "RuntimeError: the solver failed")
-    study.print_study(console, what, rows, study_path="study.yaml", verbose=verbose)
+    study.print_study(console, *study_results(), study_path="study.yaml", verbose=verbose)
 
 
 def tuned(console, verbose):
-    arm = dvrk.load_arm("psm")
-    names = (OWN, PUBLISHED, "paper", "model")
-    settling = {name: k for k, name in enumerate(reversed(names))}
-    n, q = arm.num_joints, arm.sample_poses(6, np.random.default_rng(0))
-    measures = {
-        name: [
-            [StepMeasures(np.where(np.arange(n) < settling[name], np.inf, 0.5), *np.full((3, n), 0.12)) for _ in q]
-            for _ in CONDITIONS
-        ]
-        for name in names
-    }
-    compared = Comparison(arm, dict.fromkeys(names, arm.gains), CONDITIONS, q, measures, {})
-    procedure = JointProcedure(1.2, 0.3, 0.5, Ultimate(1234.5, 0.123, 1.01, False), 1.0, False, 1.234e-3)
-    properties = JointProperties((1.23e-4, 4.56e-3), 0.1, 0.1, 1.0, 1e-4, 1e-3, 3.0)
-    design = JointDesign(1.2, 0.3, 0.5, 123.4, (Margins(0.7, 100.0, 2.3),) * 2, "phase margin")
-    found = Tuning(arm, (procedure,) * n, ArmDesign(arm.gains, (properties,) * n, (design,) * n), compared)
-    tuning.print_tuning(console, found, verbose=verbose)
+    tuning.print_tuning(console, tuning_result(), verbose=verbose)
 
 
 def forces(console, verbose):
-    t = np.linspace(0.0, 12.0, 100)
-    vectors = np.random.default_rng(0).normal(size=(100, 3))
-    names = ("nothing", "model A", "model A, friction 0.5")
-    off = np.abs(vectors[:, 0]) / 100
-    results = [OperatorForces(name, t, vectors / 10, (4 - k) * vectors, off) for k, name in enumerate(names)]
-    transparency.print_transparency(console, dvrk.load_arm("mtml"), results, verbose=verbose)
+    transparency.print_transparency(console, *operator_forces(), verbose=verbose)
 
 
 def demonstrated(console, verbose):

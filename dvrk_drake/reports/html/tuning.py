@@ -55,9 +55,15 @@ def _step_plot(comparison: Comparison) -> Plot:
             goal = 1e3 * abs(step)
             line = {"color": series_colour(i), "width": 1.6}
             figure.add_scatter(
-                x=response.t, y=np.sign(step) * displacement, name=name, legendgroup=name, showlegend=j == 0,
-                line=line, row=row, col=column,
-            )  # fmt: skip
+                x=response.t,
+                y=np.sign(step) * displacement,
+                name=name,
+                legendgroup=name,
+                showlegend=j == 0,
+                line=line,
+                row=row,
+                col=column,
+            )
         half = 1e3 * band(arm)[j]
         figure.add_hrect(goal - half, goal + half, fillcolor=REFERENCE, opacity=0.25, line_width=0, row=row, col=column)
         # Limits the axis, so that an unstable response does not flatten the other curves.

@@ -32,6 +32,15 @@ def write_report(
 
     Raises:
         DvrkDrakeError: There is no report for this type, or the file cannot be written.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+        >>> from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+        >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtml"))
+        >>> exported = dvrk.export_model(model, "gc-MTML.json", "dvrk-gc", tolerance=1.0)
+        >>> comparison = compare_compensation(GravityCompensationFile.load("gc-MTML.json"), model)
+        >>> dvrk.write_report(comparison, "report.html", inputs=["gc-MTML.json"])
     """
     name = type(result).__name__
     if name not in _MAKERS:
