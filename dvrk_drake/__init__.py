@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dvrk_drake.recordings.samples import write_samples
     from dvrk_drake.reports.html.write import write_report
     from dvrk_drake.systems.arm_station import ArmStation
-    from dvrk_drake.systems.arm_view import start_meshcat
+    from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
@@ -53,7 +53,7 @@ _MODULES = {
     "read_recording": "recordings.reading",
     "recalibrate": "analysis.recalibration",
     "simulate": "experiments.simulation",
-    "start_meshcat": "systems.arm_view",
+    "start_meshcat": "systems.arm_view.page",
     "validate": "analysis.validation",
     "write_recording": "recordings.recording",
     "write_report": "reports.html.write",

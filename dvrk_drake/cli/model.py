@@ -69,16 +69,18 @@ def view(
 ) -> None:
     """Show an arm in a web browser.
 
-    Sliders set the joint positions. The linkage stays closed.
+    Sliders set the joint positions. The linkage stays closed. Buttons show frames, joint names and gravity efforts,
+    and move the camera.
 
     Args:
-        live: Show the measured pose from the LCM messages of the arm, without sliders.
+        live: Show the measured pose and efforts from the LCM messages of the arm, and the commanded pose as a ghost.
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import show_status
-    from dvrk_drake.systems.arm_view import ArmView, start_meshcat
+    from dvrk_drake.systems.arm_view.arm_view import ArmView
+    from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
 
     quiet_drake()
     if lcm_url and not live:
@@ -87,12 +89,13 @@ def view(
     url = open_lcm(lcm_url).get_lcm_url() if live else ""
     meshcat = start_meshcat(shown, port=port)
     arm_view = ArmView(shown, meshcat)
+    arm_view.add_view_buttons()
     ending = "press Stop, Escape or Ctrl-C to end"
     if live:
         link = ArmLink(shown, url, replays=True)
-        print(f"{shown.name} live at {meshcat.web_url()}; {ending}", flush=True)
+        print(f"{shown.name} live at {tracked_url(meshcat)}; {ending}", flush=True)
         until_stopped(meshcat, lambda: show_status(arm_view, link))
         return
     arm_view.add_sliders()
-    print(f"{shown.name} at {meshcat.web_url()}; the sliders are under Open Controls; {ending}", flush=True)
-    until_stopped(meshcat, arm_view.follow_sliders)
+    print(f"{shown.name} at {tracked_url(meshcat)}; the controls are under Open Controls; {ending}", flush=True)
+    until_stopped(meshcat, arm_view.follow_controls)

@@ -59,7 +59,9 @@ def simulate(
         check_output(output, source, loaded.controller.model, overwrite=overwrite)
     page = dvrk.start_meshcat(loaded.mounted_arm) if meshcat else None
     if page is not None:
-        print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
+        from dvrk_drake.systems.arm_view.page import tracked_url
+
+        print(f"{loaded.mounted_arm.name} at {tracked_url(page)}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
     argument = (scenario or f"--arm {arm}") if folder is None else None

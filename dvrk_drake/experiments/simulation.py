@@ -24,6 +24,8 @@ from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
+from dvrk_drake.systems.arm_view.overlay import ArmOverlay
+from dvrk_drake.systems.arm_view.overlay_publisher import add_overlay
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
@@ -169,6 +171,9 @@ def _simulate(
     if hand is not None:
         outputs.append(hand.GetOutputPort("spatial_force"))
     logs = [LogVectorOutput(output, builder, scenario.sample_period) for output in outputs]
+    if meshcat is not None:
+        desired_port = desired.get_output_port() if desired is not None else None
+        add_overlay(builder, station, ArmOverlay(arm, meshcat), desired_port, phases(scenario))
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     station.SetPositions(context, poses[0])
@@ -239,6 +244,25 @@ def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration
     """Returns a trajectory that is at rest at pose `poses[i]` at time `times[i]`, and stays at the last pose."""
     times, poses = np.append(times, max(duration, times[-1]) + 1.0), np.vstack([poses, poses[-1:]])
     return PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
+
+
+def phases(scenario: Scenario) -> Callable[[float], str]:
+    """Returns a function from a time [s] to the name of the phase of a scenario, for a caption."""
+    times, poses = scenario.knots()
+    hand = [target.time for target in scenario.hand.path]
+    holds = scenario.controller.mode == "hold"
+
+    def phase(time: float) -> str:
+        if hand and hand[0] <= time <= hand[-1]:
+            return "a hand moves the arm"
+        if not holds:
+            return "gravity compensation"
+        after = int(np.searchsorted(times, time, side="right"))
+        if 0 < after < len(times) and np.any(poses[after] != poses[after - 1]):
+            return "moves to the next target"
+        return "regulates a pose"
+
+    return phase
 
 
 def _friction(scenario: Scenario) -> FrictionCompensator | None:

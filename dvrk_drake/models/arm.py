@@ -19,6 +19,7 @@ from dvrk_drake.models.arm_schema import (
     Gains,
     IdentificationSettings,
     LoopClosure,
+    ViewSettings,
 )
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
@@ -69,6 +70,7 @@ class Arm:
         console_gravity_compensation: Whether the dVRK's controller can compensate the gravity of this arm.
         locked_joints: Positions of the joints that are locked [rad, m], see `with_locked_joints`. They are not among
             the n independent joints.
+        view: Close-ups, remote centre and tip for 3D views.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -103,6 +105,7 @@ class Arm:
     separate_joint: str = ""
     console_gravity_compensation: bool = False
     locked_joints: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
+    view: ViewSettings = field(default_factory=ViewSettings)
 
     def __post_init__(self) -> None:
         self.check()

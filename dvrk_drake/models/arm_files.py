@@ -21,6 +21,7 @@ from dvrk_drake.models.arm_schema import (
     IdentificationSettings,
     Instrument,
     Mechanism,
+    ViewSettings,
 )
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
@@ -172,7 +173,24 @@ def _build_arm(
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
         separate_joint=instrument.separate_joint,
         console_gravity_compensation=mechanism.console_gravity_compensation,
+        view=_view_settings(path, mechanism.view, instrument.view, facts),
     )
+
+
+def _view_settings(path: Path, mechanism: ViewSettings, instrument: ViewSettings, facts: SdfFacts) -> ViewSettings:
+    """Returns the settings of mechanism and instrument. The entries of the instrument take precedence."""
+    view = ViewSettings(
+        {**mechanism.close_ups, **instrument.close_ups},
+        instrument.remote_center or mechanism.remote_center,
+        instrument.tip or mechanism.tip,
+    )
+    for name, links in view.close_ups.items():
+        if unknown := sorted(set(links) - facts.link_names):
+            raise ArmError(f"{path}: view.close_ups.{name}: the SDF has no link {', '.join(unknown)}")
+    for key, frame in (("remote_center", view.remote_center), ("tip", view.tip)):
+        if frame and frame not in facts.frame_names | facts.link_names:
+            raise ArmError(f"{path}: view.{key}: the SDF has no frame {frame}")
+    return view
 
 
 def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:

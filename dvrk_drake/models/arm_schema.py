@@ -124,6 +124,21 @@ class IdentificationSettings(MotionSettings):
 
 
 @dataclass
+class ViewSettings:
+    """Parts of an arm that a 3D view shows, besides its links.
+
+    Attributes:
+        close_ups: Mapping from the name of a camera position, e.g. "gimbal", to the links that fill its view.
+        remote_center: SDF frame with its origin at the remote centre of motion, which is drawn as a sphere, or "".
+        tip: SDF frame whose origin leaves a trace, or "".
+    """
+
+    close_ups: dict[str, list[str]] = field(default_factory=dict)
+    remote_center: str = ""
+    tip: str = ""
+
+
+@dataclass
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: properties that all arms of one type share.
 
@@ -132,7 +147,7 @@ class Mechanism:
     frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects` are the friction, cable and
     sensor effects of the real arm. A simulation includes only those that are named in `simulated_effects`.
     `console_gravity_compensation` states whether the dVRK's controller can compensate the gravity of this arm. It then
-    publishes the efforts on the ROS topic gravity_compensation/setpoint_js.
+    publishes the efforts on the ROS topic gravity_compensation/setpoint_js. `view` are the parts that a 3D view shows.
     """
 
     sdf: str = ""
@@ -146,6 +161,7 @@ class Mechanism:
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
     console_gravity_compensation: bool = False
+    view: ViewSettings = field(default_factory=ViewSettings)
 
 
 @dataclass
@@ -155,7 +171,8 @@ class Instrument:
     `joint_from_actuator` is the disc coupling as defined by the dVRK: joint position = sum of coefficient * actuator
     position. `friction_coordinates` are additional coordinates along which friction acts, besides joints and actuators.
     Each name is mapped to the joint coefficients of its coordinate: coordinate = sum of coefficient * joint position.
-    `separate_joint` is the joint that the dVRK publishes on separate topics `/<ARM>/<joint>/...`, or "".
+    `separate_joint` is the joint that the dVRK publishes on separate topics `/<ARM>/<joint>/...`, or "". `view` adds
+    to the close-ups of the mechanism, and replaces its other entries.
     """
 
     sdf: str = ""
@@ -168,6 +185,7 @@ class Instrument:
     motion: MotionSettings = field(default_factory=MotionSettings)
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
+    view: ViewSettings = field(default_factory=ViewSettings)
 
 
 @dataclass

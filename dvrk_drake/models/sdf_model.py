@@ -59,12 +59,16 @@ class SdfFacts:
         mimics: Mapping from a dependent joint to (leading joint, multiplier, offset).
         effort_limits: Mapping from a joint to its `<effort>` [N m or N]; joints without the tag have no entry.
         prismatic: Names of the prismatic joints; all others are revolute.
+        link_names: Names of the links.
+        frame_names: Names of the frames that are not frames of links.
     """
 
     joint_names: tuple[str, ...]
     mimics: dict[str, tuple[str, float, float]]
     effort_limits: dict[str, float]
     prismatic: frozenset[str]
+    link_names: frozenset[str]
+    frame_names: frozenset[str]
 
 
 def local_path(url: str) -> Path:
@@ -154,7 +158,10 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         effort = joint.findtext("axis/limit/effort")
         if effort is not None:
             efforts[name] = float(effort)
-    return SdfFacts(tuple(names), mimics, efforts, frozenset(prismatic))
+    links, frames = (
+        frozenset(part.get("name", "") for part in root.findall(f"model/{tag}")) for tag in ("link", "frame")
+    )
+    return SdfFacts(tuple(names), mimics, efforts, frozenset(prismatic), links, frames)
 
 
 def _read(path: Path) -> ElementTree.Element:

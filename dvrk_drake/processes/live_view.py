@@ -12,21 +12,29 @@ from collections.abc import Iterator
 import numpy as np
 
 from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.processes.control import ArmLink
-from dvrk_drake.systems.arm_view import ArmView
+from dvrk_drake.systems.arm_view.arm_view import ArmView
 
 #: Longest time to wait for a status [s]. It is short, so that the view can be closed at any time.
 _TIMEOUT = 0.2
 
 
 def show_status(view: ArmView, link: ArmLink) -> None:
-    """Displays the pose in the newest status, if there is a new status and its pose is finite."""
+    """Displays the newest status, if there is a new status and its measured pose is finite.
+
+    The view shows the measured pose and efforts, the commanded pose as a ghost, and the state of the guard as a caption.
+    """
+    view.follow_controls()
     try:
-        q = link.next_status(_TIMEOUT).position
+        status = link.next_status(_TIMEOUT)
     except ControllerError:
         return
-    if np.all(np.isfinite(q)):
-        view.show(q)
+    if np.all(np.isfinite(status.position)):
+        commanded = status.position_commanded
+        desired = commanded if np.all(np.isfinite(commanded)) else None
+        view.show(status.position, effort=status.effort_measured, desired=desired)
+        view.overlay.set_phase(describe_state(status.guard_state))
 
 
 # The function `prctl` is looked up before the fork, because few operations are safe after a fork.

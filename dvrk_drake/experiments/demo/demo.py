@@ -28,7 +28,7 @@ from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.arm_view.page import start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 

@@ -18,7 +18,7 @@ from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
 from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.arm_view.page import start_meshcat
 from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 

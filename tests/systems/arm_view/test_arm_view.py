@@ -1,4 +1,4 @@
-"""Meshcat view: linkage, sliders at the coupled limit, and camera position."""
+"""Interactive view of an arm: linkage, sliders at the coupled limit, buttons, and the live view."""
 
 import math
 import os
@@ -14,7 +14,8 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.live_view import show_status
-from dvrk_drake.systems.arm_view import ASPECT, HALF_HEIGHT, ArmView, framing, geometry_corners, start_meshcat
+from dvrk_drake.systems.arm_view.arm_view import ArmView
+from dvrk_drake.systems.arm_view.page import start_meshcat
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +36,14 @@ def test_dependent_joints_follow(view):
 
 
 def test_sliders_stop_at_the_coupled_limit(view):
-    view.show(np.zeros(7))
     for i, name in enumerate(view.arm.joint_names):
         view.meshcat.SetSliderValue(f"q{i + 1} {name}", 0.0)
-    view.follow_sliders()
+    view.follow_controls()
     view.meshcat.SetSliderValue("q2 shoulder_pitch", 0.6)
-    q = view.follow_sliders()
+    q = view.follow_controls()
     assert q[1] == pytest.approx(0.6, abs=2e-3)
     view.meshcat.SetSliderValue("q3 elbow_pitch", 0.6)
-    q = view.follow_sliders()
+    q = view.follow_controls()
     assert q[1] + q[2] <= 0.68 + 2e-3
     assert q[1] + q[2] > 0.6
     assert view.meshcat.GetSliderValue("q3 elbow_pitch") == pytest.approx(q[2])
@@ -53,29 +53,25 @@ def test_other_sliders_move_at_the_coupled_limit(view):
     """Regression: at the stop of the parallelogram, a division by zero reset every slider."""
     q = np.zeros(7)
     q[1:3] = 0.4, 0.28033  # a step of a slider beyond the limit
-    view.show(q)
-    for name, value in zip(view._slider_names, q, strict=True):
-        view.meshcat.SetSliderValue(name, value)
-    view.follow_sliders()
+    view._sliders.set_positions(q)
+    view.follow_controls()
     with np.errstate(all="raise"):
         for wanted in (0.2, 0.4):
             view.meshcat.SetSliderValue("q1 outer_yaw", wanted)
             view.meshcat.SetSliderValue("q3 elbow_pitch", 0.6)
-            q = view.follow_sliders()
+            q = view.follow_controls()
             assert q[0] == pytest.approx(wanted, abs=2e-3)
             assert 0.67 < q[1] + q[2] < 0.685
-    stop = "stopped by the limit parallelogram: -0.33 to 0.68"
-    assert view.meshcat.GetButtonClicks(stop) == 0
+    assert view._sliders.stopped_by == "stopped by the limit parallelogram: -0.33 to 0.68 rad"
     view.meshcat.SetSliderValue("q3 elbow_pitch", 0.1)
-    assert view.follow_sliders()[2] == pytest.approx(0.1, abs=2e-3)
-    with pytest.raises(RuntimeError):
-        view.meshcat.GetButtonClicks(stop)
+    assert view.follow_controls()[2] == pytest.approx(0.1, abs=2e-3)
+    assert view._sliders.stopped_by == ""
 
 
 def test_psm_sliders_move_joints_and_linkage():
     view = ArmView(load_arm("psm"), start_meshcat())
     view.add_sliders()
-    assert view._slider_names == [
+    assert view._sliders.names == [
         "q1 yaw",
         "q2 pitch",
         "q3 insertion",
@@ -85,9 +81,9 @@ def test_psm_sliders_move_joints_and_linkage():
         "q7 jaw",
     ]
     wanted = [-0.7, 0.6, 0.15, 2.0, -0.5, 0.8, 0.9]
-    for name, value in zip(view._slider_names, wanted, strict=True):
+    for name, value in zip(view._sliders.names, wanted, strict=True):
         view.meshcat.SetSliderValue(name, value)
-    np.testing.assert_allclose(view.follow_sliders(), wanted, atol=6e-3)  # a slider has steps of 1/1000 of its range
+    np.testing.assert_allclose(view.follow_controls(), wanted, atol=6e-3)  # a slider has steps of 1/1000 of its range
     plant = view._plant
     context = plant.GetMyContextFromRoot(view._context)
     for loop in view.arm.loop_closures:
@@ -97,19 +93,6 @@ def test_psm_sliders_move_joints_and_linkage():
     assert plant.GetJointByName("pitch").get_angle(context) == q[1]
     assert plant.GetJointByName("top_bar").get_angle(context) == pytest.approx(-q[1])
     assert plant.GetJointByName("counterweight").get_translation(context) == pytest.approx(q[2])
-
-
-@pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_camera_frames_the_whole_arm(name):
-    arm = load_arm(name)
-    camera, target = framing(arm)
-    forward = (target - camera) / np.linalg.norm(target - camera)
-    right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
-    seen = geometry_corners(arm) - camera
-    half_height = HALF_HEIGHT * (seen @ forward)
-    share = np.maximum(np.abs(seen @ right) / ASPECT, np.abs(seen @ np.cross(right, forward))) / half_height
-    assert (half_height > 0).all()
-    assert 0.8 < share.max() < 1.0
 
 
 class Link:
@@ -124,6 +107,8 @@ class Link:
             raise ControllerError("no status")
         status = lcmt_dvrk_status()
         status.position = position
+        status.position_commanded = [1.1 * q for q in position]
+        status.effort_measured = [0.5 * limit for limit in load_arm("mtml").effort_limits]
         return status
 
 
@@ -134,6 +119,8 @@ def test_live_view_draws_the_last_status():
     for _ in range(3):
         show_status(view, link)
         np.testing.assert_array_equal(view._q, pose)  # last drawn pose
+    np.testing.assert_array_equal(view.overlay._efforts.shares, 0.5)
+    assert view.meshcat.HasPath("/drake/mtml/overlay/ghost/desired/forearm_link")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")

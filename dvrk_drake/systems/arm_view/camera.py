@@ -1,0 +1,151 @@
+"""Camera positions from which an arm, or some of its links, fill the view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Role
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import add_arm, set_arm_positions
+
+#: Direction from the target to the camera in the base frame. Magnification relative to Meshcat's default view angle of
+#: 75 degrees.
+DIRECTION, ZOOM = (1.1, 1.0, 0.3), 2.8
+#: Half the height of the view at distance 1 from the camera. Aspect ratio (width / height) of a common browser window.
+HALF_HEIGHT, ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2
+#: Displacement of a joint from home in the poses that must be inside the view, as a fraction of the distance from home
+#: to the joint limit. With a fraction of 1, the arm would appear small. Ratio of the size of the view to the size that
+#: these poses require.
+SHARE, MARGIN = 0.75, 1.05
+#: Smallest width of a close-up [m].
+_LEAST_WIDTH = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Pose of a camera.
+
+    Attributes:
+        X_WC: Pose of the camera. Its x axis points to the right of the view, y up, and z away from the target.
+        distance: Distance to the target [m].
+    """
+
+    X_WC: RigidTransform
+    distance: float
+
+    @staticmethod
+    def looking_at(position: ArrayLike, target: ArrayLike) -> Camera:
+        """Returns the camera at `position` (3,) that looks at `target` (3,) [m]. The z axis of the world points up."""
+        position, target = np.asarray(position, float), np.asarray(target, float)
+        back = position - target
+        distance = float(np.linalg.norm(back))
+        back /= distance
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right = np.array([0.0, 1.0, 0.0]) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
+        R_WC = RotationMatrix(np.column_stack([right, np.cross(back, right), back]))
+        return Camera(RigidTransform(R_WC, position), distance)
+
+    def point(self, u: float, v: float, depth: float) -> NDArray[np.float64]:
+        """Returns a point (3,) [m] in the world from its place in the view.
+
+        Args:
+            u: Distance from the middle of the view to the right, as a multiple of half the height of the view.
+            v: Distance from the middle of the view upwards, as a multiple of half the height of the view.
+            depth: Distance from the camera along the view direction [m].
+        """
+        return np.asarray(self.X_WC @ (depth * np.array([u * HALF_HEIGHT, v * HALF_HEIGHT, -1.0])))
+
+    def place(self, p_W: ArrayLike) -> tuple[float, float, float]:
+        """Returns u, v and depth [m] of a point (3,) [m] in the world, see `point`."""
+        x, y, z = self.X_WC.inverse() @ np.asarray(p_W, float)
+        return x / (-z * HALF_HEIGHT), y / (-z * HALF_HEIGHT), -z
+
+
+def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns positions (3,) [m] of a camera and of its target in the base frame, so that the arm fills the view.
+
+    The view contains the arm at home. It also contains the poses in which one joint is displaced towards one of its
+    limits, by the fraction `SHARE` of the distance to this limit.
+
+    Raises:
+        ArmError: The arm has no visual geometry.
+    """
+    return _framing(geometry_corners(arm))
+
+
+def close_up(arm: Arm, q: ArrayLike, links: tuple[str, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns positions (3,) [m] of a camera and of its target in the base frame, so that links fill the view.
+
+    Args:
+        arm: Arm with the links.
+        q: Pose (n,) of the arm [rad, m].
+        links: Names of the links.
+
+    Raises:
+        ArmError: The links have no visual geometry.
+    """
+    return _framing(_corners(arm, np.atleast_2d(np.asarray(q, float)), links))
+
+
+def _framing(p_WC: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    target = (p_WC.min(axis=0) + p_WC.max(axis=0)) / 2
+    back = np.array(DIRECTION) / np.linalg.norm(DIRECTION)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    from_target = p_WC - target
+    off_axis = np.abs(from_target @ np.column_stack([right / ASPECT, np.cross(back, right)])).max(axis=1)
+    off_axis = np.maximum(off_axis, _LEAST_WIDTH / 2)
+    return target + np.max(from_target @ back + MARGIN * off_axis / HALF_HEIGHT) * back, target
+
+
+def home_position(arm: Arm) -> NDArray[np.float64]:
+    """Returns the home pose (n,) [rad, m]: all joints at zero, or at the limit nearest to zero."""
+    return np.clip(np.zeros(arm.num_joints), arm.position_lower, arm.position_upper)
+
+
+@cache
+def geometry_corners(arm: Arm) -> NDArray[np.float64]:
+    """Returns the corners (k, 3) of boxes around the visual geometry in the base frame [m].
+
+    The corners are those at all poses that the view must show.
+
+    Raises:
+        ArmError: The arm has no visual geometry.
+    """
+    home = home_position(arm)
+    steps = [SHARE * np.diag(limit - home) for limit in (arm.position_lower, arm.position_upper)]
+    return _corners(arm, home + np.vstack([np.zeros_like(home), *steps]), ())
+
+
+def _corners(arm: Arm, poses: NDArray[np.float64], links: tuple[str, ...]) -> NDArray[np.float64]:
+    """Returns the corners (k, 3) of the visual geometry of links, or of all links, at poses (m, n)."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+    add_arm(plant, arm)
+    plant.Finalize()
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    query_port, inspector = scene_graph.get_query_output_port(), scene_graph.model_inspector()
+    corners = []
+    for q in poses:
+        set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
+        query = query_port.Eval(scene_graph.GetMyContextFromRoot(context))
+        for geometry in inspector.GetAllGeometryIds(Role.kIllustration):
+            body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
+            if links and (body is None or body.name() not in links):
+                continue
+            box = inspector.GetObbInGeometryFrame(geometry)
+            X_WB = query.GetPoseInWorld(geometry) @ box.pose()
+            corners.append([X_WB @ (box.half_width() * sign) for sign in product((-1.0, 1.0), repeat=3)])
+    if not corners:
+        raise ArmError(f"{arm.name} has no visual geometry" + (f" of {', '.join(links)}" if links else ""))
+    return np.concatenate(corners)

@@ -1,0 +1,83 @@
+"""Sliders for the joints of an arm in Meshcat."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Meshcat
+
+from dvrk_drake.models.arm import Arm
+
+
+class JointSliders:
+    """One slider per independent joint, from its lower to its upper limit.
+
+    Attributes:
+        names: Names of the sliders.
+        degrees: Whether revolute joints have degrees, and prismatic joints mm. Otherwise, the units are rad and m.
+        stopped_by: Description of the coupled limits that stopped the sliders, or "".
+    """
+
+    def __init__(self, arm: Arm, meshcat: Meshcat, q: ArrayLike) -> None:
+        """Adds the sliders at the pose q (n,) [rad, m]."""
+        self._arm, self._meshcat = arm, meshcat
+        self._q = np.array(q, float)
+        self.names = [f"q{i + 1} {name}" for i, name in enumerate(arm.joint_names)]
+        self.degrees = False
+        self.stopped_by = ""
+        self._add()
+
+    def _add(self) -> None:
+        self._unit = self._arm.per_joint(np.radians(1.0), 1e-3) if self.degrees else np.ones(self._arm.num_joints)
+        lower, upper = self._arm.position_lower / self._unit, self._arm.position_upper / self._unit
+        for i, name in enumerate(self.names):
+            step = (upper[i] - lower[i]) / 1000
+            self._meshcat.AddSlider(name, lower[i], upper[i], step, self._q[i] / self._unit[i])
+
+    def set_degrees(self, degrees: bool) -> None:
+        """Replaces the sliders by sliders in the other units."""
+        self.degrees = degrees
+        for name in self.names:
+            self._meshcat.DeleteSlider(name)
+        self._add()
+
+    def set_positions(self, q: ArrayLike) -> None:
+        """Moves the sliders to the pose q (n,) [rad, m]."""
+        self._q = np.array(q, float)
+        for name, value in zip(self.names, self._q / self._unit, strict=True):
+            self._meshcat.SetSliderValue(name, value)
+
+    def positions(self) -> NDArray[np.float64]:
+        """Returns the pose (n,) [rad, m] of the sliders.
+
+        Sliders of joints with a coupled limit stop at this limit.
+        """
+        requested = self._read()
+        if np.array_equal(requested, self._q):
+            return self._q
+        q, self.stopped_by = self._inside_coupled_limits(requested)
+        for name, value, target in zip(self.names, requested / self._unit, q / self._unit, strict=True):
+            if value != target:
+                self._meshcat.SetSliderValue(name, target)
+        self._q = self._read()
+        return self._q
+
+    def _read(self) -> NDArray[np.float64]:
+        return np.array([self._meshcat.GetSliderValue(name) for name in self.names]) * self._unit
+
+    def _inside_coupled_limits(self, requested: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+        """Returns the pose inside the coupled limits, and a description of the limits that stopped the sliders.
+
+        A slider moves in steps, so the pose may exceed a limit slightly. In that case, the sliders cannot move further
+        beyond the limit.
+        """
+        A, lower, upper = self._arm.limit_matrix()
+        n, q, stops = self._arm.num_joints, requested.copy(), []
+        for a, least, most, limit in zip(A[n:], lower[n:], upper[n:], self._arm.coupled_limits, strict=True):
+            start, end = a @ self._q, a @ q
+            allowed = np.clip(end, min(least, start), max(most, start))
+            if end != allowed:
+                stopped = a != 0
+                q[stopped] = (self._q + (allowed - start) / (end - start) * (q - self._q))[stopped]
+                stops.append(f"stopped by the limit {limit.name}: {least:.4g} to {most:.4g} rad")
+        return q, "; ".join(stops)

@@ -1,0 +1,210 @@
+"""Overlay of an arm in Meshcat: ghosts, efforts, frames, joint names, RCM, tip trace and captions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Meshcat, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.arm_view.camera import Camera, close_up, framing, geometry_corners, home_position
+from dvrk_drake.systems.arm_view.captions import Captions
+from dvrk_drake.systems.arm_view.efforts import EffortArcs, share_color
+from dvrk_drake.systems.arm_view.ghost import ORANGE, GhostArm
+from dvrk_drake.systems.arm_view.joints import ArmJoints
+from dvrk_drake.systems.arm_view.markers import FrameAxes, RemoteCenter, TipTrace
+from dvrk_drake.systems.arm_view.scene import Scene
+from dvrk_drake.systems.arm_view.text import color_scale_image
+
+WHOLE_ARM = "whole arm"
+#: Pose of the camera of `Camera` in Meshcat's camera.
+_X_CAMERA = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])))
+DESIRED = "desired"
+#: Upper edge of the legend, see `Camera.point`.
+LEGEND_EDGE = -0.78
+#: Smallest and largest radius of the effort arcs, length of the frames' axes, radius of the RCM, and distance of joints
+#: with the same origin, as multiples of the size of the arm.
+_ARC, _AXIS, _RCM, _SAME = (0.012, 0.055), 0.06, 0.009, 1e-3
+
+
+class ArmOverlay:
+    """Information about an arm, drawn in Meshcat in addition to its links.
+
+    The overlay does not draw the links. `ArmStation(arm, meshcat=meshcat)` or `ArmView` draws them. All objects are
+    below the path of the arm, e.g. "mtml/overlay", so `SetTransform("mtml", X_WB)` moves them together with the links.
+
+    With `time`, the methods also store the drawn objects in the recording of Meshcat, if one was started. The names of
+    joints, the trace of the tip, and texts other than phases are not part of the recording.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from dvrk_drake.systems.arm_view.overlay import ArmOverlay
+        >>> from dvrk_drake.systems.arm_view.page import page_html
+        >>> arm = dvrk.load_arm("mtml")
+        >>> meshcat = dvrk.start_meshcat(arm)
+        >>> overlay = ArmOverlay(arm, meshcat)
+        >>> meshcat.StartRecording()
+        >>> overlay.set_phase("held", time=0.0)
+        >>> overlay.draw([0.0] * 7, effort=[0.0, 1.6, 0.0, 0.0, 0.0, 0.0, 0.0], desired=[0.1] * 7, time=0.0)
+        >>> meshcat.StopRecording()
+        >>> meshcat.PublishRecording()
+        >>> "<title>MTML</title>" in page_html(meshcat, "MTML")
+        True
+    """
+
+    def __init__(
+        self, arm: Arm, meshcat: Meshcat, *, X_WB: RigidTransform | None = None, camera: Camera | None = None
+    ) -> None:
+        """Adds the overlay. Nothing is visible except the RCM of the arm, if it has one.
+
+        Args:
+            arm: Arm that the overlay describes.
+            meshcat: Meshcat with the arm.
+            X_WB: Pose of the arm's base in the world. None: identity.
+            camera: Camera for which the texts are placed. None: the camera of `start_meshcat(arm)`.
+        """
+        self.arm, self.meshcat = arm, meshcat
+        self._X_WB = X_WB or RigidTransform()
+        self._camera = camera or self._looking_at(*framing(arm))
+        self._scene = Scene(meshcat, f"{arm.name.lower()}/overlay")
+        self.captions = Captions(self._scene, self._camera, self._X_WB)
+        self._joints = ArmJoints(arm)
+        self._q = home_position(arm)
+        self._joints.set_positions(self._q)
+        size = float(np.ptp(geometry_corners(arm), axis=0).max())
+        radii = _radii(self._joints.origins(), size)
+        self._efforts = EffortArcs(arm, self._joints, self._scene, radii)
+        self._frames = FrameAxes(self._joints, self._scene, _AXIS * size)
+        self._ghosts: dict[str, GhostArm] = {}
+        self._shows_names = self._shows_legend = False
+        if arm.view.remote_center:
+            RemoteCenter(self._joints, self._scene, arm.view.remote_center, _RCM * size)
+        self._trace = TipTrace(self._joints, self._scene, arm.view.tip) if arm.view.tip else None
+        self._scene.set_visible("names", False)
+        self._tracked = RigidTransform()
+
+    def add_ghost(self, name: str, color: Rgba = ORANGE) -> None:
+        """Adds a translucent arm, which `draw` shows if its argument `ghosts` has a pose with this name."""
+        self._ghosts[name] = GhostArm(self.arm, self._scene, f"ghost/{name}", color)
+
+    def draw(
+        self,
+        q: ArrayLike,
+        *,
+        effort: ArrayLike | None = None,
+        desired: ArrayLike | None = None,
+        ghosts: Mapping[str, ArrayLike] | None = None,
+        time: float | None = None,
+    ) -> None:
+        """Moves the overlay to the pose of the arm.
+
+        Args:
+            q: Pose (n,) [rad, m] of the arm.
+            effort: Efforts (n,) [N m, N] to show. None: the efforts remain as they are.
+            desired: Desired or commanded pose (n,) [rad, m], drawn as a ghost. None: this ghost is hidden.
+            ghosts: Poses of the other ghosts, see `add_ghost`. Ghosts without a pose are hidden.
+            time: Time in the recording of Meshcat [s]. None: the objects are not recorded.
+        """
+        self._q = np.array(q, float)
+        self._joints.set_positions(self._q)
+        if effort is not None:
+            self._show_legend()
+            self._efforts.draw(effort, time)
+        poses = dict(ghosts or {})
+        if desired is not None:
+            poses[DESIRED] = desired
+            if DESIRED not in self._ghosts:
+                self.add_ghost(DESIRED)
+        if unknown := set(poses) - set(self._ghosts):
+            raise DvrkDrakeError(f"unknown ghost {sorted(unknown)[0]}; known: {', '.join(self._ghosts) or 'none'}")
+        for name, ghost in self._ghosts.items():
+            if name in poses:
+                ghost.draw(poses[name], self._q, time)
+            else:
+                ghost.hide(time)
+        self._frames.draw(time)
+        if self._trace is not None:
+            self._trace.draw()
+        self._draw_names()
+
+    def set_phase(self, text: str, time: float | None = None) -> None:
+        """Shows the name of a phase, e.g. "released". "" shows nothing. A recording stores the change at `time` [s]."""
+        self.captions.set_phase(text, time)
+
+    def show_frames(self, visible: bool) -> None:
+        """Shows or hides the frames of the DH convention (x red, y green, z blue); see `ArmJoints.frame_names`."""
+        self._frames.show(visible)
+
+    def show_names(self, visible: bool) -> None:
+        """Shows or hides the names of the joints."""
+        self._shows_names = visible
+        self._scene.set_visible("names", visible)
+        self._draw_names()
+
+    def show_efforts(self, visible: bool) -> None:
+        """Shows or hides the efforts of the joints and their legend. They are visible after `draw` with an effort."""
+        self._scene.set_visible("efforts", visible)
+        self._scene.set_visible("legend", visible)
+
+    def clear_trace(self) -> None:
+        """Deletes the trace of the tip."""
+        if self._trace is not None:
+            self._trace.clear()
+
+    @property
+    def camera_presets(self) -> tuple[str, ...]:
+        """Names of camera positions for `look_at`: the whole arm, and the close-ups of the arm's file."""
+        return (WHOLE_ARM, *self.arm.view.close_ups)
+
+    def look_at(self, preset: str) -> None:
+        """Moves the camera to one of `camera_presets`. A close-up shows its links at the pose that was drawn last."""
+        links = self.arm.view.close_ups.get(preset)
+        position, target = framing(self.arm) if links is None else close_up(self.arm, self._q, tuple(links))
+        self._set_camera(self._looking_at(position, target))
+        self.meshcat.SetCameraPose(self._X_WB @ position, self._X_WB @ target)
+
+    def follow_camera(self) -> None:
+        """Turns the texts to the camera, if the browser reports its camera; see `tracked_url`."""
+        X_WC = self.meshcat.GetTrackedCameraPose()
+        if X_WC is None or X_WC.IsNearlyEqualTo(self._tracked, 1e-9):
+            return
+        self._tracked = X_WC
+        self._set_camera(Camera(X_WC @ _X_CAMERA, self._camera.distance))
+
+    def _looking_at(self, p_BC: ArrayLike, p_BT: ArrayLike) -> Camera:
+        return Camera.looking_at(self._X_WB @ np.asarray(p_BC), self._X_WB @ np.asarray(p_BT))
+
+    def _set_camera(self, camera: Camera) -> None:
+        self._camera = camera
+        self.captions.set_camera(camera)
+        self._draw_names()
+
+    def _draw_names(self) -> None:
+        if self._shows_names:
+            names = [f"{i + 1} {name}" for i, name in enumerate(self.arm.joint_names)]
+            self.captions.place_names(names, self._joints.origins())
+
+    def _show_legend(self) -> None:
+        if not self._shows_legend:
+            colors = [share_color(share) for share in np.linspace(0, 1, 50)]
+            image = color_scale_image("joint effort / effort limit", colors, ("0 %", "50 %", "100 %"))
+            self.captions.set_image("legend", image, 0.0, LEGEND_EDGE)
+            self._shows_legend = True
+
+
+def _radii(origins: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+    """Returns radii (n,) of the effort arcs [m] for joints with these origins (n, 3).
+
+    Joints that are close to each other have small arcs. Joints with the same origin have arcs of different sizes.
+    """
+    radii = np.empty(len(origins))
+    for i, p in enumerate(origins):
+        distances = np.linalg.norm(origins - p, axis=1)
+        apart = distances[distances > _SAME * size]
+        equal = np.count_nonzero(distances[:i] <= _SAME * size)
+        radii[i] = np.clip(0.35 * apart.min(initial=np.inf), _ARC[0] * size, _ARC[1] * size) * 0.8**equal
+    return radii

@@ -1,0 +1,103 @@
+"""Meshcat page: start of the server, background, ground and camera, and the page as an HTML file."""
+
+from __future__ import annotations
+
+import html
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Box, Meshcat, MeshcatParams, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.arm_view.camera import ZOOM, framing, geometry_corners
+
+#: Colours of the background. Light castings and dark motors of an arm stand out from both.
+TOP, BOTTOM = [0.36, 0.45, 0.55], [0.62, 0.69, 0.75]
+GROUND, LINES = Rgba(0.56, 0.63, 0.69), Rgba(0.45, 0.52, 0.58)
+#: Distance of the grid lines, half the width of the ground, and distance of the ground below the lowest point [m].
+GRID, HALF_WIDTH, CLEARANCE = 0.1, 1.5, 0.03
+
+
+def start_meshcat(
+    arm: Arm | None = None,
+    *,
+    camera: ArrayLike = (2.0, 2.0, 1.0),
+    target: ArrayLike = (0.0, 0.0, 0.0),
+    zoom: float = ZOOM,
+    port: int | None = None,
+) -> Meshcat:
+    """Starts Meshcat, Drake's 3D view in a browser, on localhost with a ground and a camera position.
+
+    Args:
+        arm: Arm that fills the view. The caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`. None: `camera`
+            and `target` define the view, and there is no ground.
+        camera: Position (3,) [m] of the camera, for a view without an arm.
+        target: Position (3,) [m] of the camera's target, for a view without an arm.
+        zoom: Magnification relative to Meshcat's default view angle of 75 degrees.
+        port: Port in 1024..65535. None: a free port is used.
+
+    Raises:
+        DvrkDrakeError: The port cannot be opened.
+        ArmError: The arm has no visual geometry.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("psm")
+        >>> meshcat = dvrk.start_meshcat(arm)
+        >>> station = dvrk.ArmStation(arm, meshcat=meshcat)  # drawn when it is simulated
+        >>> meshcat.web_url().startswith("http://localhost:")
+        True
+    """
+    if arm is not None:
+        camera, target = framing(arm)
+    if port is not None and not 1024 <= port <= 65535:
+        raise DvrkDrakeError(f"port {port} cannot be opened; allowed: 1024..65535")
+    try:
+        meshcat = Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
+    except RuntimeError as error:
+        raise DvrkDrakeError(
+            "no free port can be opened" if port is None else f"port {port} cannot be opened. Choose another port"
+        ) from error
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetProperty("/Background", "top_color", TOP)
+    meshcat.SetProperty("/Background", "bottom_color", BOTTOM)
+    meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", zoom)
+    meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
+    if arm is not None:
+        add_ground(meshcat, geometry_corners(arm), arm.gravity)
+    return meshcat
+
+
+def add_ground(meshcat: Meshcat, p_WC: NDArray[np.float64], gravity: ArrayLike = (0.0, 0.0, -9.81)) -> None:
+    """Draws the ground with a grid of 10 cm below the points p_WC (k, 3) [m], perpendicular to gravity (3,) [m/s^2]."""
+    down = np.asarray(gravity, float)
+    if np.linalg.norm(down) < 1e-9:
+        return
+    down /= np.linalg.norm(down)
+    center = p_WC.mean(axis=0)
+    center += (np.max((p_WC - center) @ down) + CLEARANCE) * down
+    X_WG = RigidTransform(RotationMatrix.MakeFromOneVector(-down, 2), center)
+    meshcat.SetObject("ground", Box(2 * HALF_WIDTH, 2 * HALF_WIDTH, 0.01), GROUND)
+    meshcat.SetTransform("ground", X_WG @ RigidTransform([0.0, 0.0, -0.006]))
+    steps = np.arange(-HALF_WIDTH, HALF_WIDTH + GRID / 2, GRID)
+    edge, zero = np.full_like(steps, HALF_WIDTH), np.zeros_like(steps)
+    start = np.hstack([[steps, -edge, zero], [-edge, steps, zero]])
+    end = np.hstack([[steps, edge, zero], [edge, steps, zero]])
+    meshcat.SetLineSegments("grid", np.asfortranarray(start), np.asfortranarray(end), 1.0, LINES)
+    meshcat.SetTransform("grid", X_WG)
+
+
+def tracked_url(meshcat: Meshcat) -> str:
+    """Returns the address of the page on which texts follow the camera."""
+    return f"{meshcat.web_url()}/?tracked_camera=on"
+
+
+def page_html(meshcat: Meshcat, title: str) -> str:
+    """Returns the page with its recorded animation as one HTML document with this title.
+
+    The title of the served page cannot be changed: it is fixed in Drake's HTML document.
+    """
+    return str(meshcat.StaticHtml()).replace("<title>Drake MeshCat</title>", f"<title>{html.escape(title)}</title>", 1)

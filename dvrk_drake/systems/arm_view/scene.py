@@ -1,0 +1,52 @@
+"""Paths of one arm in Meshcat. Transforms and visibilities are sent only if they change."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
+
+
+class Scene:
+    """Writes to the Meshcat paths below one root path.
+
+    Attributes:
+        meshcat: Meshcat that draws the scene.
+    """
+
+    def __init__(self, meshcat: Meshcat, root: str) -> None:
+        """Creates a scene below `root`, e.g. "mtml/overlay". Existing objects below this path are deleted."""
+        self.meshcat, self._root = meshcat, root
+        self._transforms: dict[str, NDArray[np.float64]] = {}
+        self._visible: dict[str, bool] = {}
+        meshcat.Delete(root)
+
+    def path(self, name: str) -> str:
+        """Returns the Meshcat path of `name`."""
+        return f"{self._root}/{name}"
+
+    def set_transform(self, name: str, X_PN: RigidTransform, time: float | None = None) -> None:
+        """Sets the pose of `name` in its parent path. A recording stores it at `time` [s]."""
+        # A recording interpolates between its samples, so it also requires the samples without a change.
+        if self._changes(name, X_PN.GetAsMatrix4()) or time is not None:
+            self.meshcat.SetTransform(self.path(name), X_PN, time)
+
+    def set_scaled_transform(self, name: str, X_PN: RigidTransform, scale: float) -> None:
+        """Sets the pose of `name` in its parent path, and its size. A recording does not store it."""
+        matrix = X_PN.GetAsMatrix4()
+        matrix[:3, :3] *= scale
+        if self._changes(name, matrix):
+            self.meshcat.SetTransform(self.path(name), np.asfortranarray(matrix))
+
+    def _changes(self, name: str, matrix: NDArray[np.float64]) -> bool:
+        if name in self._transforms and np.array_equal(self._transforms[name], matrix):
+            return False
+        self._transforms[name] = matrix
+        return True
+
+    def set_visible(self, name: str, visible: bool, time: float | None = None) -> None:
+        """Shows or hides `name`. A recording stores the change at `time` [s]."""
+        if self._visible.get(name) != visible:
+            self._visible[name] = visible
+            self.meshcat.SetProperty(self.path(name), "visible", visible, time)
