@@ -23,7 +23,7 @@ _TIMEOUT = 0.2
 def show_status(view: ArmView, link: ArmLink) -> None:
     """Displays the newest status, if there is a new status and its measured pose is finite.
 
-    The view shows the measured pose and efforts, the commanded pose as a ghost, and the state of the guard as a caption.
+    The view shows the measured pose and efforts. A ghost shows the commanded pose, and a caption the guard state.
     """
     view.follow_controls()
     try:
