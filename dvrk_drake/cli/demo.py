@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import PAPER, SIMULATE, Overwrite, Port, Seed, Verbose, app
-from dvrk_drake.cli.support import Steps, check_output, new_folder, print_written, quiet_drake
+from dvrk_drake.cli.support import Steps, check_output, command_words, new_folder, print_written, quiet_drake
 from dvrk_drake.progress import step_progress
 
 _DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "simulating release and step", "drawing"
@@ -95,7 +95,7 @@ def reproduce(
 ) -> None:
     """Reproduce the figures and tables of the paper (Rutfield et al., 2015).
 
-    The command writes a page that compares published and reproduced numbers.
+    The command writes an HTML page that compares published and reproduced numbers.
     Without the recording of the paper, Fig. 4 is omitted and a different MTM is simulated.
 
     Args:
@@ -113,5 +113,5 @@ def reproduce(
     output = new_folder(folder, overwrite=overwrite)
     names = NAMES if what == "all" else (what,)
     with Steps(*names) as steps:
-        page = reproduce_paper(names, output, recordings, steps, seed=seed)
+        page = reproduce_paper(names, output, recordings, steps, seed=seed, command=command_words)
     print_written(page)

@@ -2,6 +2,8 @@
 
 import csv
 import dataclasses
+import re
+from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor
 from typing import get_args, get_type_hints
 
@@ -44,6 +46,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.reproduction import run
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5
 from dvrk_drake.reports.reproduction.mechanisms import reproduce_table_1
@@ -153,20 +156,21 @@ def test_rejects_unknown_figures(tmp_path):
 
 def test_page_links_its_tables_and_figures(tmp_path):
     table = ResultTable("numbers", "Numbers", ("", "J1"), (("ours", "1"), ("theirs", "a, b")))
-    page = write_page(tmp_path, [Section("x", "Fig. 9: a, b", ("Said.",), (table,), {"x.png": "Seen"})], ["a reason"])
-    text = page.read_text()
-    assert "[Fig. 9: a, b](#fig-9-a-b)" in text
-    assert "![Seen](x.png)" in text
-    assert "| ours | 1 |" in text
-    assert "[numbers.csv](numbers.csv)" in text
-    assert "a reason" in text
+    (tmp_path / "x.png").write_bytes(b"picture")
+    section = Section("x", "Fig. 9: a, b", "Found.", ("**Said** `so`.",), (table,), {"x.png": "Seen"})
+    text = write_page(tmp_path, [section], ["a reason"], Provenance.of()).read_text()
+    assert '<a href="#section-2">Fig. 9: a, b</a>' in text
+    assert f'alt="Seen" src="data:image/png;base64,{b64encode(b"picture").decode()}"' in text
+    assert text.index("Found.") < text.index("numbers.csv") < text.index("<strong>Said</strong> <code>so</code>.")
+    assert "1 of 2 requested results were computed." in text and "Missing: a reason" in text
+    assert "reproduce all --folder reproduction --data FOLDER" in text
     with open(tmp_path / "numbers.csv") as stream:
         assert list(csv.reader(stream)) == [["", "J1"], ["ours", "1"], ["theirs", "a, b"]]
 
 
 def test_page_with_table_1_only(no_recordings, tmp_path):
-    page = write_page(tmp_path, [reproduce_table_1()], [])
-    assert "L3 = 0.3645 | 0.3645" in page.read_text()
+    page = write_page(tmp_path, [reproduce_table_1()], [], Provenance.of())
+    assert re.search(r"L3 = 0.3645</td><td[^>]*>0.3645<", page.read_text())
     assert (tmp_path / "table1.csv").stat().st_size > 0
 
 
@@ -177,8 +181,8 @@ def test_finished_figures_are_written_if_others_fail(no_recordings, monkeypatch,
     monkeypatch.setitem(run._MAKERS, "fig7", fail)
     with pytest.raises(KeyboardInterrupt):
         run.reproduce(["table1", "fig7"], tmp_path, PaperRecordings(None))
-    page = (tmp_path / "index.md").read_text()
-    assert "L3 = 0.3645 | 0.3645" in page and "fig7 was not finished" in page
+    page = (tmp_path / "index.html").read_text()
+    assert "L3 = 0.3645" in page and "fig7 was not finished" in page
 
 
 def test_shares_have_wilson_interval():
@@ -304,7 +308,7 @@ def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
     sample_sizes = SampleSizes(releases=3, paper_releases=2, hand_guided_releases=1, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_figure_5(exact_session(truth, tmp_path, executor, sample_sizes))
-    page = write_page(tmp_path, [section], []).read_text()
+    page = write_page(tmp_path, [section], [], Provenance.of()).read_text()
     assert len(section.figures) == 2
     assert all((tmp_path / figure).read_bytes().startswith(b"\x89PNG") for figure in section.figures)
     drift = {row[0]: row[1:] for row in section.tables[0].rows}
@@ -323,4 +327,4 @@ def test_compensation_reduces_operator_force(truth, tmp_path):
         section = reproduce_transparency(exact_session(truth, tmp_path, executor, SampleSizes(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]
     assert force[0] > force[2] > force[3] > 0  # unpowered, our model, our model with friction compensation
-    assert (tmp_path / "transparency.png").read_bytes().startswith(b"\x89PNG")
+    assert len(section.plots) == 2

@@ -177,6 +177,11 @@ class PaperRecordings:
         return cls(below if below is not None and (below / STATIC).is_file() else None)
 
     @property
+    def files(self) -> list[Path]:
+        """Existing files of the recordings."""
+        return [] if self.folder is None else [p for n in (STATIC, FIGURE_4) if (p := self.folder / n).is_file()]
+
+    @property
     def poses(self) -> Recording:
         """Reads the paper's 72 poses.
 

@@ -38,7 +38,7 @@ from typing import ClassVar
 
 import plotly.graph_objects as go
 from jinja2 import Environment, FunctionLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from dvrk_drake.models.files import atomic_write
@@ -67,11 +67,11 @@ Cell = str | int | float | Verdict
 
 @dataclass(frozen=True)
 class Text:
-    """Paragraph of text without markup.
+    """Paragraph of text.
 
     Attributes:
-        text: The text.
-        level: "plain", "good", "warning" or "bad". All but "plain" are drawn as a box of this colour.
+        text: The text. The only markup is **emphasis** and `code`.
+        level: "plain", "result", "good", "warning" or "bad". All but "plain" are drawn in a box.
     """
 
     text: str
@@ -134,6 +134,25 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class Image:
+    """Picture.
+
+    Attributes:
+        png: Content of a PNG file.
+        caption: Sentence above the picture that says what to see.
+    """
+
+    png: bytes
+    caption: str
+    kind: ClassVar[str] = "image"
+
+    @property
+    def base64(self) -> str:
+        """Content of the file as Base64."""
+        return b64encode(self.png).decode()
+
+
+@dataclass(frozen=True)
 class Meshcat:
     """3D view.
 
@@ -163,7 +182,7 @@ class Command:
     kind: ClassVar[str] = "command"
 
 
-Block = Text | Table | Plot | Meshcat | Command
+Block = Text | Table | Plot | Image | Meshcat | Command
 
 
 @dataclass(frozen=True)
@@ -246,6 +265,12 @@ def _heading(text: str) -> str:
     return re.sub(r"\[[^]]*\]", lambda unit: unit[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
 
 
+def _emphasis(text: str) -> Markup:
+    """Escapes text and converts **emphasis** and `code` to HTML."""
+    marked = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)), flags=re.DOTALL)
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", marked))
+
+
 @cache
 def _plotly_script() -> str:
     return _packed(get_plotlyjs())
@@ -266,6 +291,6 @@ def _environment() -> Environment:
     )
     environment.globals["file"] = lambda name: Markup(_template(name))
     environment.globals["plotly"] = _plotly_script
-    environment.filters |= {"show": _show, "heading": _heading, "packed": _packed}
+    environment.filters |= {"show": _show, "heading": _heading, "emphasis": _emphasis, "packed": _packed}
     environment.tests["verdict"] = lambda cell: isinstance(cell, Verdict)
     return environment

@@ -1,4 +1,4 @@
-"""Writes the results to a page with figures and tables, and each table to a CSV file."""
+"""Writes the results to an HTML page with figures and tables, and each table to a CSV file."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.experiments.study.table import Share
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.reports.html import page as html_page
+from dvrk_drake.reports.html.page import Block, Command, Image, Page, Plot, Table, Text
+from dvrk_drake.reports.html.provenance import Provenance
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,10 @@ class ResultTable:
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
 
-    def markdown(self) -> str:
-        """Returns the title and the table in Markdown."""
-        lines = [f"**{self.title}**", "", _line(self.header), _line(["---"] * len(self.header))]
-        return "\n".join([*lines, *map(_line, self.rows)])
+    @property
+    def block(self) -> Table:
+        """The table for the page."""
+        return Table(self.header, self.rows, self.title, note=f"File: {self.name}.csv")
 
     def csv(self) -> str:
         """Returns the content of the CSV file."""
@@ -50,50 +53,59 @@ class Section:
     Attributes:
         name: Name of the section on the command line.
         title: Heading.
+        finding: Result in one sentence.
         remarks: Paragraphs about the experiment and the differences from the paper.
         tables: Tables of results.
         figures: Mapping from the PNG file in the folder of the page to its caption.
+        plots: Interactive plots.
     """
 
     name: str
     title: str
+    finding: str
     remarks: tuple[str, ...]
     tables: tuple[ResultTable, ...] = ()
     figures: dict[str, str] = field(default_factory=dict)
+    plots: tuple[Plot, ...] = ()
 
-    def markdown(self) -> str:
-        """Returns the section in Markdown."""
-        parts = [f"## {self.title}", *self.remarks]
-        for table in self.tables:
-            parts += [table.markdown(), f"[{table.name}.csv]({table.name}.csv)"]
-        parts += [f"![{caption}]({figure})\n\n*{caption}*" for figure, caption in self.figures.items()]
-        return "\n\n".join(parts)
+    def html(self, folder: Path) -> html_page.Section:
+        """Returns the section of the page. The figures are in `folder`."""
+        blocks: list[Block] = [Text(self.finding, "result"), *(table.block for table in self.tables)]
+        blocks += [Image((folder / figure).read_bytes(), caption) for figure, caption in self.figures.items()]
+        return html_page.Section(self.title, [*blocks, *self.plots, *map(Text, self.remarks)])
 
 
-def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str]) -> Path:
-    """Writes index.md and a CSV file for each table.
+def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str], origin: Provenance) -> Path:
+    """Writes index.html and a CSV file for each table.
 
     Args:
         folder: Existing folder that contains the figures.
         sections: Sections of the page, in order.
         left_out: Requested results that could not be computed, with the reason for each.
+        origin: Provenance of the page.
 
     Returns:
-        Path of index.md.
+        Path of index.html.
     """
     for section in sections:
         for table in section.tables:
             with atomic_write(folder / f"{table.name}.csv") as stream:
                 stream.write(table.csv())
-    parts = [
-        "# Reproduction of the paper",
-        _PREFACE,
-        "\n".join(f"- [{s.title}](#{_anchor(s.title)})" for s in sections),
-    ]
-    parts += [f"**Missing:** {reason}" for reason in left_out]
-    with atomic_write(folder / "index.md") as stream:
-        stream.write("\n\n".join([*parts, *(section.markdown() for section in sections)]) + "\n")
-    return folder / "index.md"
+    missing = [Text(f"Missing: {reason}", "warning") for reason in left_out]
+    findings = Table(("result", "finding"), [(section.title, section.finding) for section in sections])
+    page = Page(
+        "Reproduction of the paper",
+        f"{len(sections)} of {len(sections) + len(left_out)} requested results were computed.",
+        [
+            html_page.Section("Findings", [*missing, findings], _PREFACE),
+            *(section.html(folder) for section in sections),
+            html_page.Section("Next step", [_NEXT_DATA if left_out else _NEXT_STUDY]),
+        ],
+        origin,
+        "warning" if left_out else "good",
+    )
+    page.write(folder / "index.html")
+    return folder / "index.html"
 
 
 def numbers(values: ArrayLike, pattern: str) -> tuple[str, ...]:
@@ -108,19 +120,17 @@ def share(held: int, total: int) -> str:
     return f"{held} of {total} ({100 * held / total:.1f} %, 95 % interval {low:.1f}..{high:.1f} %)"
 
 
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _anchor(title: str) -> str:
-    """Returns the anchor of a heading in Markdown."""
-    kept = "".join(c for c in title.lower() if c.isalnum() or c in " -_")
-    return kept.replace(" ", "-")
-
-
 _PREFACE = (
-    "This page compares published figures and tables of *Gravity Compensation Control of da Vinci Robot* (Rutfield, "
+    "This page compares published figures and tables of Gravity Compensation Control of da Vinci Robot (Rutfield, "
     "Zia, Boos, Santoso, Sujumnong, WPI 2015) with results of `dvrk-drake reproduce`. Angles are in rad, torques in "
     "N m. "
     '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes the method or model of this project.'
+)
+_NEXT_DATA = Command(
+    "dvrk-drake reproduce all --folder reproduction --data FOLDER",
+    "Computes all results. FOLDER contains the recording of the paper (docs/reproduction.md).",
+)
+_NEXT_STUDY = Command(
+    "dvrk-drake study examples/release_study.yaml --output release.csv --report release.html",
+    "Repeats releases with your own poses, seeds and variations.",
 )

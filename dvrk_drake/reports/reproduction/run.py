@@ -10,6 +10,7 @@ from dvrk_drake.experiments.reproduction.published import PaperRecordings
 from dvrk_drake.experiments.reproduction.session import ReproductionSession, SampleSizes
 from dvrk_drake.experiments.study.study import local_executor
 from dvrk_drake.progress import Progress, step_progress
+from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
 from dvrk_drake.reports.reproduction.mechanisms import reproduce_psm, reproduce_table_1
 from dvrk_drake.reports.reproduction.page import Section, write_page
@@ -39,8 +40,9 @@ def reproduce(
     progress: Progress = lambda step, share: None,
     sample_sizes: SampleSizes | None = None,
     seed: int = 0,
+    command: Sequence[str] = (),
 ) -> Path:
-    """Writes figures, tables and index.md. The function writes index.md again after each finished section.
+    """Writes figures, tables and index.html. The function writes index.html again after each finished section.
 
     Args:
         names: Sections to reproduce, from `NAMES`.
@@ -51,9 +53,10 @@ def reproduce(
             to 1).
         sample_sizes: Numbers of poses and releases. None: the default numbers.
         seed: Seed of ground-truth arms, poses and noise.
+        command: Words of the command line, for the provenance.
 
     Returns:
-        Path of index.md.
+        Path of index.html.
 
     Raises:
         DvrkDrakeError: A name is not in `NAMES`.
@@ -76,7 +79,7 @@ def reproduce(
             session.progress = _within(progress, name)
             sections.append(_MAKERS[name](session))
             unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
-            page = write_page(folder, sections, [*left_out, *unfinished])
+            page = write_page(folder, sections, [*left_out, *unfinished], Provenance.of(recordings.files, command))
     return page
 
 

@@ -91,7 +91,15 @@ def reproduce_figure_4(
         "with gravity.",
     )
     shows = "Squared torque error of joints 2-7 at 72 poses, leave-one-out; errors below 1e-9 are drawn at 1e-9"
-    return Section("fig4", "Fig. 4: torque errors", remarks, (squared, left_out), {_FILE: shows})
+    better = sum(
+        np.mean(ours.leave_one_out_residuals[included[:, j], j] ** 2)
+        < np.mean(paper.leave_one_out_residuals[included[:, j], j] ** 2)
+        for j in range(1, 7)
+    )
+    finding = (
+        f"In cross-validation, our identification has a smaller torque error than the paper's on {better} of 6 joints."
+    )
+    return Section("fig4", "Fig. 4: torque errors", finding, remarks, (squared, left_out), {_FILE: shows})
 
 
 def _excluded(ours: StaticIdentification) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from dvrk_drake.dynamics.friction_compensation import MAX_RATIO
 from dvrk_drake.experiments.reproduction.session import OperatorCase, ReproductionSession, simulate_case
 from dvrk_drake.experiments.transparency import OperatorForces
-from dvrk_drake.reports.figures.transparency import plot_transparency
+from dvrk_drake.reports.html.transparency import summary_plot, time_plot
 from dvrk_drake.reports.reproduction.page import ResultTable, Section
 
 
@@ -26,7 +26,6 @@ def reproduce_transparency(session: ReproductionSession) -> Section:
     for one in session.executor.map(simulate_case, cases):
         forces.append(one)
         session.progress("simulating the operator", len(forces) / len(cases))
-    plot_transparency(session.folder / "transparency.png", mtm.truth.arm, forces)
     table = ResultTable(
         "transparency",
         "Interaction force and torque at the handle, RMS and 95th percentile",
@@ -43,9 +42,11 @@ def reproduce_transparency(session: ReproductionSession) -> Section:
     return Section(
         "transparency",
         "Transparency: interaction force at the handle",
+        f"RMS interaction force: {forces[0].rms_force:.2f} N without compensation, {forces[1].rms_force:.2f} N with "
+        f"the paper's, {forces[2].rms_force:.2f} N with ours, {forces[3].rms_force:.2f} N with friction compensation.",
         remarks,
         (table,),
-        {"transparency.png": "Magnitude of interaction force and torque at the handle over time"},
+        plots=(summary_plot(forces), time_plot(forces)),
     )
 
 
