@@ -92,7 +92,7 @@ def record(
     The file contains only complete rows, even after Ctrl-C or an error.
 
     Args:
-        file: New file: .mcap for a bag for ROS 2 tools and Foxglove, .csv for a CSV, .log for an LCM log.
+        file: New file: .mcap for a bag for ROS 2 tools, Foxglove and Rerun, .csv for a CSV, .log for an LCM log.
         duration: Duration [s], counted from the first message. Default: until Ctrl-C.
         ros: Record the JointState messages of a dVRK over ROS 2 instead of LCM, to an .mcap bag.
         topic: With --ros: JointState topic or its namespace. Default: measured_js of the arm.

@@ -127,7 +127,7 @@ def convert(
     """Convert a recording to a CSV with a header, or to an MCAP bag.
 
     Args:
-        output: File to write: .csv, or .mcap for ROS 2 tools and Foxglove.
+        output: File to write: .csv, or .mcap for ROS 2 tools, Foxglove and Rerun.
         arm: Convert to joint coordinates of this arm. Required for bags and for files of the cisst collector.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording

@@ -66,7 +66,7 @@ def simulate(
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
     argument = (scenario or f"--arm {arm}") if folder is None else None
     if output is not None:
-        dvrk.write_recording(simulation.recording, output, loaded.mounted_arm)
+        dvrk.write_recording(simulation.recording, output, loaded.mounted_arm, simulation.setpoints)
     print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=argument, verbose=verbose)
     if output is not None:
         print_written(output, f"{len(simulation.recording)} rows")

@@ -22,7 +22,7 @@ from dvrk_drake.experiments.scenario import Scenario, Target
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import Recording, Setpoints
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.overlay_publisher import add_overlay
@@ -43,12 +43,19 @@ class Simulation:
         hand: Torque [N m], then force [N] of the hand on the arm (m, 6) at the grasped frame, expressed in the base
             frame. Zero without a hand.
         desired: Desired positions (m, n) [rad, m]. None in modes other than "hold".
+        effort_commanded: Efforts (m, n) that the controller commands [N m, N], or None.
     """
 
     recording: Recording
     state_true: NDArray[np.float64]
     hand: NDArray[np.float64]
     desired: NDArray[np.float64] | None
+    effort_commanded: NDArray[np.float64] | None = None
+
+    @property
+    def setpoints(self) -> Setpoints:
+        """Commanded positions and efforts, for `write_recording`."""
+        return Setpoints(self.desired, self.effort_commanded)
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -165,9 +172,11 @@ def _simulate(
     trajectory = _trajectory(times, poses, scenario.duration)
     desired = TrajectorySource(trajectory, output_derivative_order=1) if holds else None
     builder = DiagramBuilder()
-    add_closed_loop(builder, station, controller, desired, friction=_friction(scenario))
+    friction = _friction(scenario)
+    add_closed_loop(builder, station, controller, desired, friction)
     hand = _add_hand(builder, station, scenario)
     outputs = [station.GetOutputPort(f"{name}.{port}") for port in ("state_estimated", "effort_measured", "state_true")]
+    outputs.append((friction or controller).GetOutputPort("effort"))
     if hand is not None:
         outputs.append(hand.GetOutputPort("spatial_force"))
     logs = [LogVectorOutput(output, builder, scenario.sample_period) for output in outputs]
@@ -182,13 +191,14 @@ def _simulate(
     t = sample_times(scenario.duration, scenario.sample_period)
     with recorded_in(meshcat):
         advance(simulator, t, report)
-    estimated, tau, state_true, *hand_forces = (samples(log, simulator) for log in logs)
+    estimated, tau, state_true, effort_commanded, *hand_forces = (samples(log, simulator) for log in logs)
     q, qd = np.hsplit(estimated, 2)
     noise = np.random.default_rng(scenario.seed).normal(size=tau.shape)
     tau = tau + scenario.effort_noise * arm.effort_limits * noise
     recording = Recording(q=q, qd=qd, tau=tau, t=t, source="simulation")
     hand_force = hand_forces[0] if hand_forces else np.zeros((len(t), 6))
-    return Simulation(recording, state_true, hand_force, trajectory.vector_values(t).T if holds else None)
+    desired_positions = trajectory.vector_values(t).T if holds else None
+    return Simulation(recording, state_true, hand_force, desired_positions, effort_commanded)
 
 
 def sample_times(duration: float, period: float) -> NDArray[np.float64]:

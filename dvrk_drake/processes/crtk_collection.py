@@ -17,8 +17,10 @@ from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, approaches, estimated_duration
-from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
+from dvrk_drake.recordings.arm_bag import joint_state_topics
+from dvrk_drake.recordings.mcap_writer import GrowingMcap, Topic
 from dvrk_drake.recordings.pose_file import CollectionFile
+from dvrk_drake.recordings.ros_bag import JOINT_STATE
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
@@ -69,7 +71,7 @@ class MeasurementBag:
         self.path = path
         topics = [topic.name for topic in joint_state_topics(arm, namespace)]
         self._subscriptions = [domain.subscribe(topic, JointState, depth=_DEPTH) for topic in topics]
-        self._bag = GrowingMcap(path, topics)
+        self._bag = GrowingMcap(path, [Topic(topic, JOINT_STATE) for topic in topics])
 
     def update(self) -> None:
         """Writes the messages that have arrived.

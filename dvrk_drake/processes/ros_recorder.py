@@ -7,11 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.recorder import FIRST_STATUS, Rate
-from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
+from dvrk_drake.recordings.arm_bag import FrameMessages, joint_state_topics
+from dvrk_drake.recordings.mcap_writer import GrowingMcap, Topic
 from dvrk_drake.recordings.recording_stream import check_stream_output
+from dvrk_drake.recordings.ros_bag import JOINT_STATE
 from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
@@ -26,7 +30,7 @@ _DEPTH = 5000
 
 
 class RosRecorder:
-    """Writes the unmodified JointState messages of one arm to a new bag while they arrive.
+    """Writes the unmodified JointState messages of one arm to a new bag while they arrive, with its transforms.
 
     Attributes:
         source: Name of the ROS domain, for messages.
@@ -66,6 +70,8 @@ class RosRecorder:
         self._subscriptions: list[Subscription[JointState]] = []
         self._silent: set[str] = set()
         self._bag: GrowingMcap | None = None
+        self._frames: FrameMessages | None = None
+        self._positions: dict[str, float] = {}
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
         """Records until `stopped` returns true, or until `duration` has elapsed since the first message.
@@ -136,15 +142,29 @@ class RosRecorder:
             self._num_invalid += not is_valid
             if self._bag is None and is_valid:
                 self._check_joints(message)
-                self._bag = GrowingMcap(self._path, [each.topic for each in self._subscriptions])
+                self._frames = FrameMessages(self._arm, subscription.topic.rpartition("/")[0])
+                measured = [Topic(each.topic, JOINT_STATE) for each in self._subscriptions]
+                self._bag = GrowingMcap(self._path, [*measured, *self._frames.topics])
         if self._bag is None:
             return
         # ROS 2 uses version 1 of the CDR encoding.
-        self._bag.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, time.time_ns())
+        arrived = time.time_ns()
+        self._bag.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, arrived)
+        if is_valid:
+            self._write_frames(message, arrived)
         self._silent.discard(subscription.topic)
         if subscription is self._subscriptions[0]:
             self.num_rows += is_valid
             self._rate.add(time.monotonic())
+
+    def _write_frames(self, message: JointState, arrived: int) -> None:
+        """Writes the transforms at the latest positions of all joints, once all joints have been measured."""
+        assert self._bag is not None and self._frames is not None
+        self._positions |= zip(message.name, message.position, strict=False)
+        if all(joint in self._positions for joint in self._arm.joint_names):
+            q = np.array([self._positions[joint] for joint in self._arm.joint_names])
+            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            self._frames.write(self._bag, stamp, q, arrived)
 
     def _check_joints(self, message: JointState) -> None:
         needed = [joint for joint in self._arm.joint_names if joint != self._arm.separate_joint]

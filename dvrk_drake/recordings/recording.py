@@ -242,19 +242,37 @@ class Recording:
             )
 
 
+@dataclass(frozen=True, eq=False)
+class Setpoints:
+    """Commands to an arm in joint coordinates, one row per row of a recording [rad, m, N m, N].
+
+    Attributes:
+        q: Commanded positions (m, n), or None.
+        tau: Commanded efforts (m, n), or None.
+    """
+
+    q: NDArray[np.float64] | None = None
+    tau: NDArray[np.float64] | None = None
+
+
 def column_names(prefix: str, num_joints: int) -> list[str]:
     """Returns the column names of q, qd, tau, or t in a CSV."""
     return ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
 
 
-def write_recording(recording: Recording, path: str | Path, arm: Arm | None = None) -> None:
-    """Writes a recording as a CSV, or as an MCAP bag for ROS 2 tools and Foxglove, atomically and with full precision.
+def write_recording(
+    recording: Recording, path: str | Path, arm: Arm | None = None, setpoints: Setpoints | None = None
+) -> None:
+    """Writes a recording as a CSV, or as an MCAP bag for ROS 2 tools, Foxglove and Rerun.
+
+    The file is written atomically and with full precision. A bag also contains the transforms of the links and a URDF.
 
     Args:
         recording: Recording to write. A CSV keeps its coordinates, but does not state them. A bag is in joint
             coordinates and has other times, see `write_mcap`.
         path: Path of the file: .mcap for a bag, anything else for a CSV. An existing file is replaced.
         arm: Arm of the recording. Required for a bag, which contains the joint names.
+        setpoints: Commands of the recording. They are written only to a bag.
 
     Raises:
         RecordingError: The recording cannot be written as a bag, see `write_mcap`, or `arm` is missing.
@@ -267,13 +285,13 @@ def write_recording(recording: Recording, path: str | Path, arm: Arm | None = No
         't,q1,q2,q3,q4,q5,q6,q7'
     """
     if Path(path).suffix == ".mcap":
-        from dvrk_drake.recordings.mcap_writer import write_mcap
+        from dvrk_drake.recordings.arm_bag import write_mcap
 
         if arm is None:
             raise RecordingError(
                 f"{path}: an MCAP bag contains joint names, so the arm is required: --arm (arm= in Python)"
             )
-        write_mcap(recording, path, arm)
+        write_mcap(recording, path, arm, setpoints)
         return
     columns, header = [], []
     for prefix, block in (

@@ -18,9 +18,10 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import status_channel
+from dvrk_drake.recordings.arm_bag import ArmMessages
 from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
-from dvrk_drake.recordings.mcap_writer import GrowingMcap, joint_state_topics
+from dvrk_drake.recordings.mcap_writer import GrowingMcap
 from dvrk_drake.recordings.recording import column_names
 
 #: Ending of the file name of an LCM log.
@@ -116,17 +117,17 @@ class _LogFile(GrowingFile):
 
 
 class _McapFile:
-    """Bag with the JointState messages of a dVRK. The header stamps are the times of the measurements."""
+    """Bag with the messages of a dVRK and the transforms of its links. The header stamps are those of the statuses."""
 
     def __init__(self, path: str | Path, arm: Arm) -> None:
-        self._topics = joint_state_topics(arm)
-        self._bag = GrowingMcap(path, [topic.name for topic in self._topics])
+        self._messages = ArmMessages(arm, has_setpoints=True)
+        self._bag = GrowingMcap(path, self._messages.topics)
 
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         if status is not None:
-            q, qd, tau = np.array(measurements(status)).reshape(3, -1)
-            for topic in self._topics:
-                self._bag.write(topic, 1000 * status.utime, q, qd, tau, 1000 * utime)
+            measured = np.array(measurements(status)).reshape(3, -1)
+            commanded = np.array(status.position_commanded), None, np.array(status.effort_commanded)
+            self._messages.write(self._bag, 1000 * status.utime, list(measured), commanded, 1000 * utime)
 
     def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
         self._bag.close(progress)

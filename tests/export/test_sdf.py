@@ -21,11 +21,12 @@ from dvrk_drake.dynamics.inertial_parameters import (
 from dvrk_drake.dynamics.model_links import nearest_links
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.export.sdf import changed_links, sdf_difference, write_sdf
-from dvrk_drake.export.urdf import to_urdf, write_urdf
+from dvrk_drake.export.urdf import write_urdf
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
+from dvrk_drake.models.urdf import to_urdf
 
 
 def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:

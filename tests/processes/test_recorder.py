@@ -2,7 +2,9 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 from status_logs import ARM, statuses
 
 from dvrk_drake.models.lcm_messages import MessageKey, status_channel
@@ -79,3 +81,28 @@ def test_key_accepts_only_signed_statuses(recorder):
         made.receive(KEY.sign(status.encode()), 1e-3 * k)
     assert len(recording_of(made)) == 50
     assert made.notes() == ["messages not recorded, not signed with this key: 50"]
+
+
+def test_bag_has_the_commands_and_the_transforms(tmp_path):
+    made, sent = Recorder(ARM, tmp_path / "a.mcap", "memq://"), statuses(100)
+    for status in sent:
+        status.effort_commanded = [2 * effort for effort in status.effort_measured]
+        made._receive(status_channel(ARM), status.encode())
+    made._file.close()
+    with AnyReader([tmp_path / "a.mcap"]) as bag:
+        counts = {topic: info.msgcount for topic, info in bag.topics.items()}
+        commands = [
+            bag.deserialize(data, connection.msgtype)
+            for connection, _, data in bag.messages()
+            if connection.topic == "/MTML/setpoint_js"
+        ]
+    # 100 statuses are 0.1 s: five transforms at 50 Hz.
+    assert counts.pop("/tf") == 5
+    assert counts == {
+        "/MTML/measured_js": 100,
+        "/MTML/setpoint_js": 100,
+        "/tf_static": 1,
+        "/MTML/robot_description": 1,
+    }
+    np.testing.assert_array_equal([one.position for one in commands], [one.position_commanded for one in sent])
+    np.testing.assert_array_equal([one.effort for one in commands], [one.effort_commanded for one in sent])

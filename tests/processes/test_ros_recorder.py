@@ -4,10 +4,12 @@ import os
 import subprocess
 import sys
 from types import SimpleNamespace
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
 from ros_publisher import DOMAIN_FILE, PERIOD, START, rows
+from rosbags.highlevel import AnyReader
 from waiting import TIMEOUT
 
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
@@ -133,6 +135,10 @@ def test_invalid_messages_do_not_start_the_recording(record, tmp_path):
         "messages with header stamp 0, which marks invalid data: 2",
     ]
     assert len(read_recording(tmp_path / "a.mcap", PSM)) == 9
+    with AnyReader([tmp_path / "a.mcap"]) as bag:
+        counts = {topic: info.msgcount for topic, info in bag.topics.items()}
+    assert counts == {TOPIC: 9, JAW: 9, "/tf": ANY, "/tf_static": 1, "/PSM1/robot_description": 1}
+    assert 1 <= counts["/tf"] <= 9
 
 
 def test_missing_jaw_is_noted(record):

@@ -29,9 +29,9 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_files_are_small_ascii_text(folder):
+def test_files_of_the_package_are_small_ascii_text(folder):
     assert {path.name for path in SAMPLES_FOLDER.iterdir()} == {f"{name}.csv" for name in SAMPLES}
-    for path in folder.iterdir():
+    for path in SAMPLES_FOLDER.iterdir():
         assert path.stat().st_size < 1e6
     for name in SAMPLES:
         assert (folder / f"{name}.csv").read_bytes() == (SAMPLES_FOLDER / f"{name}.csv").read_bytes()

@@ -1,0 +1,267 @@
+"""Writes the messages of an arm to an MCAP bag for ROS 2 tools, Foxglove and Rerun.
+
+| topic | message | content |
+|---|---|---|
+| `/<ARM>/measured_js`, `/<ARM>/<separate joint>/measured_js` | `sensor_msgs/JointState` | measurements |
+| `/<ARM>/setpoint_js`, `/<ARM>/<separate joint>/setpoint_js` | `sensor_msgs/JointState` | commands |
+| `/tf`, at most `TRANSFORM_RATE` | `tf2_msgs/TFMessage` | transforms of the moving links |
+| `/tf_static`, once | `tf2_msgs/TFMessage` | constant transforms |
+| `/<ARM>/robot_description`, once | `std_msgs/String` | URDF |
+
+`read_ros_bag` reads the topics `measured_js` and ignores the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.recordings.link_frames import FrameTransform, LinkFrames, drawable_urdf
+from dvrk_drake.recordings.mcap_writer import McapWriter, Topic
+from dvrk_drake.recordings.recording import Recording, Setpoints
+from dvrk_drake.recordings.ros_bag import JOINT_STATE
+
+#: Largest rate of the messages on /tf [Hz].
+TRANSFORM_RATE = 50
+_TF, _TF_STATIC = "/tf", "/tf_static"
+_TRANSFORMS, _STRING = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
+#: Header stamp of the first row of a recording [ns]. A stamp of 0 would mark invalid data.
+_FIRST_STAMP = 1_000_000_000
+#: Interval between the header stamps of poses without times [s]. A recording with such intervals is not a motion.
+_POSE_INTERVAL = 1.0
+#: Largest header stamp [ns]: the seconds are a signed 32-bit integer.
+_LAST_STAMP = (2**31 - 1) * 1_000_000_000
+
+
+class JointStateTopic(NamedTuple):
+    """Topic with the states of some joints of an arm.
+
+    Attributes:
+        name: Name of the topic.
+        joint_names: Names of the joints.
+        columns: Index of each joint among the joints of the arm.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    columns: list[int]
+
+
+def joint_state_topics(
+    arm: Arm, namespace: str | None = None, name: str = "measured_js"
+) -> tuple[JointStateTopic, ...]:
+    """Returns the topics on which a dVRK publishes the joint states of an arm.
+
+    Args:
+        arm: Arm whose joints are published. Its `separate_joint`, e.g. the jaw, has a separate topic.
+        namespace: Namespace of the topics. Default: `/<ARM>`, where ARM is the name of the arm.
+        name: Name of the topics in their namespace.
+    """
+    namespace = f"/{arm.name}" if namespace is None else namespace
+    topics = []
+    for suffix, is_separate in (("", False), (f"/{arm.separate_joint}", True)):
+        columns = [i for i, joint in enumerate(arm.joint_names) if (joint == arm.separate_joint) == is_separate]
+        if columns:
+            joints = tuple(arm.joint_names[i] for i in columns)
+            topics.append(JointStateTopic(f"{namespace}{suffix}/{name}", joints, columns))
+    return tuple(topics)
+
+
+class FrameMessages:
+    """Messages for programs that draw an arm: transforms of its links, and its URDF.
+
+    Attributes:
+        topics: Topics of the messages.
+    """
+
+    def __init__(self, arm: Arm, namespace: str | None = None) -> None:
+        """Creates the messages of an arm. The URDF is on the topic `<namespace>/robot_description`."""
+        self._frames, self._urdf = LinkFrames(arm), drawable_urdf(arm)
+        self._description = f"{f'/{arm.name}' if namespace is None else namespace}/robot_description"
+        self._slot: int | None = None
+        self.topics = [Topic(_TF, _TRANSFORMS), Topic(_TF_STATIC, _TRANSFORMS)]
+        if self._urdf:
+            self.topics.append(Topic(self._description, _STRING))
+
+    def write(self, bag: McapWriter, stamp: int, q: NDArray[np.float64], log_time: int | None = None) -> None:
+        """Writes the transforms of the links if `TRANSFORM_RATE` permits it and all positions are finite.
+
+        The first call also writes the constant transforms and the URDF.
+
+        Args:
+            bag: Bag with the topics `topics`.
+            stamp: Header stamp, and time of publication [ns].
+            q: Positions (n,) of all joints of the arm [rad, m].
+            log_time: Time of arrival [ns]. Default: `stamp`.
+
+        Raises:
+            RecordingError: The bag cannot be written.
+        """
+        slot = stamp * TRANSFORM_RATE // 1_000_000_000
+        if slot == self._slot or not np.all(np.isfinite(q)):
+            return
+        if self._slot is None:
+            if self._urdf:
+                bag.write(self._description, bag.make(_STRING, data=self._urdf), stamp, log_time)
+            _write_transforms(bag, _TF_STATIC, stamp, self._frames.static, log_time)
+        self._slot = slot
+        _write_transforms(bag, _TF, stamp, self._frames.moving(q), log_time)
+
+
+class ArmMessages:
+    """Messages with the joint states of one arm, and those of `FrameMessages`.
+
+    Attributes:
+        topics: Topics of the messages.
+    """
+
+    def __init__(self, arm: Arm, *, has_setpoints: bool = False) -> None:
+        """Creates the messages of an arm. `has_setpoints` states whether the bag contains commands."""
+        self._measured = joint_state_topics(arm)
+        self._commanded = joint_state_topics(arm, name="setpoint_js") if has_setpoints else ()
+        self._frames = FrameMessages(arm)
+        joint_states = [Topic(topic.name, JOINT_STATE) for topic in (*self._measured, *self._commanded)]
+        self.topics = [*joint_states, *self._frames.topics]
+
+    def write(
+        self,
+        bag: McapWriter,
+        stamp: int,
+        measured: Sequence[NDArray[np.float64] | None],
+        commanded: Sequence[NDArray[np.float64] | None] = (None, None, None),
+        log_time: int | None = None,
+    ) -> None:
+        """Writes the messages of one measurement.
+
+        Args:
+            bag: Bag with the topics `topics`.
+            stamp: Header stamp, and time of publication [ns].
+            measured: Positions, velocities and efforts (n,) of all joints of the arm. None: the messages do not contain
+                the quantity. The positions are required.
+            commanded: The same for the commands. If all are None, no command is written.
+            log_time: Time of arrival [ns]. Default: `stamp`.
+
+        Raises:
+            RecordingError: The stamp is 0, negative or too large, or the bag cannot be written.
+        """
+        if not 0 < stamp <= _LAST_STAMP:
+            raise RecordingError(
+                f"the time of a measurement is {stamp / 1e9:g} s; a bag needs times above 0 s, up to "
+                f"{_LAST_STAMP / 1e9:.0f} s"
+            )
+        for topics, state in ((self._measured, measured), (self._commanded, commanded)):
+            if any(part is not None for part in state):
+                for topic in topics:
+                    _write_joint_state(bag, topic, stamp, state, log_time)
+        q = measured[0]
+        assert q is not None
+        self._frames.write(bag, stamp, q, log_time)
+
+
+def _header(bag: McapWriter, stamp: int, frame_id: str = "") -> object:
+    sec, nanosec = divmod(stamp, 1_000_000_000)
+    time = bag.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return bag.make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+
+
+def _write_joint_state(
+    bag: McapWriter,
+    topic: JointStateTopic,
+    stamp: int,
+    state: Sequence[NDArray[np.float64] | None],
+    log_time: int | None,
+) -> None:
+    position, velocity, effort = (np.empty(0) if part is None else part[topic.columns] for part in state)
+    message = bag.make(
+        JOINT_STATE,
+        header=_header(bag, stamp),
+        name=list(topic.joint_names),
+        position=position,
+        velocity=velocity,
+        effort=effort,
+    )
+    bag.write(topic.name, message, stamp, log_time)
+
+
+def _write_transforms(
+    bag: McapWriter, topic: str, stamp: int, transforms: Iterable[FrameTransform], log_time: int | None
+) -> None:
+    messages = []
+    for parent, child, X_PC in transforms:
+        (x, y, z), rotation = X_PC.translation(), X_PC.rotation().ToQuaternion()
+        transform = bag.make(
+            "geometry_msgs/msg/Transform",
+            translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=bag.make(
+                "geometry_msgs/msg/Quaternion", x=rotation.x(), y=rotation.y(), z=rotation.z(), w=rotation.w()
+            ),
+        )
+        messages.append(
+            bag.make(
+                "geometry_msgs/msg/TransformStamped",
+                header=_header(bag, stamp, parent),
+                child_frame_id=child,
+                transform=transform,
+            )
+        )
+    bag.write(topic, bag.make(_TRANSFORMS, transforms=messages), stamp, log_time)
+
+
+def write_mcap(recording: Recording, path: str | Path, arm: Arm, setpoints: Setpoints | None = None) -> None:
+    """Writes a recording as an MCAP bag, atomically and with full precision, in joint coordinates of the arm.
+
+    The header stamp of the first row is 1 s. The intervals between the rows are those of the recording. Static poses
+    without times are 1 s apart, so they are not read as a motion. The log times are the header stamps.
+
+    Args:
+        recording: Recording to write.
+        path: Path of the bag; an existing file is replaced.
+        arm: Arm whose name and joint names the bag contains.
+        setpoints: Commands of the recording.
+
+    Raises:
+        RecordingError: The number of joints is wrong, there are no rows, or the times do not increase.
+        DvrkDrakeError: The folder does not exist or cannot be written.
+    """
+    joints = recording.in_joint_coordinates(arm)
+    stamps = _stamps(joints, path)
+    messages = ArmMessages(arm, has_setpoints=setpoints is not None)
+    commands = (setpoints.q, None, setpoints.tau) if setpoints is not None else (None, None, None)
+    with atomic_write(path, "wb") as stream:
+        bag = McapWriter(stream, messages.topics)
+        for row, stamp in enumerate(stamps):
+            measured, commanded = (
+                [None if part is None else part[row] for part in parts]
+                for parts in ((joints.q, joints.qd, joints.tau), commands)
+            )
+            messages.write(bag, stamp, measured, commanded)
+        bag.finish()
+
+
+def _stamps(recording: Recording, path: str | Path) -> list[int]:
+    """Returns the header stamps [ns] of all rows.
+
+    Raises:
+        RecordingError: There are no rows, or the stamps do not increase or are too large.
+    """
+    if not len(recording):
+        raise RecordingError(f"{path} was not written: the recording has no rows")
+    t = recording.t if recording.t is not None else _POSE_INTERVAL * np.arange(len(recording))
+    elapsed = 1e9 * (t - t[0])
+    if not np.all(elapsed < _LAST_STAMP - _FIRST_STAMP):  # also false for NaN
+        raise RecordingError(f"{path} was not written: allowed in a bag: finite times up to {_LAST_STAMP / 1e9:g} s")
+    stamps = _FIRST_STAMP + np.rint(elapsed).astype(np.int64)
+    if np.any(late := np.diff(stamps) <= 0):
+        row = int(np.argmax(late)) + 1
+        raise RecordingError(
+            f"{recording.where(row)}: t = {t[row]:.9g} s is not later than the previous row; the times of a bag must "
+            "increase by at least 1 ns"
+        )
+    return stamps.tolist()
