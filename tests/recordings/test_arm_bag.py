@@ -70,7 +70,7 @@ def assert_equal_poses(first, second):
     np.testing.assert_allclose(first.GetAsMatrix4(), second.GetAsMatrix4(), rtol=0, atol=1e-9)
 
 
-def test_transforms_equal_the_forward_kinematics_of_drake(tmp_path, arm):
+def test_transforms_equal_forward_kinematics_of_drake(tmp_path, arm):
     recording = poses_of(arm)
     write_recording(recording, tmp_path / "a.mcap", arm)
     messages = decoded(tmp_path / "a.mcap")
@@ -107,7 +107,7 @@ def test_linkage_is_closed(tmp_path, arm):
             np.testing.assert_allclose(p_WP(X_WF, loop.frame_a), p_WP(X_WF, loop.frame_b), atol=1e-9)
 
 
-def test_urdf_has_the_frames_and_the_kinematics_of_the_transforms(tmp_path, arm):
+def test_urdf_has_the_frames_of_the_transforms(tmp_path, arm):
     recording = poses_of(arm)
     write_recording(recording, tmp_path / "a.mcap", arm)
     messages = decoded(tmp_path / "a.mcap")
@@ -179,7 +179,7 @@ def test_unknown_positions_have_no_transforms(tmp_path):
     assert [one.transforms[0].header.stamp.sec for one in messages["/tf"]] == [1, 3]
 
 
-def test_model_that_urdf_does_not_support_has_only_transforms(tmp_path):
+def test_unsupported_urdf_is_omitted(tmp_path):
     arm = ARMS["mtml"]
     model = compose_sdf(arm.sdf, arm.mirrored_links)
     dynamics = ElementTree.SubElement(next(model.iter("axis")), "dynamics")
