@@ -42,7 +42,7 @@ from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.reports.html.plot_style import TEMPLATE
+from dvrk_drake.reports.html.plot_style import DEFAULT_HEIGHT, TEMPLATE
 from dvrk_drake.reports.html.provenance import Provenance
 
 
@@ -89,6 +89,7 @@ class Table:
         caption: Quantity, unit and condition. "" for no caption.
         note: Explanation below the table.
         collapsed: Whether only the caption is visible until the reader opens the table.
+        right: Whether each column is aligned right. None: columns in which all cells are numbers are.
     """
 
     header: Sequence[str]
@@ -96,6 +97,7 @@ class Table:
     caption: str = ""
     note: str = ""
     collapsed: bool = False
+    right: Sequence[bool] | None = None
     kind: ClassVar[str] = "table"
 
     def __post_init__(self) -> None:
@@ -106,9 +108,12 @@ class Table:
 
     @property
     def alignment(self) -> list[str]:
-        """Class of each column: "number" if all its cells are numbers, else "name"."""
-        columns = zip(*self.rows, strict=True) if self.rows else ([] for _ in self.header)
-        return ["number" if cells and all(map(_is_number, cells)) else "name" for cells in map(list, columns)]
+        """Class of each column: "number" if it is aligned right, else "name"."""
+        right = self.right
+        if right is None:
+            columns = map(list, zip(*self.rows, strict=True)) if self.rows else ([] for _ in self.header)
+            right = [bool(cells) and all(map(_is_number, cells)) for cells in columns]
+        return ["number" if is_right else "name" for is_right in right]
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,7 @@ class Plot:
     """Interactive plot.
 
     Attributes:
-        figure: Plotly figure. The page applies its own template. The height of the layout is kept, default 380 px.
+        figure: Plotly figure. The page applies its own template. The height of the layout is kept.
         caption: Sentence above the plot that says what to see.
         time: Whether all x axes are the time [s] of the animations on the page. The plot then has the time cursor.
         half: Whether two plots are beside each other on wide screens.
@@ -130,7 +135,8 @@ class Plot:
 
     def json(self) -> str:
         """Returns the figure with the template of the page as JSON."""
-        return str(go.Figure(self.figure).update_layout(template=TEMPLATE).to_json())
+        height = self.figure.layout.height or DEFAULT_HEIGHT  # Plotly ignores the height of a template
+        return str(go.Figure(self.figure).update_layout(template=TEMPLATE, height=height).to_json())
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from dvrk_drake.reports.figures.colours import SERIES
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
 #: Size of the smallest text in plots: 12 px are 9 pt.
 SMALLEST_TEXT = 12
+#: Height of a plot whose figure has no height [px].
+DEFAULT_HEIGHT = 380
 _INK, _LINE, _GRID = "#1b2733", "#6b7785", "#e3e7eb"
 _AXIS = {
     "showgrid": True,
@@ -30,7 +32,6 @@ _AXIS = {
 TEMPLATE = go.layout.Template(
     layout={
         "font": {"family": FONT, "size": 13, "color": _INK},
-        "height": 380,
         "margin": {"l": 64, "r": 24, "t": 56, "b": 52},
         "paper_bgcolor": "white",
         "plot_bgcolor": "white",

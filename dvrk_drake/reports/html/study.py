@@ -8,9 +8,9 @@ import numpy as np
 import plotly.graph_objects as go
 
 from dvrk_drake.experiments.study.measures import Measure
-from dvrk_drake.experiments.study.study_file import Study
+from dvrk_drake.experiments.study.study_file import Case, Study
 from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise, values_of
-from dvrk_drake.reports.html.page import Page, Plot, Section
+from dvrk_drake.reports.html.page import Page, Plot, Section, Table
 from dvrk_drake.reports.html.plot_style import series_colour
 from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.html.terminal import printed_by
@@ -31,17 +31,25 @@ def study_page(study: Study, rows: Mapping[int, Row], provenance: Provenance, st
     boolean = [m for m in study.measures if m.is_boolean]
     plots = [_share_plot(m, summaries) for m in boolean]
     plots += [_distribution_plot(m, study, rows) for m in study.measures if not m.is_boolean]
+    failed = [(c.index, c.variation, c.pose, c.seed, rows[c.index].error) for c in study.cases if _failed(c, rows)]
+    table = Table(("case", "variation", "pose", "seed", "error"), failed)
+    failed_runs = [Section(f"Failed runs ({len(failed)})", [table])] if failed else []
     return Page(
-        f"Study of {study.arm.name}: {study.scenario}",
+        f"Study of {study.arm.name}, scenario {study.scenario}",
         printed.answer,
         [
-            Section("Results", printed.blocks),
+            Section("Results", [block for block in printed.blocks if getattr(block, "level", "") != "warning"]),
             Section("Distributions", plots),
+            *failed_runs,
             *printed.next_section,
         ],
         provenance,
         printed.level,
     )
+
+
+def _failed(case: Case, rows: Mapping[int, Row]) -> bool:
+    return case.index in rows and bool(rows[case.index].error)
 
 
 def _share_plot(measure: Measure, summaries: list[Summary]) -> Plot:
@@ -96,5 +104,5 @@ def _distribution_plot(measure: Measure, study: Study, rows: Mapping[int, Row]) 
     figure.update_yaxes(title="cumulative share of runs [%]", range=[-3, 103])
     text = f"{measure.column}: cumulative distribution over the runs"
     if infinite:
-        text += f" ({infinite} runs without a finite value are not drawn)"
+        text += f" (not drawn, because the value is infinite: {infinite} of {len(rows)} runs)"
     return Plot(figure, text, half=True)

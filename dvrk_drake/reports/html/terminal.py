@@ -77,6 +77,7 @@ def table_block(table: rich_table.Table) -> Table:
         [str(column.header) for column in table.columns],
         list(zip(*columns, strict=True)),
         caption=str(table.title or ""),
+        right=[column.justify == "right" for column in table.columns],
     )
 
 

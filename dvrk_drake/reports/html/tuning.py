@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import plotly.graph_objects as go
 
 from dvrk_drake.experiments.tuning.bench import band
 from dvrk_drake.experiments.tuning.tuning import Comparison, Tuning
 from dvrk_drake.reports.figures.colours import LIMIT, REFERENCE
-from dvrk_drake.reports.html.page import Block, Page, Plot, Section
+from dvrk_drake.reports.html.page import Block, Page, Plot, Section, Table
 from dvrk_drake.reports.html.plot_style import joint_panels, series_colour
 from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.html.terminal import printed_by
@@ -24,7 +26,8 @@ def tuning_page(tuning: Tuning, provenance: Provenance, gains_path: str | None =
         gains_path: Path of the written gains, for the suggested next command. None if they were not written.
     """
     printed = printed_by(print_tuning, tuning, gains_path=gains_path, verbose=True)
-    first, *details = printed.blocks
+    first, *others = printed.blocks
+    details = [replace(block, collapsed=True) if isinstance(block, Table) else block for block in others]
     plots: list[Block] = []
     if tuning.comparison.responses:
         plots = [_step_plot(tuning.comparison), _effort_plot(tuning.comparison)]

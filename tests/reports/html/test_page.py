@@ -174,6 +174,7 @@ def test_page_states_hash_and_command(report):
 def test_columns_of_numbers_are_aligned_right():
     table = Table(("a", "b", "c", "d"), [("joint", 1.5, "-0.2", "3..5 %"), ("1 mm", 2, "12", "")])
     assert table.alignment == ["name", "number", "number", "number"]
+    assert Table(("a", "b"), [("x", "inf")], right=[False, True]).alignment == ["name", "number"]
     with pytest.raises(ValueError, match="a row has 1 cells, the header has 2"):
         Table(("a", "b"), [("1",)])
 
