@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
 from dvrk_drake.analysis.dynamic.estimates import MIN_IDENTIFIABILITY
-from dvrk_drake.analysis.dynamic.validation import DynamicValidation
+from dvrk_drake.analysis.dynamic.validation import SHARE_LABELS, DynamicValidation
 from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
 from dvrk_drake.analysis.results import Identification, Validation
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
@@ -450,15 +450,14 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     if not verbose:
         return
     print_note(console, f"{rule_text(in_motion=True)} Low-pass filter: {validation.cut_off:g} Hz.")
-    table = make_table("Shares of the squared error", "", "bias", "friction-like", "position-dependent", "other")
+    table = make_table("Shares of the squared error", "", *SHARE_LABELS)
     for a in validation.actuators:
-        shares = (f"{100 * s:.0f} %" for s in (a.bias, a.friction_like, a.position_dependent, a.other))
-        table.add_row(a.name, *shares)
+        table.add_row(a.name, *("-" if share is None else f"{100 * share:.0f} %" for share in a.shares))
     console.print(table)
     print_note(
         console,
         "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent "
-        "share indicates that the cables changed.",
+        "share indicates that the cables changed. No model reduces the share that does not repeat between periods.",
     )
 
 

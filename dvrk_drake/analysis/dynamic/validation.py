@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,46 @@ from dvrk_drake.recordings.recording import Recording
 _FRICTION_WIDTH = 0.1
 #: Number of frequencies of the sine and cosine functions in the position-dependent error.
 _HARMONICS = 2
+#: Smallest frequency of the fast share of an error [Hz]. Arms are moved with lower frequencies.
+FAST = 2.0
+
+
+class ErrorShares(NamedTuple):
+    """Shares of the squared effort error of one actuator, by cause. The sum of all shares is 1.
+
+    Each share is what its cause explains in addition to the previous causes.
+
+    Attributes:
+        bias: Share due to the mean error.
+        friction_like: Additional share that viscous and Coulomb friction in the actuator explain.
+        position_dependent: Additional share that sine and cosine functions of the actuator's position explain. The
+            functions have half a period and one period over the range of the position.
+        acceleration_dependent: Additional share that is linear in the accelerations of all actuators (inertia).
+        posture_dependent: Additional share that is linear in the sines and cosines of the positions of all other
+            actuators (gravity, cables across joints). It may contain slow errors with other causes.
+        not_repeating: Share of the rest that differs between periods of the motion: half the mean square of its
+            difference between periods. No function of position, velocity and acceleration explains it. None if the
+            motion does not repeat.
+        fast: Share of the rest above `FAST` Hz, without the part that does not repeat: transients at reversals of the
+            velocity, vibration, errors of the delay.
+        other: Remaining share: slow and, in a periodic motion, the same in each period.
+    """
+
+    bias: float
+    friction_like: float
+    position_dependent: float
+    acceleration_dependent: float
+    posture_dependent: float
+    not_repeating: float | None
+    fast: float
+    other: float
+
+
+#: Labels of the fields of `ErrorShares` in tables and figures.
+SHARE_LABELS = (
+    *("bias", "friction-like", "position-dependent", "acceleration-dependent"),
+    *("posture-dependent", "not repeating", "fast", "other"),
+)
 
 
 @dataclass(frozen=True)
@@ -30,11 +71,7 @@ class ActuatorError:
         rms_effort: RMS measured effort [N m, N if prismatic].
         rms_error: RMS of measured minus predicted effort [N m, N if prismatic].
         relative_error: rms_error / rms_effort [1], None if rms_effort is 0.
-        bias: Share of rms_error^2 due to the mean error.
-        friction_like: Additional share of rms_error^2 that viscous and Coulomb friction in the actuator explain.
-        position_dependent: Additional share of rms_error^2 that sine and cosine functions of the position explain. The
-            functions have half a period and one period over the range of the position.
-        other: Remaining share of rms_error^2.
+        shares: Shares of rms_error^2 by cause.
         repeatability: Relative RMS difference of the efforts between periods (see `repeatability_floor`) [1], or None
             if the motion does not repeat.
         verdict: Verdict on the actuator, see `judge`.
@@ -44,10 +81,7 @@ class ActuatorError:
     rms_effort: float
     rms_error: float
     relative_error: float | None
-    bias: float
-    friction_like: float
-    position_dependent: float
-    other: float
+    shares: ErrorShares
     repeatability: float | None
     verdict: Verdict
 
@@ -62,6 +96,8 @@ class DynamicValidation(Validation):
         t: Times (r,) of the compared rows [s]. One second at each end is omitted because of filter transients.
         q: Positions (r, n) of the actuators [rad, m].
         v: Velocities (r, n) of the actuators [rad/s, m/s].
+        vd: Accelerations (r, n) of the actuators [rad/s^2, m/s^2].
+        period: Period of the motion [s], or None if the motion does not repeat.
         measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
         predicted: Predicted efforts (r, n) of the actuators after low-pass filtering [N m, N].
     """
@@ -71,6 +107,8 @@ class DynamicValidation(Validation):
     t: NDArray[np.float64]
     q: NDArray[np.float64]
     v: NDArray[np.float64]
+    vd: NDArray[np.float64]
+    period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
 
@@ -98,8 +136,16 @@ class DynamicValidation(Validation):
             "coordinates": "actuator",
             "cut_off_hz": self.cut_off,
             "mean_relative_error": self.mean_relative_error,
-            "actuators": [asdict(actuator) for actuator in self.actuators],
+            "actuators": [{**asdict(actuator), "shares": actuator.shares._asdict()} for actuator in self.actuators],
         }
+
+    def error_shares(self, predicted: NDArray[np.float64]) -> list[ErrorShares]:
+        """Returns the shares of the error of each actuator for predicted efforts (r, n) [N m, N]."""
+        error = self.measured - predicted
+        return [
+            error_shares(error[:, i], i, self.q, self.v[:, i], self.vd, self.t, self.period)
+            for i in range(error.shape[1])
+        ]
 
 
 def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
@@ -136,10 +182,12 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     if period is not None:
         floors = repeatability_floor(tau, grid.rate, period, grid.settings.effort_cut_off)
         floor = [float(x) if np.isfinite(x) else None for x in floors]
-    actuators = [
-        _actuator_error(name, measured[:, i], predicted[:, i], a[:, i], v[:, i], floor[i], float(arm.effort_limits[i]))
-        for i, name in enumerate(arm.joint_names)
-    ]
+    vd = grid.efforts_at_rows(arm.transmission.velocity(grid.vd))[grid.inner]
+    actuators = []
+    for i, name in enumerate(arm.joint_names):
+        shares = error_shares(measured[:, i] - predicted[:, i], i, a, v[:, i], vd, t, period)
+        limit = float(arm.effort_limits[i])
+        actuators.append(_actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], limit))
     return DynamicValidation(
         model=model,
         recording=recording,
@@ -148,6 +196,8 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         t=t,
         q=a,
         v=v,
+        vd=vd,
+        period=period,
         measured=measured,
         predicted=predicted,
     )
@@ -161,8 +211,7 @@ def _actuator_error(
     name: str,
     measured: NDArray[np.float64],
     predicted: NDArray[np.float64],
-    q: NDArray[np.float64],
-    v: NDArray[np.float64],
+    shares: ErrorShares,
     repeatability: float | None,
     effort_limit: float,
 ) -> ActuatorError:
@@ -170,35 +219,71 @@ def _actuator_error(
     effort, size = float(np.sqrt(np.mean(measured**2))), float(np.sqrt(np.mean(error**2)))
     relative = size / effort if effort > 0 else None
     verdict = judge(effort, size, effort_limit, in_motion=True)
-    return ActuatorError(name, effort, size, relative, *error_shares(error, q, v), repeatability, verdict)
+    return ActuatorError(name, effort, size, relative, shares, repeatability, verdict)
 
 
 def error_shares(
-    error: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
-) -> tuple[float, float, float, float]:
-    """Returns the shares of the squared effort error of one actuator: bias, friction-like, position-dependent, other.
-
-    `ActuatorError` defines the shares. Their sum is 1.
+    error: NDArray[np.float64],
+    actuator: int,
+    q: NDArray[np.float64],
+    v: NDArray[np.float64],
+    vd: NDArray[np.float64],
+    t: NDArray[np.float64],
+    period: float | None,
+) -> ErrorShares:
+    """Returns the shares of the squared effort error of one actuator by cause.
 
     Args:
         error: Measured minus predicted efforts (r,) [N m, N].
-        q, v: Positions [rad, m] and velocities (r,) of the actuator.
+        actuator: Index of the actuator.
+        q: Positions (r, n) of all actuators [rad, m].
+        v: Velocities (r,) of the actuator [rad/s, m/s].
+        vd: Accelerations (r, n) of all actuators [rad/s^2, m/s^2].
+        t: Times (r,) at a nearly constant rate [s].
+        period: Period of the motion [s], or None if the motion does not repeat.
     """
+    own, others = q[:, actuator], np.delete(q, actuator, axis=1)
     width = _FRICTION_WIDTH * float(np.sqrt(np.mean(v**2))) or 1.0
-    travel = (q - q.min()) / (float(np.ptp(q)) or 1.0)
+    travel = (own - own.min()) / (float(np.ptp(own)) or 1.0)
     kinds = [
-        [np.ones_like(q)],
+        [np.ones_like(own)],
         [v, np.tanh(v / width)],
         [f(np.pi * k * travel) for k in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)],
+        list(vd.T),
+        [*np.sin(others).T, *np.cos(others).T],
     ]
     shares = []
     columns: list[NDArray[np.float64]] = []
-    total = unexplained = float(np.sum(error**2)) or 1.0
+    total = unexplained = float(np.mean(error**2)) or 1.0
+    rest = error
     for kind in kinds:
         columns += kind
         X = np.column_stack(columns)
-        remaining = float(np.sum((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2))
+        rest = error - X @ np.linalg.lstsq(X, error, rcond=None)[0]
+        remaining = float(np.mean(rest**2))
         shares.append((unexplained - remaining) / total)
         unexplained = remaining
-    bias, friction, position = shares
-    return bias, friction, position, unexplained / total
+    bias, friction, position, acceleration, posture = shares
+    slow = _slow_part(rest, t)
+    repeating, sizes = [], []
+    for part in (rest - slow, slow):
+        size = float(np.mean(part**2))
+        sizes.append(size)
+        repeating.append(max(0.0, size - _mean_square_between_periods(part, t, period)))
+    fast, other = repeating
+    not_repeating = None if period is None else (sum(sizes) - fast - other) / total
+    return ErrorShares(bias, friction, position, acceleration, posture, not_repeating, fast / total, other / total)
+
+
+def _slow_part(x: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the part of a signal (r,) below `FAST` Hz. It is orthogonal to the rest of the signal."""
+    frequency = np.fft.rfftfreq(len(x), float(t[-1] - t[0]) / (len(t) - 1))
+    return np.fft.irfft(np.where(frequency < FAST, np.fft.rfft(x), 0.0), len(x))
+
+
+def _mean_square_between_periods(x: NDArray[np.float64], t: NDArray[np.float64], period: float | None) -> float:
+    """Returns half the mean square of the difference of a signal (r,) between periods. Returns 0 without a period."""
+    if period is None:
+        return 0.0
+    first = t + period <= t[-1]
+    return float(np.mean((np.interp(t[first] + period, t, x) - x[first]) ** 2)) / 2

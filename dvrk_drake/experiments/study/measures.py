@@ -46,6 +46,13 @@ class Measure:
         return KINDS[self.kind].unit
 
     @property
+    def title(self) -> str:
+        """Name of the quantity with its band and time, for tables and figures."""
+        joints = f", joints {', '.join(self.joints)}" if self.joints else ""
+        name = f"{self.name.replace('_', ' ')}: " if self.name else ""
+        return name + KINDS[self.kind].title.format(band=self._band, time=self._time) + joints
+
+    @property
     def is_boolean(self) -> bool:
         """True for a boolean measure."""
         return isinstance(self.worst, bool)
@@ -198,6 +205,7 @@ class Kind(NamedTuple):
         band: Default tolerance band [rad, m]; None if the kind has no band.
         time: Default duration of the evaluated interval [s]; None if the kind has no such interval.
         worst: Value for a failed run.
+        title: Name of the quantity, with the fields {band} and {time}.
     """
 
     compute: Callable[[_Run, float, float], float | bool]
@@ -205,6 +213,7 @@ class Kind(NamedTuple):
     band: float | None
     time: float | None
     worst: float | bool
+    title: str
 
 
 #: Kinds of measures. They are computed from the true positions and the measured efforts of the evaluated joints at the
@@ -221,12 +230,12 @@ class Kind(NamedTuple):
 #: held: Whether all joints stay within `band` of the desired pose for `time` after the last target or the release.
 #: ran_away: Whether the distance of any joint from the desired pose ever exceeds `band`.
 KINDS = {
-    "settling_time": Kind(_settling_time, "s", 1e-3, None, math.inf),
-    "overshoot": Kind(_overshoot, "rad", None, None, math.inf),
-    "steady_error": Kind(_steady_error, "rad", None, 1.0, math.inf),
-    "drift": Kind(_drift, "rad", None, 5.0, math.inf),
-    "drift_rate": Kind(_drift_rate, "rad/s", None, 5.0, math.inf),
-    "effort_share": Kind(_effort_share, "", None, None, math.inf),
-    "held": Kind(_stays_in_band, "", 0.015, 10.0, False),
-    "ran_away": Kind(_leaves_band, "", 0.5, None, True),
+    "settling_time": Kind(_settling_time, "s", 1e-3, None, math.inf, "settling time to a band of {band:g} rad or m"),
+    "overshoot": Kind(_overshoot, "rad", None, None, math.inf, "overshoot"),
+    "steady_error": Kind(_steady_error, "rad", None, 1.0, math.inf, "steady-state error, mean of the last {time:g} s"),
+    "drift": Kind(_drift, "rad", None, 5.0, math.inf, "drift in the last {time:g} s"),
+    "drift_rate": Kind(_drift_rate, "rad/s", None, 5.0, math.inf, "drift rate in the last {time:g} s"),
+    "effort_share": Kind(_effort_share, "", None, None, math.inf, "largest effort / effort limit"),
+    "held": Kind(_stays_in_band, "", 0.015, 10.0, False, "runs that stay within {band:g} rad or m for {time:g} s"),
+    "ran_away": Kind(_leaves_band, "", 0.5, None, True, "runs that leave a band of {band:g} rad or m"),
 }

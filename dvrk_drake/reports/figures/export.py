@@ -10,12 +10,11 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
-from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
-
-FILE_COLOUR = "#d1495b"
+from dvrk_drake.reports.figures.colours import FITTED, LIMIT, NEUTRAL, REFERENCE, SERIES
+from dvrk_drake.reports.figures.style import WIDTH, add_legend, save_figure, set_title
 
 #: Mapping from a problem to the colour of the curve that shows the share of poses with this problem.
-PROBLEM_COLOURS = {"torque limit active": "#edae49", "opposite sign": "#d1495b", "runaway": "#5b3a8c"}
+PROBLEM_COLOURS = dict(zip(("torque limit active", "opposite sign", "runaway"), SERIES, strict=False))
 
 _BINS = 60
 
@@ -39,7 +38,7 @@ def plot_compensation(path: str | Path, comparison: CompensationComparison, titl
     Raises:
         DvrkDrakeError: The file cannot be written.
     """
-    figure = plt.figure(figsize=(16, 9.5), layout="constrained")
+    figure = plt.figure(figsize=(WIDTH, 9.5), layout="constrained")
     grid = figure.add_gridspec(4, 3, height_ratios=[3, 1, 3, 1])
     for j in range(NUM_PANELS):
         row, column = 2 * (j // 3), j % 3
@@ -47,9 +46,8 @@ def plot_compensation(path: str | Path, comparison: CompensationComparison, titl
         share_axes = figure.add_subplot(grid[row + 1, column], sharex=torque_axes)
         _draw_torque(torque_axes, comparison, j)
         _draw_shares(share_axes, comparison, j)
-    handles, labels = (a + b for a, b in zip(*(ax.get_legend_handles_labels() for ax in figure.axes[:2]), strict=True))
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
-    figure.suptitle(title)
+    set_title(figure, title)
+    add_legend(figure)
     save_figure(figure, Path(path))
 
 
@@ -58,19 +56,17 @@ def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None
     edges, centres, members = position_bins(comparison, j)
     if file.sweep is not None:
         span = np.clip(file.sweep[:, j], edges[0], edges[-1])
-        axes.axvspan(*span, color="0.92", label="positions in the recording of the file")
+        axes.axvspan(*span, color=NEUTRAL, alpha=0.35, linewidth=0, label="positions in the recording of the file")
     for torque, colour, label in (
-        (comparison.file_torque, FILE_COLOUR, "file, without torque limits"),
-        (comparison.model_torque, MODEL_COLOUR, "model"),
+        (comparison.file_torque, REFERENCE, "file, without torque limits"),
+        (comparison.model_torque, FITTED, "model"),
     ):
         low, middle, high = (np.array([f(torque[m, j]) for m in members]) for f in (np.min, np.mean, np.max))
         axes.fill_between(centres, low, high, color=colour, alpha=0.3, label=f"{label} (range)")
         axes.plot(centres, middle, color=colour, linewidth=1.2)
-    for i, limit in enumerate((joint.clip_lower, joint.clip_upper)):
-        axes.axhline(
-            limit, color="black", linestyle="--", linewidth=0.9, label="" if i else "torque limits of the file"
-        )
-    axes.set_title(f"J{j + 1} {joint.name}", fontsize=10)
+    for limit in (joint.clip_lower, joint.clip_upper):
+        axes.axhline(limit, color=LIMIT, linestyle="--", linewidth=1.2, label="torque limits of the file")
+    axes.set_title(f"J{j + 1} {joint.name}")
     axes.set_ylabel("torque [N m]")
     axes.tick_params(labelbottom=False)
     axes.set_xlim(edges[0], edges[-1])
@@ -79,12 +75,17 @@ def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None
 def _draw_shares(axes: Axes, comparison: CompensationComparison, j: int) -> None:
     _, centres, members = position_bins(comparison, j)
     flags = (comparison.clipped, comparison.opposed, comparison.runaway)
-    for (label, colour), flag in zip(PROBLEM_COLOURS.items(), flags, strict=True):
-        axes.plot(centres, [100 * flag[m, j].mean() for m in members], color=colour, label=f"{label} [% of poses]")
+    for k, ((label, colour), flag) in enumerate(zip(PROBLEM_COLOURS.items(), flags, strict=True)):
+        axes.plot(
+            centres,
+            [100 * flag[m, j].mean() for m in members],
+            color=colour,
+            label=f"{label} (share of poses)",
+            linestyle=("-", "--", ":")[k],
+        )
     axes.set_ylim(-3, 103)
     axes.set_ylabel("poses [%]")
     axes.set_xlabel(f"q{j + 1} [rad]")
-    axes.grid(alpha=0.3)
 
 
 def position_bins(

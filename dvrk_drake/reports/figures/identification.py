@@ -1,7 +1,8 @@
-"""Plots identification and validation results for static poses and motions."""
+"""Plots the results of an identification or a validation. Motions are plotted by `figures.motion`."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -14,18 +15,37 @@ from dvrk_drake.analysis.results import Identification, Validation
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement, usable_measurements
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR, save_figure
+from dvrk_drake.reports.figures.colours import FITTED, HELD_OUT, LIMIT, MEASURED, NEUTRAL, REFERENCE
+from dvrk_drake.reports.figures.motion import plot_motion
+from dvrk_drake.reports.figures.style import (
+    WIDTH,
+    add_legend,
+    effort_unit,
+    joint_title,
+    panel_grid,
+    save_figure,
+    set_title,
+)
+
+#: Colours and markers of the errors in `plot_torque_error`, by label. Other labels are drawn as held out.
+_ERROR_STYLES = {
+    "zero torque": (MEASURED, "o"),
+    "leave-one-out": (FITTED, "s"),
+    "least squares of the paper": (REFERENCE, "D"),
+    "model, with excluded measurements": (LIMIT, "x"),
+}
+#: Number of random samples for a bootstrap interval.
+_SAMPLES = 1000
+#: Quantile of the values that determine the range of a panel, and the margin on both sides as a share of their range.
+_QUANTILE, _MARGIN = 0.02, 0.25
 
 
 def plot_identification(folder: Path, result: Identification) -> None:
     """Plots measured and predicted efforts. See `plot_motion` and `plot_static_identification` for the files."""
     if isinstance(result, DynamicIdentification):
         fit = validate_motion(result.model, result.recording)
-        arm = result.model.arm
-        plot_motion(folder, arm, fit, f"{arm.name}, model fitted to {Path(result.recording.source).name}")
+        plot_motion(folder, fit, held_out=result.held_out)
     elif isinstance(result, StaticIdentification):
         plot_static_identification(folder, result)
 
@@ -33,28 +53,39 @@ def plot_identification(folder: Path, result: Identification) -> None:
 def plot_validation(folder: Path, validation: Validation) -> None:
     """Plots the errors of a model. See `plot_motion` and `plot_static_validation` for the files."""
     if isinstance(validation, DynamicValidation):
-        arm = validation.model.arm
-        plot_motion(folder, arm, validation, f"{arm.name}, {Path(validation.recording.source).name}")
+        plot_motion(folder, validation)
     elif isinstance(validation, StaticValidation):
         plot_static_validation(folder, validation)
 
 
 def plot_static_identification(folder: Path, result: StaticIdentification) -> None:
     """Writes torque_error.png and predicted.png of an identification."""
-    recording = result.recording
-    joints = result.model.joints
+    recording, arm = result.recording, result.model.arm
+    tau = recording.measured_effort()
+    usable = usable_measurements(tau.shape, result.excluded) & result.measured
+    errors = {
+        "zero torque": tau,
+        "leave-one-out": result.leave_one_out_residuals,
+        "10-fold cross-validation, effects selected again": result.cross_validation_residuals,
+    }
+    rms, intervals = _errors_and_intervals(errors, usable)
+    name = Path(recording.source).name
     plot_torque_error(
         folder / "torque_error.png",
-        result.model.arm,
-        np.array([j.rms_zero_torque_included for j in joints]),
-        {
-            "leave-one-out": np.array([j.rms_leave_one_out_included for j in joints]),
-            "10-fold, effects selected anew": np.array([j.rms_cross_validation_included for j in joints]),
-        },
-        f"{result.model.arm.name}: RMS torque error in cross-validation, {Path(recording.source).name}, without "
-        "excluded measurements",
+        arm,
+        rms.pop("zero torque"),
+        rms,
+        f"{arm.name}: RMS torque error at poses that were not used to fit, {name}, without excluded measurements",
+        intervals,
     )
-    plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.excluded)
+    predictions = {
+        "fitted (the pose was used to fit)": (FITTED, tau - result.residuals),
+        "held out (10-fold cross-validation)": (HELD_OUT, tau - result.cross_validation_residuals),
+    }
+    title = f"{arm.name}: predicted and measured torque at {len(recording)} poses of {name}"
+    plot_measured_against_predicted(
+        folder / "predicted.png", arm, tau, predictions, result.measured, result.excluded, title
+    )
 
 
 def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
@@ -62,184 +93,183 @@ def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
     model = validation.model
     arm = model.arm
     recording = validation.recording.in_joint_coordinates(arm)
+    tau, predicted = recording.measured_effort(), model.holding_torque(recording.q)
+    usable = usable_measurements(tau.shape, validation.excluded) & validation.measured
+    is_held_out = validation.recording.sha256 != model.provenance.sha256 or not validation.recording.sha256
+    role = "held out (the recording was not used to fit)" if is_held_out else "fitted (the recording was used to fit)"
+    label = f"model, {role}"
+    rms, intervals = _errors_and_intervals({"zero torque": tau, label: tau - predicted}, usable)
+    if validation.excluded:
+        squares = np.where(validation.measured, (tau - predicted) ** 2, np.nan)
+        rms["model, with excluded measurements"] = _rms_of_squares(squares)
+    name = Path(recording.source).name
     plot_torque_error(
         folder / "torque_error.png",
         arm,
-        np.array([j.rms_torque for j in validation.joints]),
-        {"model": np.array([j.rms_error for j in validation.joints])},
-        f"{model.arm.name}: RMS torque error at all {validation.poses} poses of {Path(recording.source).name}",
+        rms.pop("zero torque"),
+        rms,
+        f"{arm.name}: RMS torque error at {validation.poses} poses of {name}, without excluded measurements",
+        intervals,
     )
     plot_measured_against_predicted(
-        folder / "predicted.png", model, recording, validation.measured, validation.excluded
+        folder / "predicted.png",
+        arm,
+        tau,
+        {role: (HELD_OUT if is_held_out else FITTED, predicted)},
+        validation.measured,
+        validation.excluded,
+        f"{arm.name}: predicted and measured torque at {validation.poses} poses of {name}",
     )
+
+
+def _rms_of_squares(squares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the RMS (n,) of squared errors (m, n). nan marks missing values. A joint without values has nan."""
+    count = np.sum(np.isfinite(squares), axis=0)
+    return np.asarray(np.sqrt(np.where(count, np.nansum(squares, axis=0), np.nan) / np.maximum(count, 1)))
+
+
+def _errors_and_intervals(
+    errors: Mapping[str, NDArray[np.float64]], usable: NDArray[np.bool_]
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
+    """Returns RMS errors (n,) and their 95 % intervals (2, n) by label, from errors (m, n).
+
+    The intervals are percentiles of RMS errors of poses drawn with replacement (bootstrap).
+    """
+    rng = np.random.default_rng(0)
+    rms, intervals = {}, {}
+    for label, values in errors.items():
+        squares = np.where(usable, values**2, np.nan)
+        rms[label] = _rms_of_squares(squares)
+        drawn = rng.integers(len(squares), size=(_SAMPLES, len(squares)))
+        resampled = np.array([_rms_of_squares(squares[rows]) for rows in drawn])
+        known = np.where(np.isfinite(resampled), resampled, rms[label])
+        intervals[label] = np.quantile(known, [0.025, 0.975], axis=0)
+    return rms, intervals
 
 
 def plot_torque_error(
     path: Path,
     arm: Arm,
     rms_zero: NDArray[np.float64],
-    rms_model: dict[str, NDArray[np.float64]],
+    rms_model: Mapping[str, NDArray[np.float64]],
     title: str,
+    intervals: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> None:
-    """Plots the RMS torque error of each joint for zero torque and for each model, on a logarithmic scale.
+    """Plots the RMS torque error of each joint as dots with intervals, on a logarithmic scale.
 
     Args:
         path: PNG file to write.
         arm: Arm of the joints.
-        rms_zero: RMS errors (n,) of zero torque [N m; N].
-        rms_model: RMS errors (n,) [N m; N] by name of the model.
+        rms_zero: RMS errors (n,) of zero torque [N m; N]. nan: no value.
+        rms_model: RMS errors (n,) [N m; N] by label.
         title: Title of the figure.
+        intervals: 95 % intervals (2, n) [N m; N] by label, "zero torque" for zero torque. Labels may be missing.
     """
-    names = arm.joint_names
-    figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
-    bars = {"zero torque": rms_zero, **rms_model}
-    colours = [ZERO_COLOUR, MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
-    width = 0.8 / len(bars)
-    for i, (label, values) in enumerate(bars.items()):
-        x = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
-        drawn = axes.bar(x, values, width, label=label, color=colours[i % len(colours)])
-        axes.bar_label(drawn, [f"{v:.2g}" for v in values], fontsize=7, padding=2, rotation=90)
-    if any(np.any(values > 0) for values in bars.values()):
-        axes.set_yscale("log")
-    axes.set_xticks(range(len(names)), _labels(names), fontsize=8)
+    rms = {"zero torque": rms_zero, **rms_model}
+    intervals = intervals or {}
+    height = (0.16 + 0.22 * len(rms)) * arm.num_joints + 1.6
+    figure, axes = plt.subplots(figsize=(WIDTH, height), layout="constrained")
+    rows = np.arange(arm.num_joints)
+    for j in rows[1::2]:
+        axes.axhspan(j - 0.5, j + 0.5, color=NEUTRAL, alpha=0.2, linewidth=0)
+    for i, (label, values) in enumerate(rms.items()):
+        colour, marker = _ERROR_STYLES.get(label, (HELD_OUT, "o"))
+        y = rows + 0.8 * ((i + 0.5) / len(rms) - 0.5)
+        shown = np.where(values > 0, values, np.nan)
+        lower, upper = intervals.get(label, np.array([values, values]))
+        bars = np.abs(np.array([np.minimum(lower, values), np.maximum(upper, values)]) - values)
+        axes.errorbar(shown, y, xerr=bars, fmt=marker, color=colour, capsize=3, markersize=6, label=label)
+        for value, bar, yi in zip(shown, bars[1], y, strict=True):
+            if np.isfinite(value):
+                axes.annotate(
+                    f"{value:.2g}", (value + bar, yi), (8, 0), textcoords="offset points", va="center", fontsize=9
+                )
+    if any(np.any(values > 0) for values in rms.values()):
+        axes.set_xscale("log")
+    axes.set_yticks(rows, [joint_title(arm, j) for j in range(arm.num_joints)])
+    axes.set_ylim(arm.num_joints - 0.5, -0.5)
+    axes.margins(x=0.08)
+    axes.grid(visible=False, axis="y")
     forces = "".join(f"; J{j + 1}: N" for j in np.flatnonzero(arm.prismatic))
-    axes.set_ylabel(f"RMS torque error [N m{forces}]")
-    axes.set_title(title)
-    axes.margins(y=0.25)
-    axes.legend(fontsize=8)
+    bars_label = ", with 95 % intervals (bootstrap over the poses)" if intervals else ""
+    axes.set_xlabel(f"RMS torque error [N m{forces}]{bars_label}")
+    set_title(figure, title)
+    add_legend(figure)
     save_figure(figure, path)
 
 
 def plot_measured_against_predicted(
     path: Path,
-    model: IdentifiedModel,
-    recording: Recording,
+    arm: Arm,
+    measured: NDArray[np.float64],
+    predictions: Mapping[str, tuple[str, NDArray[np.float64]]],
     measured_joints: NDArray[np.bool_],
     excluded: list[ExcludedMeasurement],
+    title: str,
 ) -> None:
     """Plots predicted against measured torque, with one point per pose and one panel per joint.
 
+    The range of a panel is that of the central values. Values outside the range are drawn in the hatched margin.
+
     Args:
         path: PNG file to write.
-        model: Model that predicts the torques.
-        recording: Recording in joint coordinates.
+        arm: Arm of the joints.
+        measured: Measured torques (m, n) of the joints [N m, N].
+        predictions: Mapping from a label to a colour and predicted torques (m, n) of the joints [N m, N].
         measured_joints: Mask (m, n), True for measured holding torques. Only these torques are drawn.
-        excluded: Excluded measurements, drawn as crosses. They do not affect the limits of the axes.
+        excluded: Excluded measurements, drawn as crosses. They do not affect the range of the panels.
+        title: Title of the figure.
     """
-    usable = usable_measurements(recording.q.shape, excluded) & measured_joints
-    arm = model.arm
-    names = arm.joint_names
-    measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
-    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
-    for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
+    usable = usable_measurements(measured.shape, excluded) & measured_joints
+    shown_joints = np.flatnonzero(np.any(usable, axis=0)).tolist()
+    figure, panels = panel_grid(max(len(shown_joints), 1), height=3.0)
+    for j, ax in zip(shown_joints, panels, strict=False):
         use, left_out = usable[:, j], measured_joints[:, j] & ~usable[:, j]
-        if not np.any(use):
-            ax.set_title(f"J{j + 1} {name}: no measurements", fontsize=10)
-            ax.set(xticks=[], yticks=[])
-            continue
-        shown = np.concatenate([measured[use, j], predicted[use, j], [0.0]])
-        pad = 0.05 * max(float(np.ptp(shown)), 1e-6)
-        limits = np.array([shown.min() - pad, shown.max() + pad])
-        ax.plot(limits, limits, color="black", linewidth=0.8, label="measured = predicted")
-        ax.plot(measured[use, j], predicted[use, j], ".", color=MODEL_COLOUR, label="one pose")
-        ax.plot(
-            np.clip(measured[left_out, j], *limits),
-            np.clip(predicted[left_out, j], *limits),
-            "x",
-            color=MEASURED_COLOUR,
-            label="excluded (at the edge: outside the axes)",
-        )
-        ax.set(xlim=limits, ylim=limits)
+        everything = np.concatenate([measured[use, j], *(tau[use, j] for _, tau in predictions.values())])
+        inner, outer = _ranges(np.append(everything, 0.0))
+        ax.plot(outer, outer, color=MEASURED, linewidth=0.8, label="predicted = measured")
+        for k, (label, (colour, predicted)) in enumerate(predictions.items()):
+            x, y = _at_edge(measured[use, j], inner, outer), _at_edge(predicted[use, j], inner, outer)
+            face = "none" if k else colour
+            ax.plot(x, y, "os"[k % 2], color=colour, markersize=4.5, markerfacecolor=face, label=label)
+        _, predicted = next(iter(predictions.values()))
+        x, y = _at_edge(measured[left_out, j], inner, outer), _at_edge(predicted[left_out, j], inner, outer)
+        if len(x):
+            ax.plot(x, y, "x", color=LIMIT, markersize=5, label="excluded measurement")
+        if everything.min() < inner[0] or everything.max() > inner[1] or np.any(left_out):
+            _hatch_margin(ax, inner, outer)
+        ax.set(xlim=outer, ylim=outer)
         ax.locator_params(nbins=5)
-        ax.set_title(f"J{j + 1} {name}", fontsize=10)
-        unit = "N" if arm.prismatic[j] else "N m"
-        ax.set_xlabel(f"measured [{unit}]", fontsize=8)
-        ax.set_ylabel(f"predicted [{unit}]", fontsize=8)
-        ax.tick_params(labelsize=7)
-    for ax in axes.flat[len(names) :]:
-        ax.axis("off")
-    key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
-    if key:
-        figure.legend(*key, loc="lower right", fontsize=8)
-    figure.suptitle(
-        f"{model.arm.name}: predicted and measured torque, {len(recording)} rows of {Path(recording.source).name}"
-    )
+        ax.set_title(joint_title(arm, j))
+        ax.set_xlabel(f"measured [{effort_unit(arm, j)}]")
+        ax.set_ylabel(f"predicted [{effort_unit(arm, j)}]")
+    missing = [joint_title(arm, j) for j in range(arm.num_joints) if j not in shown_joints]
+    if missing:
+        title += f"\nNo measurements: {', '.join(missing)}"
+    set_title(figure, title)
+    add_legend(figure)
     save_figure(figure, path)
 
 
-def plot_motion(folder: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """Writes efforts.png, residuals.png and error_budget.png of a motion into `folder`."""
-    _plot_efforts(folder / "efforts.png", arm, validation, title)
-    _plot_residuals(folder / "residuals.png", arm, validation, title)
-    _plot_budget(folder / "error_budget.png", validation, title)
+def _ranges(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the range (2,) of the drawn values, and the limits (2,) of the axis with the margin for outliers."""
+    low, high = np.quantile(values, [_QUANTILE, 1 - _QUANTILE])
+    pad = _MARGIN * max(float(high - low), 1e-6)
+    inner = np.array([max(low - pad, values.min()), min(high + pad, values.max())])
+    width = max(float(np.ptp(inner)), 1e-6)
+    return inner + np.array([-0.03, 0.03]) * width, inner + np.array([-0.13, 0.13]) * width
 
 
-def _plot_efforts(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """Plots measured and predicted efforts and residuals over time, with one panel per actuator."""
-    count = arm.num_joints
-    figure, axes = plt.subplots(count, 1, figsize=(13, 1.9 * count), sharex=True, layout="constrained")
-    for i, (actuator, ax) in enumerate(zip(validation.actuators, axes, strict=True)):
-        measured, predicted = validation.measured[:, i], validation.predicted[:, i]
-        ax.plot(validation.t, measured - predicted, color=ZERO_COLOUR, linewidth=0.8, label="measured - predicted")
-        ax.plot(validation.t, measured, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
-        ax.plot(validation.t, predicted, color=MODEL_COLOUR, linewidth=1.0, label="predicted")
-        relative = (
-            "" if actuator.relative_error is None else f", relative RMS error {100 * actuator.relative_error:.1f} %"
-        )
-        ax.set_title(f"actuator {i + 1} {actuator.name}{relative}", fontsize=9)
-        ax.set_ylabel(f"effort [{'N' if arm.prismatic[i] else 'N m'}]", fontsize=8)
-        ax.tick_params(labelsize=7)
-    axes[-1].set_xlabel("time [s]", fontsize=8)
-    axes[0].legend(fontsize=7, loc="upper right", ncols=3)
-    figure.suptitle(f"{title}: efforts of the actuators, after low-pass filtering at {validation.cut_off:g} Hz")
-    save_figure(figure, path)
+def _at_edge(
+    values: NDArray[np.float64], inner: NDArray[np.float64], outer: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Moves values outside the inner range into the middle of the margin."""
+    low, high = (inner + outer) / 2
+    return np.where(values < inner[0], low, np.where(values > inner[1], high, values))
 
 
-def _plot_residuals(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """Plots residuals over position, velocity and time, with one column per actuator."""
-    count = arm.num_joints
-    figure, axes = plt.subplots(3, count, figsize=(2.6 * count, 7), sharey="col", layout="constrained")
-    residuals = validation.measured - validation.predicted
-    for i, actuator in enumerate(validation.actuators):
-        length = "m" if arm.prismatic[i] else "rad"
-        over = (
-            (validation.q[:, i], f"position [{length}]"),
-            (validation.v[:, i], f"velocity [{length}/s]"),
-            (validation.t, "time [s]"),
-        )
-        for (x, label), ax in zip(over, axes[:, i], strict=True):
-            ax.plot(x, residuals[:, i], ",", color=MODEL_COLOUR, alpha=0.5)
-            ax.axhline(0.0, color="black", linewidth=0.6)
-            ax.set_xlabel(label, fontsize=8)
-            ax.tick_params(labelsize=7)
-        axes[0, i].set_title(f"{i + 1} {actuator.name}\n[{'N' if arm.prismatic[i] else 'N m'}]", fontsize=9)
-    figure.suptitle(f"{title}: residuals (measured - predicted effort) of the actuators")
-    save_figure(figure, path)
-
-
-def _plot_budget(path: Path, validation: DynamicValidation, title: str) -> None:
-    """Plots the relative error of each actuator, divided into shares of the squared error."""
-    kinds = ("bias", "friction_like", "position_dependent", "other")
-    colours = ("#edae49", MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR)
-    figure, ax = plt.subplots(figsize=(11, 5), layout="constrained")
-    heights = np.array([100 * (a.relative_error or 0.0) for a in validation.actuators])
-    bottom = np.zeros(len(heights))
-    for kind, colour in zip(kinds, colours, strict=True):
-        part = heights * np.array([getattr(a, kind) for a in validation.actuators])
-        ax.bar(range(len(heights)), part, 0.6, bottom=bottom, color=colour, label=kind.replace("_", "-"))
-        bottom += part
-    for i, actuator in enumerate(validation.actuators):
-        if actuator.repeatability is not None:
-            floor = 100 * actuator.repeatability
-            ax.plot(
-                [i - 0.35, i + 0.35], [floor, floor], color="black", linewidth=1.2, label="_" if i else "repeatability"
-            )
-    ax.set_xticks(range(len(heights)), [a.name.replace("_", "\n") for a in validation.actuators], fontsize=8)
-    ax.set_ylabel("relative RMS error [%]")
-    ax.set_title(f"{title}: relative RMS error of the actuators, divided by shares of the squared error")
-    ax.legend(fontsize=8)
-    save_figure(figure, path)
-
-
-def _labels(names: tuple[str, ...]) -> list[str]:
-    return [f"J{i + 1}\n{name.replace('_', chr(10))}" for i, name in enumerate(names)]
+def _hatch_margin(ax: plt.Axes, inner: NDArray[np.float64], outer: NDArray[np.float64]) -> None:
+    label = "margin: values outside the range"
+    for low, high in ((outer[0], inner[0]), (inner[1], outer[1])):
+        for span in (ax.axvspan, ax.axhspan):
+            span(low, high, facecolor="none", edgecolor=NEUTRAL, hatch="////", linewidth=0, zorder=0.5, label=label)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import RecordingReport
 from dvrk_drake.analysis.signals.noise import spectra
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR, save_figure
+from dvrk_drake.reports.figures.colours import LIMIT, MEASURED, REFERENCE
+from dvrk_drake.reports.figures.style import add_legend, effort_unit, joint_title, panel_grid, save_figure, set_title
+
+#: Number of bins per octave of frequency. The power spectral densities are averaged in each bin.
+_BINS_PER_OCTAVE = 4
 
 
 def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm: Arm) -> bool:
@@ -26,22 +30,48 @@ def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm
     if report.rate is None or report.joints[0].effort_cut_off is None:
         return False
     tau = recording.in_actuator_coordinates(arm).measured_effort()
-    of = spectra(tau, report.rate, report.period)
-    noise = "noise (differs between periods)" if report.period is not None else "noise (estimated as white)"
-    figure, axes = plt.subplots(2, -(-arm.num_joints // 2), figsize=(13, 6.5), layout="constrained", sharex=True)
-    for j, (joint, ax) in enumerate(zip(report.joints, axes.flat, strict=False)):
+    densities = spectra(tau, report.rate, report.period)
+    noise_label = "noise (differs between periods)" if report.period is not None else "noise (estimated as white)"
+    f, total = _averaged(densities.frequency, densities.signal + densities.noise)
+    _, noise = _averaged(densities.frequency, densities.noise)
+    figure, panels = panel_grid(arm.num_joints, height=2.8, sharex=True)
+    for j, (joint, ax) in enumerate(zip(report.joints, panels, strict=True)):
+        assert joint.effort_cut_off is not None
         # Avoids the logarithm of zero.
-        bottom = 0.1 * max(float(np.min(of.noise[1:, j])), 1e-12 * float(np.max(of.signal[:, j])), 1e-30)
-        for density, colour, label in ((of.signal, MODEL_COLOUR, "signal"), (of.noise, MEASURED_COLOUR, noise)):
-            ax.loglog(of.frequency[1:], np.maximum(density[1:, j], bottom), color=colour, label=label)
-        ax.axvline(joint.effort_cut_off, color=ZERO_COLOUR, label="cut-off frequency")
-        ax.set_title(f"J{j + 1} {joint.name}: cut-off {joint.effort_cut_off:.1f} Hz", fontsize=10)
-        ax.set_ylabel(f"tau{j + 1} [({'N' if arm.prismatic[j] else 'N m'})$^2$/Hz]", fontsize=8)
-        ax.set_xlabel("frequency [Hz]", fontsize=8)
-        ax.tick_params(labelsize=7)
-    for ax in axes.flat[arm.num_joints :]:
-        ax.axis("off")
-    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="lower right", fontsize=8)
-    figure.suptitle(f"{arm.name}: power spectral density of the actuator efforts, {Path(report.source).name}")
+        bottom = 0.1 * max(float(np.min(noise[:, j])), 1e-12 * float(np.max(total[:, j])), 1e-30)
+        for density, colour, label in ((total, MEASURED, "measured effort"), (noise, REFERENCE, noise_label)):
+            ax.loglog(f, np.maximum(density[:, j], bottom), color=colour, label=label)
+        ax.axvline(joint.effort_cut_off, color=LIMIT, linestyle="--", label="cut-off frequency: noise exceeds signal")
+        ax.set_title(f"{joint_title(arm, j)}\ncut-off {joint.effort_cut_off:.1f} Hz")
+        ax.set_ylabel(f"PSD of tau{j + 1} [({effort_unit(arm, j)})$^2$/Hz]")
+        ax.set_xlabel("frequency [Hz]")
+    explanation = f"Averaged over 1/{_BINS_PER_OCTAVE} octave."
+    if report.period is not None:
+        explanation += (
+            f" The motion repeats every {report.period:.2f} s, so its effort has lines at multiples of "
+            f"{1 / report.period:.3f} Hz, which the average merges."
+        )
+    set_title(
+        figure,
+        f"{arm.name}, {Path(report.source).name}: power spectral density (PSD) of the actuator efforts and of their "
+        f"noise\n{explanation}",
+    )
+    add_legend(figure)
     save_figure(figure, folder / "spectra.png")
     return True
+
+
+def _averaged(
+    frequency: NDArray[np.float64], density: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns mean frequencies (b,) and mean densities (b, n) in bins of equal width on a logarithmic scale.
+
+    The frequency 0 is omitted. Bins without a frequency are omitted.
+    """
+    f = frequency[1:]
+    index = np.floor(_BINS_PER_OCTAVE * np.log2(f / f[0]) + 1e-9).astype(int)
+    used = np.unique(index)
+    return (
+        np.array([np.exp(np.mean(np.log(f[index == k]))) for k in used]),
+        np.array([density[1:][index == k].mean(axis=0) for k in used]),
+    )

@@ -1,4 +1,4 @@
-"""Plots the positions of a simulation over time."""
+"""Plots the positions, position errors and efforts of a simulation over time."""
 
 from __future__ import annotations
 
@@ -6,27 +6,83 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, save_figure
+from dvrk_drake.reports.figures.colours import COMMANDED, FITTED, LIMIT, MEASURED, NEUTRAL, REFERENCE
+from dvrk_drake.reports.figures.style import (
+    WIDTH,
+    add_legend,
+    effort_unit,
+    joint_title,
+    panel_grid,
+    position_unit,
+    save_figure,
+    set_title,
+)
+
+#: Smallest range of a position axis, and smallest range of an error axis [rad; 0.1 m]. Smaller ranges would magnify the
+#: noise of a joint at rest.
+_SMALLEST_RANGE, _SMALLEST_ERROR_RANGE = 0.02, 0.004
+#: Efforts above this share of the effort limit are drawn together with the limit.
+_NEAR_LIMIT = 0.5
 
 
 def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> None:
-    """Writes a PNG of the simulated positions and, if available, the desired positions."""
-    curves = {"simulated": simulation.recording.q}
-    if simulation.desired is not None:
-        curves["desired"] = simulation.desired
-    arm = scenario.mounted_arm
-    plot_positions(
-        path,
-        arm,
-        simulation.time,
-        curves,
-        f"{arm.name}: simulated joint positions, controller mode {scenario.controller.mode}",
+    """Writes a PNG with one row per joint: position, position error and measured effort.
+
+    Without desired positions, the second column shows the motion from the initial position. Times at which the hand
+    acts on the arm are shaded.
+    """
+    arm, t = scenario.mounted_arm, simulation.time
+    q, tau, desired = simulation.recording.q, simulation.recording.measured_effort(), simulation.desired
+    figure, rows = plt.subplots(
+        arm.num_joints, 3, figsize=(WIDTH, 1.75 * arm.num_joints + 1), sharex=True, layout="constrained", squeeze=False
     )
+    for j, (position, error, effort) in enumerate(rows):
+        unit = position_unit(arm, j)
+        scale = 0.1 if arm.prismatic[j] else 1.0
+        position.plot(t, q[:, j], color=MEASURED, label="measured position and effort")
+        if desired is not None:
+            position.plot(t, desired[:, j], "--", color=COMMANDED, label="desired position")
+        position.set_ylabel(f"position [{unit}]")
+        _widen(position, _SMALLEST_RANGE * scale)
+        error.plot(t, 1e3 * (q[:, j] - (q[0, j] if desired is None else desired[:, j])), color=MEASURED)
+        error.axhline(0.0, color=NEUTRAL, linewidth=0.8)
+        error.set_ylabel(f"{'error' if desired is not None else 'motion'} [m{unit}]")
+        _widen(error, 1e3 * _SMALLEST_ERROR_RANGE * scale)
+        limit = float(arm.effort_limits[j])
+        effort.plot(t, tau[:, j], color=MEASURED)
+        effort.set_ylabel(f"effort [{effort_unit(arm, j)}]")
+        _widen(effort, 0.02 * limit)
+        if np.abs(tau[:, j]).max() > _NEAR_LIMIT * limit:
+            for sign in (-1, 1):
+                effort.axhline(sign * limit, color=LIMIT, linestyle="--", label="effort limit")
+        position.set_title(joint_title(arm, j), loc="left")
+        share = 100 * np.abs(tau[:, j]).max() / limit
+        effort.set_title(f"largest {share:.0f} % of the limit {limit:g} {effort_unit(arm, j)}", loc="left")
+    acts = np.any(simulation.hand != 0, axis=1)
+    if np.any(acts):
+        for ax in rows.flat:
+            span = ax.get_ylim()
+            ax.fill_between(
+                t, *span, where=acts, color=REFERENCE, alpha=0.15, linewidth=0, label="disturbance: the hand acts"
+            )
+            ax.set_ylim(span)
+    for ax in rows[-1]:
+        ax.set_xlabel("time [s]")
+        ax.set_xlim(t[0], t[-1])
+    figure.align_ylabels(rows)
+    second = "motion from the start" if desired is None else "position error"
+    set_title(
+        figure,
+        f"{arm.name}, simulated, controller mode {scenario.controller.mode}: position, {second} and effort",
+    )
+    add_legend(figure)
+    save_figure(figure, path)
 
 
 def plot_positions(
@@ -41,24 +97,23 @@ def plot_positions(
         curves: Positions (m, n) [rad; m] by label. The second and later curves are dashed.
         title: Title of the figure.
     """
-    names = arm.joint_names
-    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
-    colours = [MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
-    for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
+    figure, panels = panel_grid(arm.num_joints, sharex=True)
+    colours = [FITTED, REFERENCE, COMMANDED]
+    for j, ax in enumerate(panels):
         for i, (label, q) in enumerate(curves.items()):
-            ax.plot(t, q[:, j], "-" if i == 0 else "--", color=colours[i % 3], linewidth=1.2, label=label)
-        low, high = ax.get_ylim()
-        if high - low < 2e-3:  # avoids a magnified view of the noise of a joint at rest
-            ax.set_ylim((low + high) / 2 - 1e-3, (low + high) / 2 + 1e-3)
-        ax.set_title(f"J{j + 1} {name}", fontsize=10)
-        ax.set_ylabel(f"position [{'m' if arm.prismatic[j] else 'rad'}]", fontsize=8)
-        ax.set_xlabel("time [s]", fontsize=8)
-        ax.tick_params(labelsize=7)
-        ax.grid(alpha=0.3)
-    for ax in axes.flat[len(names) :]:
-        ax.axis("off")
-    key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
-    if key:
-        figure.legend(*key, loc="lower right", fontsize=8)
-    figure.suptitle(title)
+            ax.plot(t, q[:, j], "--" if i else "-", color=colours[i % 3], label=label)
+        _widen(ax, _SMALLEST_RANGE * (0.1 if arm.prismatic[j] else 1.0))
+        ax.set_title(joint_title(arm, j))
+        ax.set_ylabel(f"position [{position_unit(arm, j)}]")
+        ax.set_xlabel("time [s]")
+    set_title(figure, title)
+    add_legend(figure)
     save_figure(figure, path)
+
+
+def _widen(ax: Axes, smallest: float) -> None:
+    """Widens the range of the y axis to at least `smallest`, and has no offset in its labels."""
+    low, high = ax.get_ylim()
+    missing = max(smallest - (high - low), 0.0)
+    ax.set_ylim(low - missing / 2, high + missing / 2)
+    ax.ticklabel_format(axis="y", useOffset=False)

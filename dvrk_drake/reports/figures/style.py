@@ -79,9 +79,8 @@ def panel_grid(
     figure.set_layout_engine("constrained")
     for unused in axes.flat[count:]:
         unused.remove()
-    if sharex:
-        for ax in axes.flat[max(count - columns, 0) : count]:
-            ax.tick_params(labelbottom=True)
+    for ax in axes.flat[:count]:
+        ax.tick_params(labelbottom=True, labelleft=True)
     return figure, list(axes.flat[:count])
 
 

@@ -3,39 +3,59 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from dvrk_drake.experiments.tuning.bench import band
-from dvrk_drake.experiments.tuning.tuning import OWN, PUBLISHED, Comparison
-from dvrk_drake.reports.figures.style import save_figure
-
-COLOURS = {OWN: "#9a9a9a", PUBLISHED: "#b58db6", "paper": "#edae49", "model": "#d1495b"}
+from dvrk_drake.experiments.tuning.tuning import Comparison
+from dvrk_drake.reports.figures.colours import COMMANDED, REFERENCE, SERIES
+from dvrk_drake.reports.figures.style import (
+    add_legend,
+    effort_unit,
+    joint_title,
+    panel_grid,
+    position_unit,
+    save_figure,
+    set_title,
+)
 
 
 def plot_steps(path: Path, comparison: Comparison) -> None:
-    """Plots the step response from the first pose for all gains, with one panel per joint."""
+    """Plots the step response from the first pose for all gains: displacement and effort, one column per joint.
+
+    The first and the third row show displacements, the rows below them the commanded efforts.
+    """
     arm = comparison.arm
-    figure, axes = plt.subplots(2, -(-arm.num_joints // 2), figsize=(15, 7), layout="constrained")
-    for j, (name, ax) in enumerate(zip(arm.joint_names, axes.flat, strict=False)):
-        unit = "mm" if arm.prismatic[j] else "mrad"
-        for which, response in comparison.responses.items():
+    columns = -(-arm.num_joints // 2)
+    figure, panels = panel_grid(4 * columns, columns=columns, height=2.1)
+    rows = np.array(panels).reshape(4, columns)
+    for ax in rows[2:, arm.num_joints - columns :].flat:
+        ax.remove()
+    for j in range(arm.num_joints):
+        row, column = 2 * (j // columns), j % columns
+        position, effort = rows[row, column], rows[row + 1, column]
+        goal = 0.0
+        for i, (name, response) in enumerate(comparison.responses.items()):
             displacement = 1e3 * (response.q[:, j] - response.q[0, j])
-            sign = np.sign(response.q_desired[j] - response.q[0, j])
-            ax.plot(response.t, sign * displacement, color=COLOURS[which], label=which, linewidth=1.2)
             goal = 1e3 * abs(response.q_desired[j] - response.q[0, j])
+            sign = np.sign(response.q_desired[j] - response.q[0, j])
+            style: dict[str, Any] = {"color": SERIES[i % len(SERIES)], "linestyle": ("-", "--", "-.", ":")[i % 4]}
+            position.plot(response.t, sign * displacement, label=name, **style)
+            effort.plot(response.t, response.effort[:, j], **style)
         half = 1e3 * band(arm)[j]
-        ax.axhspan(goal - half, goal + half, color="#1f6f8b", alpha=0.15, linewidth=0)
+        position.axhline(goal, color=COMMANDED, linestyle=":", label="target")
+        position.axhspan(goal - half, goal + half, color=REFERENCE, alpha=0.3, linewidth=0, label="settling band")
         # Limits the axis, so that an unstable response does not flatten the other curves.
-        ax.set_ylim(-0.1 * goal, 1.6 * goal)
-        ax.set_title(f"J{j + 1} {name}", fontsize=9)
-        ax.set_ylabel(f"displacement [{unit}]", fontsize=8)
-        ax.set_xlabel("time [s]", fontsize=8)
-        ax.tick_params(labelsize=8)
-    for ax in axes.flat[arm.num_joints :]:
-        ax.axis("off")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower right", fontsize=9)
-    figure.suptitle(f"{arm.name}, simulated with all effects: simultaneous step of all joints, settling band shaded")
+        position.set_ylim(-0.1 * goal, 1.6 * goal)
+        position.set_title(joint_title(arm, j))
+        position.set_ylabel(f"displacement [m{position_unit(arm, j)}]")
+        effort.set_ylabel(f"effort [{effort_unit(arm, j)}]")
+        effort.set_xlabel("time [s]")
+    set_title(
+        figure,
+        f"{arm.name}, simulated with all effects: simultaneous step of all joints. Good gains reach the settling band "
+        "early and stay in it",
+    )
+    add_legend(figure)
     save_figure(figure, path)

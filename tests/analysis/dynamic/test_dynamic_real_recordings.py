@@ -137,7 +137,7 @@ def test_rigid_body_is_valid_on_another_day(another_day):
     error = np.array([100 * a.relative_error for a in validation.actuators])
     assert np.all(error[:3] <= PUBLISHED["psm"][:3])
     # The wrist friction changed. It is the largest part of the error there, not position or bias.
-    assert all(a.friction_like > a.position_dependent for a in validation.actuators[3:])
+    assert all(a.shares.friction_like > a.shares.position_dependent for a in validation.actuators[3:])
 
 
 def test_recalibration_on_a_third_improves_the_rest(another_day):

@@ -1,0 +1,67 @@
+"""Shares of the effort error of one actuator by cause: each error with one cause is assigned to this cause."""
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.dynamic.validation import FAST, SHARE_LABELS, ErrorShares, error_shares
+
+PERIOD, PASSES, RATE = 8.0, 4, 100.0
+t = np.arange(PERIOD * PASSES * RATE) / RATE
+OMEGA = 2 * np.pi / PERIOD
+
+
+def motion():
+    """Returns positions, velocities and accelerations (r, 3) of a periodic motion of three actuators."""
+    rng = np.random.default_rng(3)
+    k = np.arange(1, 6)[:, None]
+    amplitude, phase = rng.uniform(0.2, 1.0, (5, 3)) / k, rng.uniform(0, 2 * np.pi, (5, 3))
+    angle = OMEGA * k * t[:, None, None] + phase
+    q = np.sum(amplitude * np.sin(angle), axis=1)
+    v = np.sum(amplitude * OMEGA * k * np.cos(angle), axis=1)
+    return q, v, -np.sum(amplitude * (OMEGA * k) ** 2 * np.sin(angle), axis=1)
+
+
+Q, V, VD = motion()
+NOISE = np.random.default_rng(0).normal(size=len(t))
+
+
+def shares(error, period=PERIOD):
+    return error_shares(error, 0, Q, V[:, 0], VD, t, period)
+
+
+@pytest.mark.parametrize(
+    ("cause", "error"),
+    [
+        ("bias", np.ones_like(t)),
+        ("friction_like", np.sign(V[:, 0]) - np.mean(np.sign(V[:, 0]))),
+        ("friction_like", V[:, 0]),
+        ("position_dependent", np.sin(2 * Q[:, 0]) - np.mean(np.sin(2 * Q[:, 0]))),
+        ("acceleration_dependent", VD[:, 0]),
+        ("posture_dependent", np.sin(Q[:, 1]) * 3 + np.cos(Q[:, 2])),
+        ("not_repeating", NOISE),
+        ("fast", np.sin(2 * np.pi * 5.0 * t)),
+    ],
+)
+def test_error_with_one_cause_has_mostly_this_share(cause, error):
+    # The previous causes explain a part by chance, because all signals are slow and have the same period.
+    assert getattr(shares(error), cause) > 0.5
+    assert max(shares(error)) == getattr(shares(error), cause)
+
+
+def test_sum_of_shares_is_one_and_no_share_is_negative():
+    error = NOISE + np.sign(V[:, 0]) + 0.3 + np.sin(2 * np.pi * 5.0 * t)
+    assert sum(shares(error)) == pytest.approx(1.0, abs=1e-9)
+    assert min(shares(error)) > -1e-9
+    assert len(SHARE_LABELS) == len(ErrorShares._fields)
+
+
+def test_motion_without_period_has_no_share_that_does_not_repeat():
+    found = shares(NOISE, period=None)
+    assert found.not_repeating is None
+    # White noise is above `FAST` Hz, except for the share of `FAST` of half the rate.
+    assert found.fast == pytest.approx(1 - FAST / (RATE / 2), abs=0.05)
+    assert sum(x for x in found if x is not None) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_error_of_zero_has_no_shares():
+    assert not any(shares(np.zeros_like(t)))
