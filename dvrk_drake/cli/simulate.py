@@ -73,7 +73,7 @@ def simulate(
     if folder is not None:
         from dvrk_drake.reports.figures.simulation import plot_simulation
 
-        plot_simulation(folder / "positions.png", simulation, loaded)
+        plot_simulation(folder / "simulation.png", simulation, loaded)
         print_written(folder)
     if page is not None:
         print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)

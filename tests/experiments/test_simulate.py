@@ -133,7 +133,7 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         str(tmp_path / "plots"),
     ]
     assert main(command) == 0
-    assert (tmp_path / "plots/positions.png").stat().st_size > 10_000
+    assert (tmp_path / "plots/simulation.png").stat().st_size > 10_000
     assert "Largest tracking error" in capsys.readouterr().out
     assert main(["validate", recording, "--model", model, "--json", errors]) == 0
     held = read_recording(recording, PSM)

@@ -1,6 +1,6 @@
 """Figures of identifications, validations and simulations keep the rules of the style, and show what they state."""
 
-from pathlib import Path
+import dataclasses
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,10 +8,12 @@ import pytest
 from figure_rules import checked_figures, colours_of, figure_faults
 from matplotlib.collections import LineCollection
 
-from dvrk_drake.experiments.simulation import scenario_of_arm, simulate
-from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.dynamic.validation import ActuatorError, DynamicValidation, ErrorShares
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.simulation import scenario_of_arm, simulate
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.figures import colours, identification, motion, simulation
 from dvrk_drake.reports.figures.style import WIDTH, add_legend, panel_grid, set_title
 
@@ -27,7 +29,8 @@ def test_unused_panels_are_removed(count):
 
 
 def test_rules_find_faults():
-    figure, (one, two) = panel_grid(2)
+    figure, panels = panel_grid(2)
+    one = panels[0]
     one.plot([0, 1], [0, 1], label="curve")
     one.set_xlabel("time", fontsize=7)
     one.legend()
@@ -58,14 +61,18 @@ def poses(count=40):
 def test_torque_errors_are_dots_with_intervals(monkeypatch, tmp_path):
     measured, predicted = poses()
     usable = np.ones(measured.shape, dtype=bool)
-    rms, intervals = identification._errors_and_intervals({"zero torque": measured, "model": measured - predicted}, usable)
+    rms, intervals = identification._errors_and_intervals(
+        {"zero torque": measured, "model": measured - predicted}, usable
+    )
     for name, (lower, upper) in intervals.items():
         assert np.all((lower < rms[name]) & (rms[name] < upper))
     with checked_figures(monkeypatch) as figures:
         identification.plot_torque_error(
             tmp_path / "a.png", MTM, rms.pop("zero torque"), rms, "RMS torque error", intervals
         )
-        identification.plot_torque_error(tmp_path / "b.png", MTM, np.zeros(7), {"model": np.full(7, np.nan)}, "No errors")
+        identification.plot_torque_error(
+            tmp_path / "b.png", MTM, np.zeros(7), {"model": np.full(7, np.nan)}, "No errors"
+        )
     axes = figures[0].axes[0]
     assert axes.get_xscale() == "log"
     assert not [patch for patch in axes.patches if patch.get_height() != 1.0]  # bands behind the joints, no bars
@@ -94,17 +101,66 @@ def test_outliers_do_not_determine_the_range_of_a_panel(monkeypatch, tmp_path):
 
 
 def test_simulation_shows_position_error_effort_and_disturbance(monkeypatch, tmp_path):
-    start = np.zeros(7)
-    scenario = scenario_of_arm(MTM, False, start, ())
+    scenario = scenario_of_arm(MTM, False, np.zeros(7), ())
     scenario.mounted_arm = MTM
-    scenario.duration = 0.1
-    done = simulate(MTM, effects=False, duration=0.1, start=start)
+    done = simulate(MTM, effects=False, duration=0.1, start=np.zeros(7))
     done.hand[3:6] = 1.0
     with checked_figures(monkeypatch) as figures:
         simulation.plot_simulation(tmp_path / "a.png", done, scenario)
+        simulation.plot_simulation(tmp_path / "b.png", dataclasses.replace(done, desired=None), scenario)
+    assert len(figures[1].axes) == 2 * 7  # no errors without desired positions
     axes = figures[0].axes
     assert len(axes) == 3 * 7
     assert [ax.get_ylabel().split(" [")[0] for ax in axes[:3]] == ["position", "error", "effort"]
     assert all(np.ptp(ax.get_ylim()) >= 0.0199 for ax in axes[::3])
     assert any("disturbance" in text.get_text() for text in figures[0].legends[0].get_texts())
     assert colours_of(figures[0])["measured position and effort"] == colours.MEASURED
+
+
+@pytest.fixture(scope="module")
+def validation():
+    """Returns a validation with errors from friction and noise."""
+    arm, rng, t = load_arm("psm"), np.random.default_rng(0), np.arange(1200) / 100
+    q = 0.3 * np.sin(2 * np.pi / 6.0 * (np.arange(7) % 3 + 1) * t[:, None] + np.arange(7))
+    v = np.gradient(q, t, axis=0)
+    predicted = np.sin(q) + 0.3 * np.sign(v)
+    measured = predicted + 0.1 * np.sign(v) + 0.02 * rng.normal(size=q.shape)
+    return DynamicValidation(
+        model=IdentifiedModel.from_arm(arm),
+        recording=Recording(q=q, qd=v, tau=measured, t=t, source="simulated"),
+        actuators=[
+            ActuatorError(name, 1.0, 0.1, 0.1, ErrorShares(0.0, 0.9, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0), 0.02, "good")
+            for name in arm.joint_names
+        ],
+        cut_off=15.0,
+        t=t,
+        q=q,
+        v=v,
+        vd=np.gradient(v, t, axis=0),
+        period=6.0,
+        measured=measured,
+        predicted=predicted,
+    )
+
+
+@pytest.mark.parametrize("is_fitted", [True, False])
+def test_motion_figures_show_held_out_predictions_and_errors(validation, is_fitted, monkeypatch, tmp_path):
+    held_out = validation.predicted * 0.9 if is_fitted else None
+    with checked_figures(monkeypatch) as figures:
+        motion.plot_motion(tmp_path, validation, held_out)
+    efforts, residuals, budget = figures
+    expected = {"measured": colours.MEASURED}
+    if is_fitted:
+        expected |= {"fitted": colours.FITTED, "held out (cross-validation)": colours.HELD_OUT}
+    else:
+        expected["held out (the motion was not used to fit)"] = colours.HELD_OUT
+    assert colours_of(efforts) == expected
+    assert len(efforts.axes) == len(residuals.axes) == 2 * 7
+    # The measurement is drawn wider than the predictions, so that they do not hide it.
+    measured, *predictions = efforts.axes[0].lines
+    assert all(line.get_linewidth() < measured.get_linewidth() / 2 for line in predictions)
+    # The bars have the lengths of the relative errors.
+    lengths = np.array([sum(p.get_width() for p in budget.axes[0].patches[i::7]) for i in range(7)])
+    predicted = validation.predicted if held_out is None else held_out
+    error = np.sqrt(np.mean((validation.measured - predicted) ** 2, axis=0) / np.mean(validation.measured**2, axis=0))
+    np.testing.assert_allclose(lengths, 100 * error, atol=1e-6)

@@ -254,7 +254,8 @@ def error_shares(
     ]
     shares = []
     columns: list[NDArray[np.float64]] = []
-    total = unexplained = float(np.mean(error**2)) or 1.0
+    unexplained = float(np.mean(error**2))
+    total = unexplained or 1.0
     rest = error
     for kind in kinds:
         columns += kind

@@ -24,7 +24,7 @@ from dvrk_drake.reports.figures.style import (
     set_title,
 )
 
-#: Smallest range of a position axis, and smallest range of an error axis [rad; 0.1 m]. Smaller ranges would magnify the
+#: Smallest range of a position axis and of an error axis [rad]; a tenth of it in m. Smaller ranges would magnify the
 #: noise of a joint at rest.
 _SMALLEST_RANGE, _SMALLEST_ERROR_RANGE = 0.02, 0.004
 #: Efforts above this share of the effort limit are drawn together with the limit.
@@ -32,38 +32,40 @@ _NEAR_LIMIT = 0.5
 
 
 def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> None:
-    """Writes a PNG with one row per joint: position, position error and measured effort.
+    """Writes a PNG with one row per joint: position, position error if there are desired positions, and effort.
 
-    Without desired positions, the second column shows the motion from the initial position. Times at which the hand
-    acts on the arm are shaded.
+    Times at which the hand acts on the arm are shaded.
     """
     arm, t = scenario.mounted_arm, simulation.time
     q, tau, desired = simulation.recording.q, simulation.recording.measured_effort(), simulation.desired
-    figure, rows = plt.subplots(
-        arm.num_joints, 3, figsize=(WIDTH, 1.75 * arm.num_joints + 1), sharex=True, layout="constrained", squeeze=False
-    )
-    for j, (position, error, effort) in enumerate(rows):
+    columns, size = 2 if desired is None else 3, (WIDTH, 1.75 * arm.num_joints + 1)
+    figure, rows = plt.subplots(arm.num_joints, columns, figsize=size, sharex=True, layout="constrained", squeeze=False)
+    for j, panels in enumerate(rows):
+        position, effort = panels[0], panels[-1]
         unit = position_unit(arm, j)
         scale = 0.1 if arm.prismatic[j] else 1.0
         position.plot(t, q[:, j], color=MEASURED, label="measured position and effort")
         if desired is not None:
+            error = panels[1]
             position.plot(t, desired[:, j], "--", color=COMMANDED, label="desired position")
+            error.plot(t, 1e3 * (q[:, j] - desired[:, j]), color=MEASURED)
+            error.axhline(0.0, color=NEUTRAL, linewidth=0.8)
+            error.set_ylabel(f"error [m{unit}]")
+            _widen(error, 1e3 * _SMALLEST_ERROR_RANGE * scale)
         position.set_ylabel(f"position [{unit}]")
         _widen(position, _SMALLEST_RANGE * scale)
-        error.plot(t, 1e3 * (q[:, j] - (q[0, j] if desired is None else desired[:, j])), color=MEASURED)
-        error.axhline(0.0, color=NEUTRAL, linewidth=0.8)
-        error.set_ylabel(f"{'error' if desired is not None else 'motion'} [m{unit}]")
-        _widen(error, 1e3 * _SMALLEST_ERROR_RANGE * scale)
         limit = float(arm.effort_limits[j])
         effort.plot(t, tau[:, j], color=MEASURED)
         effort.set_ylabel(f"effort [{effort_unit(arm, j)}]")
         _widen(effort, 0.02 * limit)
-        if np.abs(tau[:, j]).max() > _NEAR_LIMIT * limit:
+        largest = np.abs(tau[:, j]).max()
+        if largest > _NEAR_LIMIT * limit:
             for sign in (-1, 1):
                 effort.axhline(sign * limit, color=LIMIT, linestyle="--", label="effort limit")
         position.set_title(joint_title(arm, j), loc="left")
-        share = 100 * np.abs(tau[:, j]).max() / limit
-        effort.set_title(f"largest {share:.0f} % of the limit {limit:g} {effort_unit(arm, j)}", loc="left")
+        effort.set_title(
+            f"largest {100 * largest / limit:.0f} % of the limit {limit:.3g} {effort_unit(arm, j)}", loc="left"
+        )
     acts = np.any(simulation.hand != 0, axis=1)
     if np.any(acts):
         for ax in rows.flat:
@@ -76,11 +78,8 @@ def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> N
         ax.set_xlabel("time [s]")
         ax.set_xlim(t[0], t[-1])
     figure.align_ylabels(rows)
-    second = "motion from the start" if desired is None else "position error"
-    set_title(
-        figure,
-        f"{arm.name}, simulated, controller mode {scenario.controller.mode}: position, {second} and effort",
-    )
+    quantities = "position and effort" if desired is None else "position, position error and effort"
+    set_title(figure, f"{arm.name}, simulated, controller mode {scenario.controller.mode}: {quantities} of each joint")
     add_legend(figure)
     save_figure(figure, path)
 
