@@ -58,10 +58,12 @@ def teleop(
     Args:
         output: Play a recorded hand motion, write an animation to this HTML file, and print the PSM's tracking error.
     """
-    from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
+    from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation
+    from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.demo import print_teleoperation
     from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.systems.arm_view.page import page_html
 
     quiet_drake()
     if output is None:
@@ -78,7 +80,7 @@ def teleop(
     with Steps("playing") as steps:
         result = play_teleoperation(meshcat, progress=step_progress(steps, "playing"))
     with atomic_write(output) as stream:
-        stream.write(meshcat.StaticHtml())
+        stream.write(page_html(meshcat, "MTML teleoperates PSM"))
     print_teleoperation(make_console(), result, output, verbose=verbose)
     print_written(output)
 

@@ -9,16 +9,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import Meshcat, Rgba, Sphere
+from pydrake.geometry import Meshcat, Rgba
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
+from dvrk_drake.experiments.demo.teleoperation_scene import TeleoperationScene
 from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.arm_view.page import start_meshcat
 from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
@@ -27,14 +27,11 @@ SCALE = 0.4
 #: Start poses of the arms [rad, m]: handle in front of the operator, instrument in the middle of its range.
 START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
 START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
-#: Positions of the bases in the world frame [m]. Both bases have the same orientation.
-BASE_POSITIONS = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
-CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
 #: Time intervals of the simulated motion in which the clutch is closed [s].
 ENGAGED = ((0.5, 9.7), (11.2, 16.0))
 DURATION = 16.0
 PERIOD = 0.02
-BLUE, GREEN, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.1, 0.7, 0.2), Rgba(0.55, 0.55, 0.55)
+BLUE, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.35, 0.35, 0.35)
 
 
 @dataclass(frozen=True)
@@ -89,6 +86,7 @@ def play_teleoperation(
     """
     builder = DiagramBuilder()
     arms = builder.AddSystem(_make_arms(meshcat))
+    scene = TeleoperationScene(arms, meshcat) if meshcat is not None else None
     start = arms.CreateDefaultContext()
     arms.SetPositions(start, START_MASTER, START_FOLLOWER)
     hand = builder.AddSystem(PoseTrajectorySource(_hand_motion(arms.CalcX_MG(start))))
@@ -110,6 +108,9 @@ def play_teleoperation(
             samples.following.append(bool(arms.GetOutputPort("following").Eval(context)[0]))
             samples.X_MG.append(arms.CalcX_MG(context))
             samples.X_FT.append(arms.CalcX_FT(context))
+            if scene is not None:
+                scene.draw(arms, context, time=t)
+                scene.set_phase("clutch closed" if samples.following[-1] else "clutch open", t)
             progress(t / duration)
     if meshcat is not None:
         _draw_paths(meshcat, samples)
@@ -119,12 +120,13 @@ def play_teleoperation(
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     """Simulates teleoperation in real time with controls for hand, clutch, jaw and scale in Meshcat.
 
-    The simulation ends after `duration` [s], or earlier if the user clicks the button Stop. A sphere above the master
-    is green while the follower follows the master, and grey otherwise.
+    The simulation ends after `duration` [s], or earlier if the user clicks the button Stop. A caption shows the state
+    of the clutch, the scale and the tracking error.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 
     arms = _make_arms(meshcat)
+    scene = TeleoperationScene(arms, meshcat)
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
     arms.SetPositions(context, START_MASTER, START_FOLLOWER)
@@ -138,29 +140,39 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     meshcat.AddSlider("scale", 0.1, 1.0, 0.05, SCALE)
     meshcat.AddButton("Clutch", "Space")
     meshcat.AddButton("Stop", "Escape")
-    scale, lamp = SCALE, None
+    scale, error = SCALE, _LiveError()
     simulator.set_target_realtime_rate(1.0)
     while meshcat.GetButtonClicks("Stop") == 0 and context.get_time() < duration:
         if (chosen := meshcat.GetSliderValue("scale")) != scale:
             scale = chosen
             arms.teleoperation.SetScale(arms.teleoperation.GetMyMutableContextFromRoot(context), scale)
+            error = _LiveError()
         X_MG = _moved(X_MG0, sliders.get_output_port().Eval(sliders_context))
         arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(X_MG))
         arms.GetInputPort("engaged").FixValue(context, [float(meshcat.GetButtonClicks("Clutch") % 2)])
         arms.GetInputPort("jaw_angle").FixValue(context, [meshcat.GetSliderValue("jaw")])
         simulator.AdvanceTo(context.get_time() + PERIOD)
-        if (follows := bool(arms.GetOutputPort("following").Eval(context)[0])) != lamp:
-            lamp = follows
-            meshcat.SetObject("mtml/lamp", Sphere(0.015), GREEN if lamp else GREY)
-            meshcat.SetTransform("mtml/lamp", RigidTransform([0.0, 0.0, 0.42]))
+        follows = bool(arms.GetOutputPort("following").Eval(context)[0])
+        tracking = error.update(follows, arms.CalcX_MG(context), arms.CalcX_FT(context), scale)
+        scene.draw(arms, context)
+        scene.show_status(follows, scale, tracking)
 
 
-def start_scene(port: int | None = None) -> Meshcat:
-    """Starts Meshcat and sets the base poses of both arms. If `port` is None, Meshcat uses a free port."""
-    meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
-    for name, p_WB in BASE_POSITIONS.items():
-        meshcat.SetTransform(name, RigidTransform(np.array(p_WB)))
-    return meshcat
+class _LiveError:
+    """Position error of the tip relative to the scaled displacement of the handle since the clutch closed."""
+
+    def __init__(self) -> None:
+        self._start: tuple[RigidTransform, RigidTransform] | None = None
+
+    def update(self, follows: bool, X_MG: RigidTransform, X_FT: RigidTransform, scale: float) -> float | None:
+        """Returns the error [m], or None while the clutch is open."""
+        if not follows:
+            self._start = None
+            return None
+        if self._start is None:
+            self._start = X_MG, X_FT
+        G0, T0 = (X.translation() for X in self._start)
+        return float(np.linalg.norm(X_FT.translation() - T0 - scale * (X_MG.translation() - G0)))
 
 
 def _make_arms(meshcat: Meshcat | None) -> TeleoperatedArms:

@@ -21,6 +21,8 @@ LINE_HEIGHT = 0.06
 NEARER = 0.6
 #: Upper edge of the caption of the phase. Distance of the joint names to the right of their joints.
 PHASE_EDGE, NAME_OFFSET = 0.84, 0.16
+#: Largest |u| and |v| of a point with a name, see `Camera.point`.
+NAMES_INSIDE = 1.4, 0.78
 #: Rotation of a text (x right, y into the view, z up) in the camera (x right, y up, z towards the viewer).
 _R_CT = RotationMatrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]))
 _LEADER = Rgba(0.1, 0.13, 0.17)
@@ -78,16 +80,18 @@ class Captions:
     def place_names(self, names: Sequence[str], p_BJ: NDArray[np.float64]) -> None:
         """Shows names beside the points p_BJ (k, 3) [m] in the base frame, with lines from the points to the names.
 
-        Names of neighbouring points are below each other.
+        Names of neighbouring points are below each other. Points outside the view have no name.
         """
         X_WB = self._X_BW.inverse()
         places = [self._camera.place(X_WB @ p) for p in p_BJ]
-        if min(depth for _, _, depth in places) <= 0:  # a joint is behind the camera
-            return
         starts, ends, lowest = [], [], np.inf
         for i in sorted(range(len(names)), key=lambda i: -places[i][1]):
             u, v, depth = places[i]
             path = f"names/{names[i]}"
+            inside = depth > 0 and abs(u) < NAMES_INSIDE[0] and abs(v) < NAMES_INSIDE[1]
+            self._scene.set_visible(path, inside)
+            if not inside:
+                continue
             if path not in self._sizes:
                 self._add(path, text_image(names[i]))
             width, height = self._sizes[path]
@@ -97,6 +101,9 @@ class Captions:
             starts.append(self._camera.point(u, v, NEARER * depth))
             ends.append(self._camera.point(u + NAME_OFFSET, lowest - height / 2, NEARER * depth))
             lowest -= height * 1.05
+        self._scene.set_visible("names/lines", bool(starts))
+        if not starts:
+            return
         lines = (np.asfortranarray(np.array([self._X_BW @ p for p in points]).T) for points in (starts, ends))
         self._scene.meshcat.SetLineSegments(self._scene.path("names/lines"), *lines, 2.0, _LEADER)
 
@@ -109,4 +116,4 @@ class Captions:
     def _place(self, name: str, u: float, v: float, depth: float) -> None:
         v -= self._sizes[name][1] / 2
         X_WT = RigidTransform(self._camera.X_WC.rotation() @ _R_CT, self._camera.point(u, v, depth))
-        self._scene.set_scaled_transform(name, self._X_BW @ X_WT, depth)
+        self._scene.set_transform(name, self._X_BW @ X_WT, scale=depth)

@@ -17,8 +17,8 @@ FULL_ANGLE = np.radians(300)
 #: distinguishes them.
 _STOPS = np.array([[0.13, 0.44, 0.71], [0.97, 0.82, 0.20], [0.75, 0.10, 0.10]])
 #: Radius of the tube and of the base of the arrow head, as multiples of the radius of the arc.
-_TUBE, _HEAD = 0.07, 0.2
-_SIDES = 6
+_TUBE, _HEAD = 0.075, 0.2
+_SIDES = 8
 
 
 def share_color(share: float) -> NDArray[np.float64]:
@@ -55,17 +55,21 @@ class EffortArcs:
                     scene.set_visible(path, False)
 
     def draw(self, effort: ArrayLike, time: float | None = None) -> None:
-        """Shows the efforts (n,) [N m, N] at the pose of the joints. A recording stores them at `time` [s]."""
+        """Shows the efforts (n,) [N m, N]. A recording stores them at `time` [s]."""
         share = np.asarray(effort, float) / self._arm.effort_limits
         nearest = np.searchsorted((np.array(LEVELS[1:]) + LEVELS[:-1]) / 2, np.abs(np.nan_to_num(share)))
         levels = (np.sign(np.nan_to_num(share)) * nearest).astype(int)
         for i, name in enumerate(self._arm.joint_names):
-            self._scene.set_transform(f"efforts/{name}", self._joints.axis_frames()[i], time)
             if levels[i] != self._levels[i]:
                 for level, visible in ((self._levels[i], False), (levels[i], True)):
                     if level:
                         self._scene.set_visible(f"efforts/{name}/{level}", visible, time)
         self._levels = levels
+
+    def move(self, time: float | None = None, scale: float = 1.0) -> None:
+        """Moves the arcs to the pose of the joints, and scales them. A recording stores the pose at `time` [s]."""
+        for name, X_BJ in zip(self._arm.joint_names, self._joints.axis_frames(), strict=True):
+            self._scene.set_transform(f"efforts/{name}", X_BJ, time, scale)
 
     @property
     def shares(self) -> NDArray[np.float64]:

@@ -43,10 +43,6 @@ class ArmJoints:
             for joint in self._joints
         ]
 
-    def origins(self) -> NDArray[np.float64]:
-        """Returns the origins (n, 3) of the frames that the joints move [m]."""
-        return np.array([j.frame_on_child().CalcPoseInWorld(self._context).translation() for j in self._joints])
-
     def frame_pose(self, name: str) -> RigidTransform:
         """Returns the pose of an SDF frame."""
         return self._plant.GetFrameByName(name).CalcPoseInWorld(self._context)

@@ -37,10 +37,10 @@ class FrameAxes:
         """Shows or hides all frames."""
         self._scene.set_visible("frames", visible)
 
-    def draw(self, time: float | None = None) -> None:
-        """Moves the frames to the pose of the joints. A recording stores them at `time` [s]."""
+    def move(self, time: float | None = None, scale: float = 1.0) -> None:
+        """Moves the frames to the pose of the joints, and scales them. A recording stores the pose at `time` [s]."""
         for name in self._joints.frame_names:
-            self._scene.set_transform(f"frames/{name}", self._joints.frame_pose(name), time)
+            self._scene.set_transform(f"frames/{name}", self._joints.frame_pose(name), time, scale)
 
 
 class RemoteCenter:
@@ -48,8 +48,13 @@ class RemoteCenter:
 
     def __init__(self, joints: ArmJoints, scene: Scene, frame_name: str, radius: float) -> None:
         """Adds the sphere with this radius [m]."""
+        self._scene, self._X_BR = scene, joints.frame_pose(frame_name)
         scene.meshcat.SetObject(scene.path("rcm"), Sphere(radius), RCM_COLOR)
-        scene.set_transform("rcm", joints.frame_pose(frame_name))
+        self.resize(1.0)
+
+    def resize(self, scale: float) -> None:
+        """Scales the sphere."""
+        self._scene.set_transform("rcm", self._X_BR, scale=scale)
 
 
 class TipTrace:

@@ -26,9 +26,11 @@ _X_CAMERA = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])))
 DESIRED = "desired"
 #: Upper edge of the legend, see `Camera.point`.
 LEGEND_EDGE = -0.78
-#: Smallest and largest radius of the effort arcs, length of the frames' axes, radius of the RCM, and distance of joints
-#: with the same origin, as multiples of the size of the arm.
-_ARC, _AXIS, _RCM, _SAME = (0.012, 0.055), 0.06, 0.009, 1e-3
+#: Largest radius of the effort arcs, length of the frames' axes, radius of the RCM, and distance below which arcs have
+#: different radii, as multiples of the size of the arm.
+_ARC, _AXIS, _RCM, _NEAR = 0.085, 0.07, 0.009, 0.05
+#: Size of arcs and frames on the screen in a close-up, as a multiple of their size in the view of the whole arm.
+_CLOSE_UP = 3.0
 
 
 class ArmOverlay:
@@ -57,7 +59,13 @@ class ArmOverlay:
     """
 
     def __init__(
-        self, arm: Arm, meshcat: Meshcat, *, X_WB: RigidTransform | None = None, camera: Camera | None = None
+        self,
+        arm: Arm,
+        meshcat: Meshcat,
+        *,
+        X_WB: RigidTransform | None = None,
+        camera: Camera | None = None,
+        legend: bool = True,
     ) -> None:
         """Adds the overlay. Nothing is visible except the RCM of the arm, if it has one.
 
@@ -66,6 +74,7 @@ class ArmOverlay:
             meshcat: Meshcat with the arm.
             X_WB: Pose of the arm's base in the world. None: identity.
             camera: Camera for which the texts are placed. None: the camera of `start_meshcat(arm)`.
+            legend: Whether the colour scale of the efforts is shown together with the efforts.
         """
         self.arm, self.meshcat = arm, meshcat
         self._X_WB = X_WB or RigidTransform()
@@ -76,16 +85,17 @@ class ArmOverlay:
         self._q = home_position(arm)
         self._joints.set_positions(self._q)
         size = float(np.ptp(geometry_corners(arm), axis=0).max())
-        radii = _radii(self._joints.origins(), size)
+        radii = _radii(self._origins(), size)
         self._efforts = EffortArcs(arm, self._joints, self._scene, radii)
         self._frames = FrameAxes(self._joints, self._scene, _AXIS * size)
         self._ghosts: dict[str, GhostArm] = {}
-        self._shows_names = self._shows_legend = False
-        if arm.view.remote_center:
-            RemoteCenter(self._joints, self._scene, arm.view.remote_center, _RCM * size)
+        self._shows_names, self._needs_legend = False, legend
+        rcm = arm.view.remote_center
+        self._rcm = RemoteCenter(self._joints, self._scene, rcm, _RCM * size) if rcm else None
         self._trace = TipTrace(self._joints, self._scene, arm.view.tip) if arm.view.tip else None
         self._scene.set_visible("names", False)
         self._tracked = RigidTransform()
+        self._whole_distance, self._scale = self._camera.distance, 1.0
 
     def add_ghost(self, name: str, color: Rgba = ORANGE) -> None:
         """Adds a translucent arm, which `draw` shows if its argument `ghosts` has a pose with this name."""
@@ -126,7 +136,8 @@ class ArmOverlay:
                 ghost.draw(poses[name], self._q, time)
             else:
                 ghost.hide(time)
-        self._frames.draw(time)
+        self._efforts.move(time, self._scale)
+        self._frames.move(time, self._scale)
         if self._trace is not None:
             self._trace.draw()
         self._draw_names()
@@ -164,7 +175,14 @@ class ArmOverlay:
         """Moves the camera to one of `camera_presets`. A close-up shows its links at the pose that was drawn last."""
         links = self.arm.view.close_ups.get(preset)
         position, target = framing(self.arm) if links is None else close_up(self.arm, self._q, tuple(links))
-        self._set_camera(self._looking_at(position, target))
+        camera = self._looking_at(position, target)
+        # In a close-up, arcs and frames would otherwise be larger than the links.
+        self._scale = min(1.0, _CLOSE_UP * camera.distance / self._whole_distance)
+        self._efforts.move(scale=self._scale)
+        self._frames.move(scale=self._scale)
+        if self._rcm is not None:
+            self._rcm.resize(self._scale)
+        self._set_camera(camera)
         self.meshcat.SetCameraPose(self._X_WB @ position, self._X_WB @ target)
 
     def follow_camera(self) -> None:
@@ -174,6 +192,10 @@ class ArmOverlay:
             return
         self._tracked = X_WC
         self._set_camera(Camera(X_WC @ _X_CAMERA, self._camera.distance))
+
+    def _origins(self) -> NDArray[np.float64]:
+        """Returns points (n, 3) on the axes of the joints in the base frame [m]."""
+        return np.array([X_BJ.translation() for X_BJ in self._joints.axis_frames()])
 
     def _looking_at(self, p_BC: ArrayLike, p_BT: ArrayLike) -> Camera:
         return Camera.looking_at(self._X_WB @ np.asarray(p_BC), self._X_WB @ np.asarray(p_BT))
@@ -186,25 +208,17 @@ class ArmOverlay:
     def _draw_names(self) -> None:
         if self._shows_names:
             names = [f"{i + 1} {name}" for i, name in enumerate(self.arm.joint_names)]
-            self.captions.place_names(names, self._joints.origins())
+            self.captions.place_names(names, self._origins())
 
     def _show_legend(self) -> None:
-        if not self._shows_legend:
+        if self._needs_legend:
             colors = [share_color(share) for share in np.linspace(0, 1, 50)]
             image = color_scale_image("joint effort / effort limit", colors, ("0 %", "50 %", "100 %"))
             self.captions.set_image("legend", image, 0.0, LEGEND_EDGE)
-            self._shows_legend = True
+            self._needs_legend = False
 
 
 def _radii(origins: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """Returns radii (n,) of the effort arcs [m] for joints with these origins (n, 3).
-
-    Joints that are close to each other have small arcs. Joints with the same origin have arcs of different sizes.
-    """
-    radii = np.empty(len(origins))
-    for i, p in enumerate(origins):
-        distances = np.linalg.norm(origins - p, axis=1)
-        apart = distances[distances > _SAME * size]
-        equal = np.count_nonzero(distances[:i] <= _SAME * size)
-        radii[i] = np.clip(0.35 * apart.min(initial=np.inf), _ARC[0] * size, _ARC[1] * size) * 0.8**equal
-    return radii
+    """Returns radii (n,) of the effort arcs [m]. Arcs of joints at nearly the same place have different radii."""
+    near = np.linalg.norm(origins[:, None] - origins, axis=2) < _NEAR * size
+    return _ARC * size * 0.82 ** np.tril(near, -1).sum(axis=1)

@@ -26,24 +26,21 @@ class Scene:
         """Returns the Meshcat path of `name`."""
         return f"{self._root}/{name}"
 
-    def set_transform(self, name: str, X_PN: RigidTransform, time: float | None = None) -> None:
-        """Sets the pose of `name` in its parent path. A recording stores it at `time` [s]."""
-        # A recording interpolates between its samples, so it also requires the samples without a change.
-        if self._changes(name, X_PN.GetAsMatrix4()) or time is not None:
-            self.meshcat.SetTransform(self.path(name), X_PN, time)
+    def set_transform(self, name: str, X_PN: RigidTransform, time: float | None = None, scale: float = 1.0) -> None:
+        """Sets the pose of `name` in its parent path, and its size.
 
-    def set_scaled_transform(self, name: str, X_PN: RigidTransform, scale: float) -> None:
-        """Sets the pose of `name` in its parent path, and its size. A recording does not store it."""
+        A recording stores the pose at `time` [s]. It cannot store a scale other than 1.
+        """
         matrix = X_PN.GetAsMatrix4()
         matrix[:3, :3] *= scale
-        if self._changes(name, matrix):
-            self.meshcat.SetTransform(self.path(name), np.asfortranarray(matrix))
-
-    def _changes(self, name: str, matrix: NDArray[np.float64]) -> bool:
-        if name in self._transforms and np.array_equal(self._transforms[name], matrix):
-            return False
+        # A recording interpolates between its samples, so it also requires the samples without a change.
+        if time is None and name in self._transforms and np.array_equal(self._transforms[name], matrix):
+            return
         self._transforms[name] = matrix
-        return True
+        if scale == 1.0:
+            self.meshcat.SetTransform(self.path(name), X_PN, time)
+        else:
+            self.meshcat.SetTransform(self.path(name), np.asfortranarray(matrix))
 
     def set_visible(self, name: str, visible: bool, time: float | None = None) -> None:
         """Shows or hides `name`. A recording stores the change at `time` [s]."""

@@ -11,8 +11,8 @@ from dvrk_drake.experiments.demo.teleoperation import (
     SCALE,
     play_teleoperation,
     run_live_teleoperation,
-    start_scene,
 )
+from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
 
 
 @pytest.mark.slow
