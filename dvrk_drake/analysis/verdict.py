@@ -46,6 +46,34 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
     return "usable" if error <= max(usable * effort, SMALL_ERROR * effort_limit) else "do not use"
 
 
+def reason(
+    verdict: Verdict, effort: float, error: float, effort_limit: float, *, in_motion: bool, prismatic: bool = False
+) -> str:
+    """Returns the reason for a verdict of `judge` in one sentence.
+
+    Args:
+        verdict: Verdict on the joint.
+        effort, error, effort_limit, in_motion: See `judge`.
+        prismatic: True for a prismatic joint, whose error is in N.
+    """
+    if verdict == "off":
+        if effort == 0:
+            return "The model commands no torque, because no effort was measured."
+        return "The model commands no torque, because the recording does not separate gravity from friction."
+    if verdict == "not judged":
+        return "No effort was measured, or no error is known."
+    ratio, limit = error / effort, USABLE_RATIO_IN_MOTION if in_motion else USABLE_RATIO_AT_REST
+    share = f"The error is {100 * ratio:.0f} % of the measured effort"
+    if verdict == "good":
+        return f"{share} (good: up to {100 * GOOD_RATIO:g} %)."
+    if verdict == "usable" and ratio > limit:
+        unit = "N" if prismatic else "N m"
+        absolute = f"{error:.2g} {unit} or {100 * error / effort_limit:.1f} % of the effort limit"
+        return f"{share}, but it is small: {absolute} (usable: up to {100 * SMALL_ERROR:g} %)."
+    more = "" if verdict == "usable" else f", and {100 * error / effort_limit:.0f} % of the effort limit"
+    return f"{share}{more} (usable: up to {100 * limit:g} %)."
+
+
 def rule_text(in_motion: bool) -> str:
     """Returns the rule of `judge` as text, with the thresholds."""
     good, usable, zero = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -35,6 +35,11 @@ from dvrk_drake.cli.support import (
 )
 from dvrk_drake.errors import ModelError
 
+if TYPE_CHECKING:
+    from dvrk_drake.analysis.results import Identification, Validation
+    from dvrk_drake.reports.html.page import Page
+    from dvrk_drake.reports.html.provenance import Provenance
+
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 LowSpeedSegments = Annotated[
     bool, Parameter(show_default=False, help="Treat low-speed segments of a motion as static poses.")
@@ -57,6 +62,7 @@ def identify(
     gravity: Gravity = None,
     locked: Locked = None,
     plots: Plots = None,
+    report: Report = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
@@ -71,6 +77,7 @@ def identify(
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, overwrite=overwrite)
+    check_report(report, recording, overwrite=overwrite)
     recorded_arm = mounted(dvrk.load_arm(arm), gravity, locked)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
@@ -91,6 +98,36 @@ def identify(
     print_written(output)
     if folder is not None:
         print_written(folder)
+    _write_report(result, report, output, file, recording)
+
+
+def _write_report(
+    result: Identification | Validation,
+    report: str | None,
+    model: str,
+    file: FileOptions,
+    *inputs: str,
+    saved: bool = False,
+) -> None:
+    """Writes the report given with --report, or prints which option writes a report.
+
+    Args:
+        result: Result of the command.
+        report: Path of the report, or None.
+        model: Path of the model file.
+        file: Options with which the recording was read.
+        inputs: Paths of the input files.
+        saved: Whether the verdicts are stored in the model file.
+    """
+    if report is None:
+        print("--report FILE.html writes plots, parameters with intervals and a 3D view of the recording.", flush=True)
+        return
+    from dvrk_drake.reports.html.identification import identification_page
+
+    def page(provenance: Provenance) -> Page:
+        return identification_page(result, provenance, model_path=model, file_options=file.as_text(), saved=saved)
+
+    write_page(report, page, *inputs)
 
 
 def _model_and_recording(
@@ -115,6 +152,7 @@ def validate(
     low_speed_segments: LowSpeedSegments = False,
     json: Json = None,
     plots: Plots = None,
+    report: Report = None,
     overwrite: Annotated[Overwrite, Parameter(help="Replace existing files, plots and stored verdicts.")] = False,
     verbose: Verbose = False,
 ) -> None:
@@ -129,6 +167,7 @@ def validate(
 
     if json is not None:
         check_output(json, recording, model, overwrite=overwrite)
+    check_report(report, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "validating") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
         folder = plots_folder(plots, overwrite=overwrite)
@@ -163,6 +202,7 @@ def validate(
         print_written(json)
     if save:
         print_written(model, "verdicts stored")
+    _write_report(validation, report, model, file, recording, model, saved=save)
     if require is not None and (failed := validation.unfit(require)):
         raise ModelError(
             f"{model}: verdicts below {require} on {read.source}: {', '.join(failed)}; identify from a recording with "

@@ -17,7 +17,7 @@ from dvrk_drake.analysis.results import Identification, Validation
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
-from dvrk_drake.analysis.verdict import cross_validated_verdicts, rule_text, worst
+from dvrk_drake.analysis.verdict import cross_validated_verdicts, rule_text
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect
 from dvrk_drake.dynamics.dynamic_section import CorrelatedEstimates, DynamicSection
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
@@ -25,8 +25,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.locked_joints import locked_option, locked_text
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.models.locked_joints import locked_text
+from dvrk_drake.reports.answers import Answer, answer_of, percent
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 #: Colours of table rows by verdict.
@@ -52,29 +52,14 @@ def print_identification(
         file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
         verbose: Whether to print each parameter with its standard error, and the excluded measurements.
     """
+    answer = answer_of(result, model_path=model_path, file_options=file_options)
+    _print_answer(console, answer)
     verdicts = cross_validated_verdicts(result.model)
-    next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
-    if worst(verdicts)[0] == "do not use":
-        next_command = (
-            f"dvrk-drake check {_source(result.recording, file_options)} --arm {_arm_options(result.model.arm)}"
-        )
     if isinstance(result, DynamicIdentification):
-        actuators = result.model.dynamic_model.section.actuators
-        fit, held_out = (
-            np.mean([getattr(a, which) / a.rms_effort for a in actuators if a.rms_effort > 0])
-            for which in ("rms_fit", "rms_cross_validation")
-        )
-        error = f"Mean relative effort error: {_percent(held_out)} in cross-validation, {_percent(fit)} in the fit."
-        _print_verdict(console, verdicts, error, next_command)
         _print_motion_errors(console, result, verdicts)
         if verbose:
             _print_motion_details(console, result)
     elif isinstance(result, StaticIdentification):
-        joints = result.model.joints
-        errors = np.array([j.rms_cross_validation_included for j in joints])
-        torques = np.array([j.rms_zero_torque_included for j in joints])
-        error = _largest_error(result.model.arm, errors, torques, "cross-validation ")
-        _print_verdict(console, verdicts, error, next_command)
         _print_pose_errors(console, result, verdicts, verbose)
         if verbose:
             _print_pose_details(console, result)
@@ -90,16 +75,6 @@ def _print_locked_joints(console: Console, arm: Arm) -> None:
             style="yellow",
             markup=False,
         )
-
-
-def _arm_options(arm: Arm) -> str:
-    """Returns the value of --arm, and the option --locked if joints are locked."""
-    return arm.source + locked_option(arm)
-
-
-def _source(recording: Recording, file_options: str) -> str:
-    """Returns the path of a recording and the options to read it, as arguments of a command."""
-    return f"{recording.source or 'RECORDING.csv'}{file_options}"
 
 
 def print_validation(
@@ -121,32 +96,13 @@ def print_validation(
         saved: Whether the verdicts are stored in the model file, from which the command `run` reads them.
         verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
     """
-    verdicts, model = validation.verdicts, validation.model
-    source = _source(validation.recording, file_options)
-    next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode damped"
-    if model.arm.locked_joints:  # run requires all joints
-        next_command = f"dvrk-drake predict {source} --model {model_path} --output FILE.csv"
-    if validation.of_same_recording:
-        next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
-    elif validation.verdict == "do not use":
-        next_command = f"dvrk-drake check {source} --arm {_arm_options(model.arm)}"
-        # Errors above 100 % are due to wrong signs, units or coordinates, which a refit of friction does not correct.
-        plausible = all(error is None or error <= 1 for error in validation.relative_errors.values())
-        if isinstance(validation, DynamicValidation) and plausible:
-            next_command = f"dvrk-drake recalibrate {source} --model {model_path} --output NEW.yaml"
-    elif not saved:
-        next_command = f"dvrk-drake validate {source} --model {model_path} --save"
+    answer = answer_of(validation, model_path=model_path, file_options=file_options, saved=saved)
+    _print_answer(console, answer)
     if isinstance(validation, DynamicValidation):
-        error = f"Mean relative effort error: {_percent(validation.mean_relative_error)}."
-        _print_verdict(console, verdicts, error, next_command)
         _print_motion_validation(console, validation, verbose)
     elif isinstance(validation, StaticValidation):
-        errors = np.array([j.rms_error_included for j in validation.joints])
-        torques = np.array([j.rms_torque_included for j in validation.joints])
-        error = _largest_error(model.arm, errors, torques)
-        _print_verdict(console, verdicts, error, next_command)
         _print_pose_validation(console, validation, verbose)
-    _print_locked_joints(console, model.arm)
+    _print_locked_joints(console, validation.model.arm)
 
 
 def print_recalibration(
@@ -165,7 +121,7 @@ def print_recalibration(
     kept = sum(a.kept for a in result.actuators)
     print_answer(
         console,
-        f"Mean effort error {_percent(before)} before and {_percent(after)} after the refit, cross-validated; "
+        f"Mean effort error {percent(before)} before and {percent(after)} after the refit, cross-validated; "
         f"{kept} of {len(result.actuators)} actuators refitted.",
         f"dvrk-drake validate OTHER.csv --model {model_path} --save",
     )
@@ -183,9 +139,9 @@ def print_recalibration(
     )
     for a in result.actuators:
         new = [_factor(a.dry), _factor(a.viscous), f"{a.offset:+.4f}"] if a.kept else ["", "", ""]
-        table.add_row(a.name, _percent(a.before), _percent(a.after), *new, a.reason)
+        table.add_row(a.name, percent(a.before), percent(a.after), *new, a.reason)
     table.columns[-1].justify, table.columns[-1].no_wrap = "left", False
-    table.add_row("mean", _percent(before), _percent(after), "", "", "", "")
+    table.add_row("mean", percent(before), percent(after), "", "", "", "")
     console.print(table)
     print_note(
         console,
@@ -204,21 +160,8 @@ def print_recalibration(
         console.print(f"Factors of friction that acts on several actuators: {shared}", markup=False)
 
 
-def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str, next_command: str) -> None:
-    """Prints the least favourable verdict with its joints, the error, and the joints without feedforward."""
-    verdict, names = worst(verdicts)
-    which = "" if verdict == "good" or len(names) == len(verdicts) else f" ({', '.join(names)})"
-    off = [name for name, v in verdicts.items() if v == "off"]
-    disabled = f" Feedforward disabled: {', '.join(off)}." if off else ""
-    answer = f"Verdict: {verdict}{which}. {error}{disabled}"
-    print_answer(console, answer, next_command, _STYLES.get(verdict, "green"))
-
-
-def _largest_error(arm: Arm, errors: np.ndarray, torques: np.ndarray, kind: str = "") -> str:
-    """Returns a sentence about the joint with the largest ratio of error to effort limit."""
-    j = int(np.nanargmax(np.where(torques > 0, errors / arm.effort_limits, -1.0)))
-    unit, share = "N" if arm.prismatic[j] else "N m", _percent(errors[j] / arm.effort_limits[j])
-    return f"Largest {kind}error: {share} of the effort limit ({arm.joint_names[j]}, {errors[j]:.3g} {unit})."
+def _print_answer(console: Console, answer: Answer) -> None:
+    print_answer(console, answer.text, answer.next_command, _STYLES.get(answer.verdict, "green"))
 
 
 def _print_motion_errors(console: Console, result: DynamicIdentification, verdicts: Mapping[str, Verdict]) -> None:
@@ -234,11 +177,11 @@ def _print_motion_errors(console: Console, result: DynamicIdentification, verdic
     }
     for a in section.actuators:
         verdict = verdicts[a.name]
-        cells = (_percent(share) if share > 0 else "" for share in shares[a.name])
+        cells = (percent(share) if share > 0 else "" for share in shares[a.name])
         table.add_row(a.name, f"{a.rms_effort:.4f}", *cells, verdict, style=_STYLES.get(verdict, ""))
     moved = [shares[a.name] for a in section.actuators if a.rms_effort > 0]
     means = np.mean(moved, axis=0) if moved else np.zeros(3)
-    table.add_row("mean", "", *(_percent(mean) if mean > 0 else "" for mean in means), "")
+    table.add_row("mean", "", *(percent(mean) if mean > 0 else "" for mean in means), "")
     console.print(table)
     tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:
@@ -441,10 +384,10 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     table = make_table(title, "", "measured", "error", "ratio", "repeatability", "verdict")
     table.columns[-1].justify = "left"
     for a in validation.actuators:
-        shares = ("" if x is None else _percent(x) for x in (a.relative_error, a.repeatability))
+        shares = ("" if x is None else percent(x) for x in (a.relative_error, a.repeatability))
         style = _STYLES.get(a.verdict, "")
         table.add_row(a.name, f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *shares, a.verdict, style=style)
-    table.add_row("mean", "", "", _percent(validation.mean_relative_error), "", "")
+    table.add_row("mean", "", "", percent(validation.mean_relative_error), "", "")
     console.print(table)
     console.print()
     if not verbose:
@@ -483,10 +426,6 @@ def _print_pose_validation(console: Console, validation: StaticValidation, verbo
         console.print(table)
         console.print()
     _print_excluded(console, validation.excluded)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
 
 
 def _factor(factor: float | None) -> str:

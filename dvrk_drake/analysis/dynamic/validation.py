@@ -100,6 +100,7 @@ class DynamicValidation(Validation):
         period: Period of the motion [s], or None if the motion does not repeat.
         measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
         predicted: Predicted efforts (r, n) of the actuators after low-pass filtering [N m, N].
+        grid: Resampled motion.
     """
 
     actuators: list[ActuatorError]
@@ -111,6 +112,7 @@ class DynamicValidation(Validation):
     period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
+    grid: MotionGrid
 
     @property
     def mean_relative_error(self) -> float:
@@ -200,6 +202,7 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         period=period,
         measured=measured,
         predicted=predicted,
+        grid=grid,
     )
 
 

@@ -63,6 +63,7 @@ class StaticIdentification(Identification):
         cross_validation_residuals: Measured efforts minus predictions (m, n) for the poses of each held-out fold, see
             `JointStatistics` [N m, N]. For the method "paper", they are `leave_one_out_residuals`.
         measured: Mask (m, n) of the efforts that are holding torques.
+        usable: Mask (m, n) of the holding torques that are not excluded.
     """
 
     excluded: list[ExcludedMeasurement]
@@ -70,6 +71,7 @@ class StaticIdentification(Identification):
     leave_one_out_residuals: NDArray[np.float64]
     cross_validation_residuals: NDArray[np.float64]
     measured: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
 
 
 def identify_static(
@@ -172,6 +174,7 @@ def identify_static(
         leave_one_out_residuals=fit.leave_one_out_residuals,
         cross_validation_residuals=validated,
         measured=measured,
+        usable=usable,
     )
 
 

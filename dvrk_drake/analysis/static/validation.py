@@ -61,6 +61,7 @@ class StaticValidation(Validation):
         residuals: Measured minus predicted efforts (m, n), in the coordinates of the recording [N m, N].
         excluded: Measurements that the verdicts do not use, and the reasons for the exclusion.
         measured: Mask (m, n) of the efforts that are holding torques.
+        usable: Mask (m, n) of the holding torques that are not excluded, in the coordinates of the recording.
     """
 
     joints: list[JointError]
@@ -68,6 +69,7 @@ class StaticValidation(Validation):
     residuals: NDArray[np.float64]
     excluded: list[ExcludedMeasurement]
     measured: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
@@ -145,6 +147,7 @@ def validate_static(
         residuals=residuals,
         excluded=excluded,
         measured=measured_joints,
+        usable=usable,
     )
 
 

@@ -226,6 +226,7 @@ class Page:
         sections: Sections in order.
         provenance: Files, versions and command of the report.
         level: Level of the answer, see `Text`.
+        closing: Sections after the provenance, e.g. the next step.
     """
 
     title: str
@@ -233,6 +234,7 @@ class Page:
     sections: Sequence[Section]
     provenance: Provenance
     level: str = "plain"
+    closing: Sequence[Section] = ()
 
     def html(self) -> str:
         """Returns the page. It contains all scripts and styles."""

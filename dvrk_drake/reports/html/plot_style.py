@@ -1,4 +1,4 @@
-"""Plotly template of the reports. The colours are those of `reports.figures.colours`."""
+"""Plotly template of the reports, and the colours of the roles of traces."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from dvrk_drake.reports.figures.colours import SERIES
+from dvrk_drake.reports.figures.colours import ROLES, SERIES
 
 #: Fonts of the page and of its plots. No font is loaded.
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
@@ -24,6 +24,7 @@ _AXIS = {
     "ticks": "outside",
     "tickcolor": _LINE,
     "zeroline": False,
+    "exponentformat": "power",
     "automargin": True,
     "tickfont": {"size": SMALLEST_TEXT},
     "title": {"font": {"size": 13}, "standoff": 8},
@@ -87,3 +88,17 @@ def joint_panels(names: Sequence[str], x_title: str = "", x_titles: Sequence[str
         # With an odd number of panels, the last panel of the right column is one row higher.
         figure.update_xaxes(title=title, showticklabels=bool(title) or bool(x_titles), row=1 + j // 2, col=1 + j % 2)
     return figure.update_layout(height=110 + height * rows)
+
+
+#: Role of a trace -> colour, the same in all plots and figures.
+COLOURS = ROLES | {"predicted": ROLES["fitted"], "residual": _LINE, "zero": _LINE}
+
+
+def line(role: str) -> dict[str, str | float]:
+    """Returns the line of a trace with a role of `COLOURS`.
+
+    Measurements are drawn first, as a thick and light line that the thin lines of predictions do not hide.
+    """
+    if role == "measured":
+        return {"color": "rgba(31, 31, 31, 0.35)", "width": 4.0}
+    return {"color": COLOURS[role], "width": 1.3}

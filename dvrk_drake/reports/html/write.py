@@ -16,6 +16,10 @@ _MAKERS = {
     "CompensationComparison": ("compensation", "compensation_page"),
     "PayloadIdentification": ("payload", "payload_page"),
     "Tuning": ("tuning", "tuning_page"),
+    "DynamicIdentification": ("identification", "identification_page"),
+    "DynamicValidation": ("identification", "identification_page"),
+    "StaticIdentification": ("identification", "identification_page"),
+    "StaticValidation": ("identification", "identification_page"),
 }
 
 

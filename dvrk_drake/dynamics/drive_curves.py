@@ -1,0 +1,53 @@
+"""Computes the friction torque over speed and the cable torque over position of each drive coordinate of a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect
+from dvrk_drake.models.effects_schema import DriveEffect
+
+
+def depends_on_position(effect: DriveEffect) -> bool:
+    """Returns whether the torque of an effect depends on the position only, which excludes friction."""
+    return effect.kind in POSITION_KINDS
+
+
+def friction_curve(
+    effects: Sequence[DriveEffect], coordinate: str, v: NDArray[np.float64], load: float = 0.0
+) -> NDArray[np.float64]:
+    """Returns the friction torque (k,) along a coordinate at constant speeds v (k,) [rad/s, m/s].
+
+    The result is the torque after the travel of presliding, when the joint slides. At v = 0, it is 0.
+
+    Args:
+        effects: Effects of a model. Those of other coordinates, and position-dependent effects, are ignored.
+        coordinate: Key of `Arm.effect_coordinates`.
+        v: Speeds of the coordinate.
+        load: Magnitude of the effort along the coordinate, for load-dependent friction [N m, N].
+    """
+    torque = np.zeros(len(v))
+    for e in effects:
+        if e.coordinate == coordinate and not depends_on_position(e):
+            effect = ActuatorEffect.of(e)
+            # After an infinite travel, the deflection of a presliding element has its final value.
+            travel = [math.copysign(math.inf, speed) if speed else 0.0 for speed in v]
+            shapes = [effect.step(0.0, dx, 0.0, float(s), load)[1] for dx, s in zip(travel, v, strict=True)]
+            torque += e.coefficient * np.array(shapes)
+    return torque
+
+
+def position_curve(effects: Sequence[DriveEffect], coordinate: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the torque (k,) of offset, cables and springs along a coordinate at positions x (k,) [rad, m].
+
+    Args:
+        effects: Effects of a model. Those of other coordinates, and friction, are ignored.
+        coordinate: Key of `Arm.effect_coordinates`.
+        x: Positions of the coordinate.
+    """
+    own = [e for e in effects if e.coordinate == coordinate and depends_on_position(e)]
+    return sum((e.coefficient * ActuatorEffect.of(e).column(x, 0 * x) for e in own), np.zeros(len(x)))

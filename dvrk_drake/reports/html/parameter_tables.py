@@ -1,0 +1,219 @@
+"""Tables of identified parameters with 95 % intervals, beside the parameters of the SDF."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dvrk_drake.analysis.dynamic.estimates import MIN_IDENTIFIABILITY
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, is_prismatic
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
+from dvrk_drake.dynamics.dynamic_section import DynamicSection
+from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.reports.html.labels import NO_BREAK
+from dvrk_drake.reports.html.page import Block, Cell, Table, Verdict
+
+#: Ratio of half the width of a 95 % interval to the standard error of a normal distribution.
+INTERVAL = 1.96
+_UNITS = dict(zip(PARAMETER_NAMES, ("kg", *3 * ["kg m"], *6 * ["kg m²"]), strict=True))
+_HEADER = ("estimate", "95 % interval", "SDF")
+_NOTE = (
+    "The intervals describe the scatter of the measurements. They do not include errors of the kinematics or of the "
+    "effort calibration."
+)
+
+
+def parameter_tables(model: IdentifiedModel) -> list[Block]:
+    """Returns the tables of all parameters of a model."""
+    if model.dynamics is None:
+        return [_gravity_parameters(model), *_effects(model.arm, model.effects)]
+    section = model.dynamic_model.section
+    arm = model.arm.with_gravity(section.gravity_expected or section.gravity)
+    regressor = DynamicRegressor(arm)
+    return [
+        _base_parameters(section, regressor),
+        *_correlations(section),
+        _links(section, regressor),
+        _rotors(section, regressor),
+        *_effects(arm, section.effects),
+        _all_link_parameters(section, regressor),
+    ]
+
+
+def interval(value: float, standard_error: float) -> str:
+    """Returns the 95 % interval of an estimate as text."""
+    half = INTERVAL * standard_error
+    if half == 0:
+        return "none"
+    digits = max(0, 1 - int(np.floor(np.log10(half))))
+    if digits > 6:
+        return f"{value - half:.2e}{NO_BREAK}.. {value + half:.2e}"
+    return f"{value - half:.{digits}f}{NO_BREAK}.. {value + half:.{digits}f}"
+
+
+def _gravity_parameters(model: IdentifiedModel) -> Table:
+    gravity = gravity_parameters(model.arm)
+    rows = [
+        (
+            p.name,
+            f"{p.value:.4g}",
+            interval(p.value, p.standard_error),
+            f"{nominal:.4g}",
+            _unit(unit),
+            _distinguishable(p),
+        )
+        for p, nominal, unit in zip(model.base_parameters, gravity.base_values, gravity.base.units, strict=True)
+    ]
+    provenance = model.provenance
+    rank = f"{provenance.rank} of {len(model.base_parameters)}" if provenance.rank else "unknown"
+    return Table(
+        ("base parameter", *_HEADER, "unit", "identifiable"),
+        rows,
+        caption="Base parameters of gravity. They are the combinations of masses and centres of mass that holding "
+        "torques determine.",
+        note=f"Poses determine {rank} base parameters (condition number {provenance.condition_number:.3g}). {_NOTE}",
+    )
+
+
+def _distinguishable(estimate: object) -> Verdict:
+    if getattr(estimate, "distinguishable", False):
+        return Verdict("yes", "good")
+    return Verdict("weakly", "warning", "the interval contains 0")
+
+
+def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> Table:
+    base = derive_base_parameters(regressor, coupled_rotors=False)
+    B = base.combination
+    nominal = dict(zip(base.base.names, B @ regressor.values[: B.shape[1]], strict=True))
+    rows: list[tuple[Cell, ...]] = []
+    for p in section.base_parameters:
+        identifiable = Verdict("yes", "good")
+        if p.identifiability < MIN_IDENTIFIABILITY:
+            identifiable = Verdict("no", "bad", "the value comes from the SDF")
+        elif abs(p.value) < INTERVAL * p.standard_error:
+            identifiable = Verdict("weakly", "warning", "the interval contains 0")
+        sdf = f"{nominal[p.name]:.4g}" if p.name in nominal else ""
+        rows.append(
+            (
+                p.name,
+                f"{p.value:.4g}",
+                interval(p.value, p.standard_error),
+                sdf,
+                _unit(p.unit),
+                f"{p.identifiability:.2f}",
+                identifiable,
+            )
+        )
+    count = sum(p.identifiability >= MIN_IDENTIFIABILITY for p in section.base_parameters)
+    return Table(
+        ("base parameter", *_HEADER, "unit", "identifiability", "identifiable"),
+        rows,
+        caption=f"Base parameters of the dynamics: {count} of {len(rows)} are identifiable from this motion.",
+        note="Identifiability: reduction of the variance relative to the prior, from 0 (value of the SDF) to 1 (value "
+        f"of the recording). {_NOTE}",
+    )
+
+
+def _correlations(section: DynamicSection) -> list[Block]:
+    if not section.correlations:
+        return []
+    rows = [
+        (
+            pair.first,
+            pair.second,
+            f"{pair.correlation:+.3f}",
+            f"a scaled {'difference' if pair.correlation > 0 else 'sum'}",
+        )
+        for pair in section.correlations
+    ]
+    header = ("first", "second", "correlation", "identifiable is")
+    return [Table(header, rows, caption="Parameters that are not identifiable separately", collapsed=len(rows) > 6)]
+
+
+def _links(section: DynamicSection, regressor: DynamicRegressor) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for link, nominal in zip(section.links, regressor.links, strict=True):
+        mass, error = link.parameters[0], (link.standard_errors or [0.0])[0]
+        source = "; ".join(link.bounds) or ("recording" if link.mass_identifiability >= MIN_IDENTIFIABILITY else "SDF")
+        com = np.array(link.parameters[1:4]) / mass
+        of_sdf = nominal.parameters[1:4] / nominal.parameters[0]
+        rows.append(
+            (
+                link.link,
+                f"{mass:.4g}",
+                interval(mass, error),
+                f"{nominal.parameters[0]:.4g}",
+                _position(com),
+                _position(of_sdf),
+                source,
+            )
+        )
+    header = ("link", "mass [kg]", "95 % interval", "SDF", "centre of mass [m]", "SDF [m]", "mass determined by")
+    return Table(
+        header,
+        rows,
+        caption="Mass and centre of mass of each link, in the frame of the link",
+        note="A motion determines the base parameters. The parameters of one link also depend on the SDF.",
+    )
+
+
+def _rotors(section: DynamicSection, regressor: DynamicRegressor) -> Table:
+    arm = regressor.arm
+    rows = [
+        (
+            r.actuator,
+            f"{r.value:.3g}",
+            interval(r.value, r.standard_error),
+            f"{sdf.value:.3g}",
+            _unit("kg" if slides else "kg m²"),
+        )
+        for r, sdf, slides in zip(section.rotors, regressor.rotors[: arm.num_joints], arm.prismatic, strict=True)
+    ]
+    return Table(("actuator", *_HEADER, "unit"), rows, caption="Rotor inertia of each actuator, at the joint")
+
+
+def _effects(arm: Arm, effects: list[DriveEffect]) -> list[Block]:
+    if not effects:
+        return []
+    rows = []
+    for e in sorted(effects, key=lambda e: (e.coordinate, e.kind, e.scale)):
+        unit = EFFECT_KINDS[e.kind].unit
+        if is_prismatic(arm, e.coordinate):
+            unit = unit.replace("N m", "N").replace("rad", "m")
+        scale = f"{e.scale:.3g}" if e.scale else ""
+        rows.append(
+            (
+                e.coordinate,
+                e.kind,
+                scale,
+                f"{e.coefficient:.3g}",
+                interval(e.coefficient, e.standard_error),
+                _unit(unit),
+            )
+        )
+    header = ("coordinate", "effect", "scale", "estimate", "95 % interval", "unit")
+    caption = f"{len(rows)} friction, cable and spring effects of the drives. Section 9 shows them as curves."
+    return [Table(header, rows, caption=caption, collapsed=len(rows) > 12)]
+
+
+def _all_link_parameters(section: DynamicSection, regressor: DynamicRegressor) -> Table:
+    rows = [
+        (link.link, name, f"{value:.4g}", interval(value, error), f"{sdf:.4g}", _unit(_UNITS[name]))
+        for link, nominal in zip(section.links, regressor.links, strict=True)
+        for name, value, error, sdf in zip(
+            PARAMETER_NAMES, link.parameters, link.standard_errors or 10 * [0.0], nominal.parameters, strict=True
+        )
+    ]
+    caption = "All inertial parameters of the links, about the origin of the link frame"
+    return Table(("link", "parameter", *_HEADER, "unit"), rows, caption=caption, collapsed=True)
+
+
+def _unit(unit: str) -> str:
+    return unit.replace(" ", NO_BREAK).replace("^2", "²")
+
+
+def _position(p: np.ndarray) -> str:
+    return ", ".join(f"{round(float(x), 3) + 0.0:.3f}" for x in p)

@@ -1,0 +1,234 @@
+"""Report of identify and validate: numbers in tables and figures, options of the commands, page in a browser."""
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from command_output import refusal
+from report_checks import check_report
+
+import dvrk_drake as dvrk
+from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.verdict import GOOD_RATIO, judge, reason
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.physical_consistency import bounding_boxes
+from dvrk_drake.reports.html.binned import bin_means
+from dvrk_drake.reports.html.consistency import centres_of_mass, link_table
+from dvrk_drake.reports.html.error_budget import JointErrors
+from dvrk_drake.reports.html.identification import identification_page
+from dvrk_drake.reports.html.joint_summary import verdict_table
+from dvrk_drake.reports.html.motion_plots import MAX_ROWS, MotionEfforts, efforts_over_time, extremes
+from dvrk_drake.reports.html.page import Command, Meshcat, Plot, Table, Verdict
+from dvrk_drake.reports.html.parameter_tables import INTERVAL, interval, parameter_tables
+from dvrk_drake.reports.html.playback import MAX_FRAMES, MAX_RATE, frame_times
+from dvrk_drake.reports.html.pose_plots import PoseEfforts, predicted_over_measured
+from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.html.write import write_report
+
+SAMPLES = files("dvrk_drake") / "samples"
+TITLES = [
+    "Verdict per joint",
+    "Data quality",
+    "Parameters",
+    "efforts",
+    "Residuals over position",
+    "Error budget",
+    "Cross-validation and repeatability",
+    "Physical consistency",
+    "Friction and cable curves",
+    "Next step",
+]
+
+
+def sample(name, arm):
+    return dvrk.read_recording(SAMPLES / name, arm)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """Validation of the PSM's nominal model on the sample motion."""
+    arm = dvrk.load_arm("psm")
+    return dvrk.validate(dvrk.IdentifiedModel.from_arm(arm, dynamics=True), sample("psm_motion.csv", arm))
+
+
+@pytest.fixture(scope="module")
+def poses():
+    """Identification of an MTM from the sample poses, by the least squares of the paper."""
+    arm = dvrk.load_arm("mtmr")
+    return identify_static(sample("mtm_poses.csv", arm), arm, "paper")
+
+
+def page_of(result):
+    return identification_page(result, Provenance.of(), model_path="own.yaml")
+
+
+def blocks(page, kind):
+    return [block for section in (*page.sections, *page.closing) for block in section.blocks if isinstance(block, kind)]
+
+
+@pytest.mark.parametrize("case", ["motion", "poses"])
+def test_sections_are_in_order(case, request):
+    page = page_of(request.getfixturevalue(case))
+    sections = [*page.sections, *page.closing]
+    assert [section.title for section in sections] == [
+        section.title if title in section.title else title for section, title in zip(sections, TITLES, strict=True)
+    ]
+    assert page.provenance.inputs[0][1] == request.getfixturevalue(case).recording.sha256
+    assert "own.yaml" in blocks(page, Command)[0].command or "dvrk-drake check" in blocks(page, Command)[0].command
+    assert blocks(page, Meshcat)
+
+
+def test_plotted_residual_is_measured_minus_predicted(motion):
+    efforts = MotionEfforts.of(motion)
+    figure, _ = efforts_over_time(efforts)
+    for i in range(efforts.arm.num_joints):
+        own = {trace.name: trace for trace in figure.data[3 * i : 3 * i + 3]}
+        scale = np.max(np.abs(efforts.measured[:, i]))
+        residual = own["measured"].y - own["predicted"].y
+        # The traces have single precision.
+        np.testing.assert_allclose(own["measured − predicted"].y, residual, rtol=0, atol=1e-6 * scale)
+        assert len(residual) <= MAX_ROWS
+        assert np.max(own["measured"].y) == np.float32(efforts.measured[:, i].max())
+
+
+def test_plotted_poses_are_the_predictions_of_the_model(poses):
+    efforts = PoseEfforts.of(poses)
+    figure = predicted_over_measured(efforts)
+    tau = poses.model.holding_torque(poses.recording.q)
+    for j, name in enumerate(efforts.arm.joint_names):
+        (trace,) = [t for t in figure.data if t.name == "fitted" and t.xaxis == ("x" if j == 0 else f"x{j + 1}")]
+        use = efforts.usable[:, j]
+        np.testing.assert_allclose(trace.y, tau[use, j], rtol=0, atol=1e-6 * np.abs(tau).max(), err_msg=name)
+
+
+def test_extremes_keep_the_smallest_and_the_largest_value():
+    values = np.random.default_rng(0).normal(size=1003)
+    rows = extremes(values, 40)
+    assert values[rows].min() == values.min() and values[rows].max() == values.max()
+    assert len(rows) <= 2 * 26 and np.all(np.diff(rows) > 0)
+    np.testing.assert_array_equal(extremes(values, 1), np.arange(1003))
+
+
+def test_bin_means_of_a_line():
+    x = np.random.default_rng(0).uniform(-1, 2, 5000)
+    center, mean, deviation = bin_means(x, 3 * x + 1)
+    np.testing.assert_allclose(mean, 3 * center + 1, atol=1e-12)
+    assert len(center) == 25 and np.all(np.diff(center) > 0) and np.all(deviation < 3 * 0.1)
+    center, mean, _ = bin_means(np.zeros(50), np.arange(50.0))  # a joint that does not move
+    assert center.tolist() == [0.0] and mean.tolist() == [24.5]
+
+
+def test_shares_of_the_error_budget():
+    t = np.linspace(0, 10, 2000)
+    q, v = np.sin(t), np.cos(t)
+    friction = JointErrors("a", 1.0, 0.1 * v, q, v, 0.0).shares()
+    constant = JointErrors("a", 1.0, np.full_like(q, 0.2), q, v).shares()
+    noise = JointErrors("a", 1.0, np.random.default_rng(0).normal(size=2000), q, v, 1e9).shares()
+    assert friction["friction-like"] > 0.97 and constant["constant"] > 0.999 and noise["differs between periods"] > 0.95
+    for shares in (friction, constant, noise):
+        assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_links_in_the_table_are_those_of_the_model():
+    arm = dvrk.load_arm("psm")
+    links, boxes = DynamicRegressor(arm).links, bounding_boxes(arm)
+    table = link_table(links, links, boxes)
+    for row, link in zip(table.rows, links, strict=True):
+        least = np.linalg.eigvalsh(link.pseudo_inertia())[0]
+        assert float(row[3].split(",")[0]) == pytest.approx(least, rel=0.06), "two digits"
+        assert row[-1].word == "consistent"
+    for trace in centres_of_mass(links, links, boxes).data:
+        assert np.all(np.abs(trace.x) < 1)
+
+
+@pytest.mark.parametrize("dynamics", [False, True])
+def test_nominal_parameters_are_those_of_the_sdf(dynamics):
+    model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr"), dynamics=dynamics)
+    tables = [block for block in parameter_tables(model) if isinstance(block, Table) and "SDF" in block.header]
+    assert tables
+    for table in tables:
+        estimate = 1 if table.header[1] == "mass [kg]" else table.header.index("estimate")
+        for row in table.rows:
+            nominal = float(row[table.header.index("SDF")])
+            # The texts have at least three digits.
+            assert float(row[estimate]) == pytest.approx(nominal, rel=1e-2, abs=1e-12), row
+
+
+def test_interval_contains_the_estimate():
+    for value, error in ((1.234, 0.05), (-2e-4, 3e-6), (1e3, 20.0), (5e-9, 1e-9)):
+        lower, upper = (float(text) for text in interval(value, error).split("\N{NO-BREAK SPACE}.. "))
+        assert lower < value < upper
+        assert (upper - lower) / 2 == pytest.approx(INTERVAL * error, rel=0.1)
+    assert interval(1.0, 0.0) == "none"
+
+
+def test_key_frames_are_limited():
+    short, long = frame_times(1.0, 3.0), frame_times(0.0, 1e4)
+    assert (short[0], short[-1]) == (1.0, 3.0) and np.diff(short).min() >= 1 / MAX_RATE - 1e-12
+    assert len(long) <= MAX_FRAMES and long[-1] == 1e4
+
+
+def test_verdicts_have_the_words_and_reasons_of_the_rule(motion):
+    table = verdict_table(motion)
+    words = {row[0]: row[-1] for row in table.rows}
+    assert {name: label.word for name, label in words.items()} == motion.verdicts
+    assert all(isinstance(label, Verdict) and label.reason.endswith(".") for label in words.values())
+    for effort, error in ((1.0, 0.3), (1.0, 0.4), (1.0, 2.0), (0.01, 0.05), (0.0, 1.0)):
+        verdict = judge(effort, error, 10.0, in_motion=True)
+        text = reason(verdict, effort, error, 10.0, in_motion=True)
+        if verdict == "good":
+            assert f"{100 * GOOD_RATIO:g} %" in text
+        if verdict in ("usable", "do not use"):
+            assert "usable: up to" in text
+    assert "separate gravity" in reason("off", 1.0, 1.0, 10.0, in_motion=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("report.txt", "must end in .html"), ("missing/report.html", "its folder does not exist"), ("old.html", "exists")],
+)
+@pytest.mark.parametrize("command", ["identify", "validate"])
+def test_bad_path_is_rejected_before_work_begins(command, name, message, tmp_path, capsys):
+    (tmp_path / "old.html").write_text("old")
+    model = tmp_path / "model.yaml"
+    dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")).save(model)
+    options = (
+        ["--arm", "mtmr", "--output", f"{tmp_path}/new.yaml"] if command == "identify" else ["--model", f"{model}"]
+    )
+    words = [command, f"{SAMPLES / 'mtm_poses.csv'}", *options, "--report", f"{tmp_path / name}"]
+    assert main(words) == 2
+    assert message in refusal(capsys.readouterr().err)
+    assert (tmp_path / "old.html").read_text() == "old" and not (tmp_path / "new.yaml").exists()
+
+
+def test_command_names_the_report_or_the_option(tmp_path, capsys):
+    model = tmp_path / "model.yaml"
+    dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")).save(model)
+    words = ["validate", f"{SAMPLES / 'mtm_other_poses.csv'}", "--model", f"{model}"]
+    assert main(words) == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith("--report FILE.html")
+    report = tmp_path / "report.html"
+    assert main([*words, "--report", f"{report}"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"wrote {report}: report"
+    assert "dvrk-drake validate" in report.read_text()
+
+
+@pytest.mark.parametrize("case", ["motion", "poses"])
+def test_page_in_a_browser(case, request, open_page, tmp_path):
+    path = tmp_path / "report.html"
+    write_report(request.getfixturevalue(case), path)
+    opened = check_report(open_page, path)
+    opened.wait_for("document.querySelector('figure.meshcat .player').checkVisibility()")
+    frame = opened.page.frames[1]
+    tip = "/drake/visualizer/" + request.getfixturevalue(case).model.arm.name
+    body = frame.evaluate(
+        """(path) => { const found = viewer.scene_tree.find(path.split("/").filter(Boolean));
+        return Object.keys(found.children).at(-1); }""",
+        tip,
+    )
+    before = opened.translation(f"{tip}/{body}", frame)
+    opened.page.locator("figure.meshcat .seek").fill("3")
+    moved = opened.translation(f"{tip}/{body}", frame) - before
+    assert np.any(np.abs(moved) > 1e-4), "the cursor moves the arm"
+    assert all(isinstance(block, Plot) for block in blocks(page_of(request.getfixturevalue(case)), Plot))
