@@ -160,18 +160,19 @@ def _parameter_note(result: Identification | Validation) -> str:
 
 
 def _efforts(efforts: Efforts) -> Section:
+    arm = efforts.arm
     title = "Measured, fitted and held-out efforts" if len(efforts.predicted) > 1 else "Measured and predicted efforts"
     if isinstance(efforts, MotionEfforts):
-        figure, rows = efforts_over_time(efforts)
+        figure, drawn = efforts_over_time(efforts)
         cut_off = efforts.grid.settings.effort_cut_off
-        caption = f"Efforts of the actuators after low-pass filtering at {cut_off:g} Hz. {rows}"
-        q = efforts.grid.q
-        # Frames of the animation need no more rows than its key frames.
-        view = _view(efforts, efforts.grid.t - efforts.grid.row_times[0], q)
+        caption = f"Efforts of the actuators after low-pass filtering at {cut_off:.3g} Hz. {drawn}"
+        grid, tau = efforts.grid, efforts.recording.in_joint_coordinates(arm).measured_effort()
+        on_grid = np.column_stack([np.interp(grid.t, grid.row_times, x) for x in tau.T])
+        view = _view(efforts, grid.t - grid.row_times[0], grid.q, on_grid)
         blocks: list[Block] = [*view, Plot(figure, caption, time=True)]
     else:
-        q = efforts.recording.in_joint_coordinates(efforts.arm).q
-        view = _view(efforts, np.arange(len(q), dtype=float), q)
+        poses = efforts.recording.in_joint_coordinates(arm)
+        view = _view(efforts, np.arange(len(poses), dtype=float), poses.q, poses.measured_effort())
         caption = "Holding effort of each pose. The 3D view shows one pose per second."
         scatter = "Predicted against measured effort of each pose, without excluded measurements"
         blocks = [
@@ -191,16 +192,14 @@ _EXPLANATION = {
 }
 
 
-def _view(efforts: Efforts, t: NDArray[np.float64], q: NDArray[np.float64]) -> list[Block]:
+def _view(efforts: Efforts, t: NDArray[np.float64], q: NDArray[np.float64], tau: NDArray[np.float64]) -> list[Block]:
     try:
-        html = playback(efforts.arm, t, q)
+        html = playback(efforts.arm, t, q, tau)
     except DvrkDrakeError as error:
         return [Text(f"No 3D view: {error}", "warning")]
-    caption = (
-        "Recorded motion. Click a plot to move the arm to this time."
-        if isinstance(efforts, MotionEfforts)
-        else ("Recorded poses. Click a plot to show a pose.")
-    )
+    caption = "Recorded poses. Click a plot to show a pose."
+    if isinstance(efforts, MotionEfforts):
+        caption = "Recorded motion. Click a plot to move the arm to this time."
     return [Meshcat(html, caption, start=float(t[0]))]
 
 

@@ -137,7 +137,7 @@ def residuals_over_position_and_speed(efforts: MotionEfforts) -> tuple[go.Figure
 
 
 def extremes(values: NDArray[np.float64], step: int) -> NDArray[np.int_]:
-    """Returns the indices of the smallest and the largest value of each `step` values (r,), or all if `step` is 1 or 2."""
+    """Returns the indices of the smallest and the largest of each `step` values (r,). Steps of 1 or 2: all indices."""
     if step <= 2:
         return np.arange(len(values))
     starts = np.arange(0, len(values), step)

@@ -10,10 +10,11 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
-from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.arm_view.overlay import ArmOverlay
+from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
 
 #: Largest rate [Hz] and largest number of key frames. Meshcat interpolates between key frames.
-MAX_RATE, MAX_FRAMES = 30.0, 600
+MAX_RATE, MAX_FRAMES = 30.0, 400
 
 
 def frame_times(start: float, end: float) -> NDArray[np.float64]:
@@ -22,37 +23,39 @@ def frame_times(start: float, end: float) -> NDArray[np.float64]:
     return np.linspace(start, end, max(count, 2))
 
 
-def playback(arm: Arm, t: NDArray[np.float64], q: NDArray[np.float64]) -> str:
-    """Returns a page of Meshcat with an animation that starts at t[0].
+def playback(arm: Arm, t: NDArray[np.float64], q: NDArray[np.float64], tau: NDArray[np.float64]) -> str:
+    """Returns a page of Meshcat with an animation of the arm and its efforts. It starts at t[0].
 
     Args:
         arm: Arm to draw.
         t: Times (m,) of the poses, increasing [s].
         q: Poses (m, n) of the joints [rad, m].
+        tau: Efforts (m, n) of the joints [N m, N].
 
     Raises:
         ArmError: The arm has no visual geometry.
         DvrkDrakeError: No port of this computer is free.
     """
     times = frame_times(float(t[0]), float(t[-1]))
-    poses = np.column_stack([np.interp(times, t, x) for x in q.T])
+    poses, efforts = (np.column_stack([np.interp(times, t, x) for x in values.T]) for values in (q, tau))
     period = float(times[1] - times[0])
     meshcat = start_meshcat(arm)
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
     add_arm(plant, arm)
     plant.Finalize()
-    visualizer = MeshcatVisualizer.AddToBuilder(
-        builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
-    )
+    links = MeshcatVisualizerParams(publish_period=period, prefix=f"{arm.name.lower()}/links")
+    visualizer = MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, links)
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
+    overlay = ArmOverlay(arm, meshcat)
     visualizer.StartRecording()
-    for k, pose in enumerate(poses):
-        # The time of a frame is in the middle of its period, so that rounding does not change the number of the frame.
+    for k, (pose, effort) in enumerate(zip(poses, efforts, strict=True)):
+        # The time is in the middle of the frame, so that rounding does not change the number of the frame.
         context.SetTime((k + 0.5) * period)
         set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, pose)
         diagram.ForcedPublish(context)
+        overlay.draw(pose, effort=effort, time=context.get_time())
     visualizer.StopRecording()
     visualizer.PublishRecording()
-    return str(meshcat.StaticHtml())
+    return page_html(meshcat, arm.name)
