@@ -73,7 +73,7 @@ def start_meshcat(
 
 def add_ground(meshcat: Meshcat, p_WC: NDArray[np.float64], gravity: ArrayLike = (0.0, 0.0, -9.81)) -> None:
     """Draws the ground with a grid of 10 cm below the points p_WC (k, 3) [m], perpendicular to gravity (3,) [m/s^2]."""
-    down = np.asarray(gravity, float)
+    down = np.array(gravity, float)  # a copy, because the array belongs to the arm
     if np.linalg.norm(down) < 1e-9:
         return
     down /= np.linalg.norm(down)
