@@ -9,75 +9,106 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.validation import error_shares
+from dvrk_drake.analysis.dynamic.validation import SHARE_LABELS, error_shares
 from dvrk_drake.reports.figures.colours import NEUTRAL, SERIES
+from dvrk_drake.reports.html.motion_plots import MotionEfforts
+from dvrk_drake.reports.html.plot_style import COLOURS
+from dvrk_drake.reports.html.pose_plots import PoseEfforts
 
 #: Cause -> colour.
-CAUSES = {
-    "constant": SERIES[1],
-    "friction-like": SERIES[2],
-    "position-dependent": SERIES[0],
-    "differs between periods": NEUTRAL,
-    "other, repeats": SERIES[5],
-    "other": SERIES[5],
-}
+_COLOURS = dict(zip(SHARE_LABELS, (*SERIES[:5], *SERIES[6:], NEUTRAL), strict=True))
 
 
-@dataclass(frozen=True, eq=False)
-class JointErrors:
-    """Errors of one joint or actuator.
+@dataclass(frozen=True)
+class JointBudget:
+    """Error of one joint.
 
     Attributes:
         name: Name of the joint.
-        effort: RMS measured effort [N m, N].
-        residuals: Measured minus predicted efforts (r,) [N m, N].
-        q, v: Positions [rad, m] and velocities (r,).
-        repeatability: RMS difference of the efforts between periods of a motion [N m, N], None if unknown.
+        relative_error: RMS error / RMS effort [1].
+        shares: Cause, a label of `SHARE_LABELS` -> share of the squared error. The shares add up to 1.
+        repeatability: RMS difference of the effort between periods / RMS effort [1], None if unknown.
     """
 
     name: str
-    effort: float
-    residuals: NDArray[np.float64]
-    q: NDArray[np.float64]
-    v: NDArray[np.float64]
+    relative_error: float
+    shares: dict[str, float]
     repeatability: float | None = None
 
-    def shares(self) -> dict[str, float]:
-        """Returns cause -> share of the squared error. The shares add up to 1.
 
-        The part of the error that no other cause explains is divided, if the repeatability is known. One part is as
-        large as the difference between periods of the motion, which no model can predict. The other part repeats.
-        """
-        constant, friction, position, other = error_shares(self.residuals, self.q, self.v)
-        shares = {"constant": constant, "friction-like": friction, "position-dependent": position}
-        if self.repeatability is None:
-            return shares | {"other": other}
-        square = float(np.mean(self.residuals**2))
-        random = min(other, self.repeatability**2 / square) if square > 0 else 0.0
-        return shares | {"differs between periods": random, "other, repeats": other - random}
+def motion_budget(efforts: MotionEfforts) -> list[JointBudget]:
+    """Returns the error of each actuator of a motion by its causes, see `ErrorShares`."""
+    grid, period = efforts.grid, efforts.period
+    vd = grid.efforts_at_rows(grid.arm.transmission.velocity(grid.vd))[grid.inner]
+    budgets = []
+    for i, name in enumerate(efforts.arm.joint_names):
+        effort = _rms(efforts.measured[:, i])
+        if effort > 0:
+            error = efforts.residuals[:, i]
+            shares = error_shares(error, i, efforts.q, efforts.v[:, i], vd, efforts.t, period)
+            by_cause = {label: share or 0.0 for label, share in zip(SHARE_LABELS, shares, strict=True)}
+            floor = efforts.repeatability[i]
+            budgets.append(JointBudget(name, _rms(error) / effort, by_cause, floor / effort if floor > 0 else None))
+    return budgets
 
 
-def error_budget(joints: Sequence[JointErrors]) -> go.Figure:
+def pose_budget(efforts: PoseEfforts) -> list[JointBudget]:
+    """Returns the error of each joint at static poses: bias, position-dependent and other.
+
+    The position-dependent share is what a sine and a cosine of the joint's position explain.
+    """
+    budgets = []
+    for j, name in enumerate(efforts.arm.joint_names):
+        use = efforts.usable[:, j]
+        error, q = efforts.residuals[use, j], efforts.recording.q[use, j]
+        if np.any(use) and (effort := _rms(efforts.measured[use, j])) > 0:
+            shares = _pose_shares(error, q)
+            budgets.append(JointBudget(name, _rms(error) / effort, shares))
+    return budgets
+
+
+def _pose_shares(error: NDArray[np.float64], q: NDArray[np.float64]) -> dict[str, float]:
+    total = float(np.mean(error**2)) or 1.0
+    bias = float(np.mean(error)) ** 2 / total
+    X = np.column_stack([np.ones_like(q), np.sin(q), np.cos(q)])
+    rest = float(np.mean((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2)) / total
+    return {"bias": bias, "position-dependent": 1 - bias - rest, "other": rest}
+
+
+def error_budget(budgets: Sequence[JointBudget]) -> go.Figure:
     """Returns a figure with one bar per joint: the relative RMS error, divided by shares of the squared error."""
-    shares = [joint.shares() for joint in joints]
-    relative = [
-        100 * float(np.sqrt(np.mean(joint.residuals**2))) / joint.effort if joint.effort > 0 else 0.0
-        for joint in joints
-    ]
+    names = [budget.name for budget in budgets]
+    relative = np.array([100 * budget.relative_error for budget in budgets])
     figure = go.Figure()
-    for cause, colour in CAUSES.items():
-        parts = np.array([s.get(cause, 0.0) for s in shares])
-        if np.any(parts > 0.005):
+    for cause, colour in _COLOURS.items():
+        shares = np.array([budget.shares.get(cause, 0.0) for budget in budgets])
+        if np.any(shares > 0.005):
             figure.add_bar(
-                y=[joint.name for joint in joints],
-                x=relative * parts,
+                y=names,
+                x=relative * shares,
                 name=cause,
                 orientation="h",
                 marker={"color": colour, "line": {"color": "white", "width": 1}},
-                customdata=100 * parts,
+                customdata=100 * shares,
                 hovertemplate=f"%{{y}}, {cause}: %{{customdata:.0f}} % of the squared error",
             )
-    figure.update_layout(barmode="stack", legend={"traceorder": "normal"}, height=130 + 36 * len(joints), bargap=0.3)
-    figure.update_xaxes(title_text="RMS error / RMS effort [%]")
+    known = [budget for budget in budgets if budget.repeatability is not None]
+    if known:
+        figure.add_scatter(
+            y=[budget.name for budget in known],
+            x=[100 * (budget.repeatability or 0.0) for budget in known],
+            mode="markers",
+            name="repeatability",
+            marker={"symbol": "line-ns", "size": 22, "line": {"width": 2.5, "color": COLOURS["measured"]}},
+            hovertemplate="%{y}: repeatability %{x:.2g} %",
+        )
+    figure.update_layout(
+        barmode="stack", height=150 + 36 * len(names), bargap=0.3, margin={"t": 76}, legend={"traceorder": "normal"}
+    )
+    figure.update_xaxes(title_text="RMS error / RMS effort [%]", rangemode="tozero")
     figure.update_yaxes(autorange="reversed")
     return figure
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2)))

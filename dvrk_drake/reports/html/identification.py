@@ -19,7 +19,7 @@ from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.reports.answers import answer_of
 from dvrk_drake.reports.html.consistency import consistency_blocks
 from dvrk_drake.reports.html.drive_plots import friction_over_speed, torque_over_position
-from dvrk_drake.reports.html.error_budget import JointErrors, error_budget
+from dvrk_drake.reports.html.error_budget import error_budget, motion_budget, pose_budget
 from dvrk_drake.reports.html.joint_summary import (
     coverage_bars,
     coverage_table,
@@ -218,36 +218,21 @@ def _adjective(efforts: Efforts) -> str:
 
 
 def _error_budget(efforts: Efforts) -> Section:
-    arm = efforts.arm
-    if isinstance(efforts, MotionEfforts):
-        repeats = bool(np.any(efforts.repeatability > 0))
-        joints = [
-            JointErrors(
-                name,
-                float(np.sqrt(np.mean(efforts.measured[:, i] ** 2))),
-                efforts.residuals[:, i],
-                efforts.q[:, i],
-                efforts.v[:, i],
-                float(efforts.repeatability[i]) if repeats else None,
-            )
-            for i, name in enumerate(arm.joint_names)
-        ]
-        what = "viscous and Coulomb friction, and sine and cosine functions of the position"
-    else:
-        joints = []
-        for j, name in enumerate(arm.joint_names):
-            use = efforts.usable[:, j]
-            if np.any(use):
-                effort = float(np.sqrt(np.mean(efforts.measured[use, j] ** 2)))
-                q = efforts.recording.q[use, j]
-                joints.append(JointErrors(name, effort, efforts.residuals[use, j], q, np.zeros_like(q)))
-        what = "sine and cosine functions of the position"
-    note = (
-        f"The bar of a joint is divided by shares of the squared error. The shares are what an offset, {what} would "
-        "explain in this order."
-    )
     caption = f"Relative RMS error of the {_adjective(efforts)} efforts and its causes"
-    return Section("Error budget", [Plot(error_budget(joints), caption)], note=note)
+    if isinstance(efforts, MotionEfforts):
+        note = (
+            "Each bar is divided by shares of the squared error. A share is what its cause explains in addition to the "
+            "previous ones: an offset, friction of the actuator, its position, accelerations, and the positions of the "
+            "other actuators. The rest differs between periods, is faster than 2 Hz, or is slow (other)."
+        )
+        budgets = motion_budget(efforts)
+    else:
+        note = (
+            "Each bar is divided by shares of the squared error: an offset, what a sine and a cosine of the position "
+            "explain, and the rest, such as friction and measurement noise (other)."
+        )
+        budgets = pose_budget(efforts)
+    return Section("Error budget", [Plot(error_budget(budgets), caption)], note=note)
 
 
 def _cross_validation(result: Identification | Validation, efforts: Efforts) -> Section:

@@ -39,6 +39,7 @@ class MotionEfforts:
         measured: Measured efforts (r, n) [N m, N].
         predicted: Name of the prediction ("fitted", "held out" or "predicted") -> predicted efforts (r, n) [N m, N].
             The last one is the most independent of the measured efforts.
+        period: Period of the motion [s], or None if the motion does not repeat.
         repeatability: RMS differences (n,) of the efforts between periods [N m, N], 0 if the motion does not repeat.
     """
 
@@ -50,6 +51,7 @@ class MotionEfforts:
     v: NDArray[np.float64]
     measured: NDArray[np.float64]
     predicted: Mapping[str, NDArray[np.float64]]
+    period: float | None
     repeatability: NDArray[np.float64]
 
     @classmethod
@@ -71,6 +73,7 @@ class MotionEfforts:
             v=v,
             measured=result.measured,
             predicted=predicted,
+            period=result.period,
             repeatability=np.array(repeatability),
         )
 

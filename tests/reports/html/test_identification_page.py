@@ -15,7 +15,7 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import bounding_boxes
 from dvrk_drake.reports.html.binned import bin_means
 from dvrk_drake.reports.html.consistency import centres_of_mass, link_table
-from dvrk_drake.reports.html.error_budget import JointErrors
+from dvrk_drake.reports.html.error_budget import error_budget, motion_budget, pose_budget
 from dvrk_drake.reports.html.identification import identification_page
 from dvrk_drake.reports.html.joint_summary import verdict_table
 from dvrk_drake.reports.html.motion_plots import MAX_ROWS, MotionEfforts, efforts_over_time, extremes
@@ -119,15 +119,25 @@ def test_bin_means_of_a_line():
     assert center.tolist() == [0.0] and mean.tolist() == [24.5]
 
 
-def test_shares_of_the_error_budget():
-    t = np.linspace(0, 10, 2000)
-    q, v = np.sin(t), np.cos(t)
-    friction = JointErrors("a", 1.0, 0.1 * v, q, v, 0.0).shares()
-    constant = JointErrors("a", 1.0, np.full_like(q, 0.2), q, v).shares()
-    noise = JointErrors("a", 1.0, np.random.default_rng(0).normal(size=2000), q, v, 1e9).shares()
-    assert friction["friction-like"] > 0.97 and constant["constant"] > 0.999 and noise["differs between periods"] > 0.95
-    for shares in (friction, constant, noise):
-        assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
+@pytest.mark.parametrize("case", ["motion", "poses"])
+def test_shares_of_the_error_budget(case, request):
+    if case == "motion":
+        result = request.getfixturevalue("motion")
+        budgets, errors = motion_budget(MotionEfforts.of(result)), result.relative_errors
+    else:
+        result = request.getfixturevalue("poses")
+        efforts = PoseEfforts.of(result)
+        budgets = pose_budget(efforts)
+        error, tau = (np.where(efforts.usable, x, 0.0) for x in (efforts.residuals, efforts.measured))
+        ratios = np.sqrt(np.sum(error**2, axis=0) / np.sum(tau**2, axis=0))
+        errors = dict(zip(efforts.arm.joint_names, ratios, strict=True))
+    figure = error_budget(budgets)
+    for budget in budgets:
+        assert sum(budget.shares.values()) == pytest.approx(1.0, abs=1e-6)
+        assert budget.relative_error == pytest.approx(errors[budget.name], rel=1e-9)
+    drawn = sum(np.asarray(bar.x) for bar in figure.data if bar.type == "bar")
+    # Causes with shares below 0.5 % are not drawn.
+    np.testing.assert_allclose(drawn, [100 * budget.relative_error for budget in budgets], rtol=0.04, atol=1e-9)
 
 
 def test_links_in_the_table_are_those_of_the_model():
