@@ -10,7 +10,7 @@ from dvrk_drake.cli.app import PAPER, SIMULATE, Overwrite, Port, Seed, Verbose, 
 from dvrk_drake.cli.support import Steps, check_output, command_words, new_folder, print_written, quiet_drake
 from dvrk_drake.progress import step_progress
 
-_DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "simulating release and step", "drawing"
+_DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "simulating the release", "drawing"
 Folder = Annotated[str, Parameter(metavar="FOLDER", help="Write into this folder, which must be new or empty.")]
 
 

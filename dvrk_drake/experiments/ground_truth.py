@@ -13,8 +13,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Meshcat
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -31,10 +29,7 @@ from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.coupled_limits import offset_pose
-from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.plant import set_joint_damping
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
@@ -44,11 +39,15 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 TRAVEL_SPEED = 1.7, 0.2
 #: Minimum travel time [s], settling time [s], samples per pose.
 MIN_TRAVEL, SETTLE, SAMPLES = 0.8, 1.0, 10
+#: Minimum duration of the motion to the start of an approach, and of the approach [s].
+MIN_APPROACH = 0.3
 #: Time between two samples of a pose [s].
 SAMPLE_SPACING = 0.01
 
 
-def pose_visit_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
+def pose_visit_trajectory(
+    arm: Arm, poses: NDArray[np.float64], approach: NDArray[np.float64] | None = None, settle: float = SETTLE
+) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
     """Makes a trajectory through all poses, which stops at each pose for settling and sampling.
 
     Between two poses, the trajectory is a straight line in joint space. If the poses satisfy the limits of the
@@ -57,22 +56,39 @@ def pose_visit_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[Piecewi
     Args:
         arm: Arm whose joint types determine the maximum speeds.
         poses: Poses (m, n) [rad, m] in the order of the trajectory.
+        approach: Distance (n,) [rad, m] from which the arm approaches each pose, first from below and then from above
+            in all joints. Near a limit, the distance is shorter. None: the arm visits each pose once.
+        settle: Settling time at a pose [s].
 
     Returns:
-        Trajectory of q (n,), and times (m,) at which the arm has settled at the poses [s].
+        Trajectory of q (n,), and times at which the arm has settled at the poses [s]: one per pose, with `approach` two
+        per pose.
     """
-    times, knots, settled = [0.0], [poses[0]], []
+    first = poses[0] if approach is None else offset_pose(arm, poses[0], -approach)
+    times, knots, settled = [0.0], [first], []
     speed = arm.per_joint(*TRAVEL_SPEED)
-    hold = SETTLE + SAMPLES * SAMPLE_SPACING
+
+    def move(q: NDArray[np.float64], min_duration: float) -> None:
+        # The maximum speed of a cubic from rest to rest is 1.5 times its mean speed.
+        duration = max(min_duration, 1.5 * float(np.max(np.abs(q - knots[-1]) / speed)))
+        times.append(times[-1] + duration)
+        knots.append(q)
+
+    def stop() -> None:
+        settled.append(times[-1] + settle)
+        times.append(settled[-1] + SAMPLES * SAMPLE_SPACING)
+        knots.append(knots[-1])
+
     for i, pose in enumerate(poses):
-        if i:
-            # The maximum speed of a cubic from rest to rest is 1.5 times its mean speed.
-            travel = max(MIN_TRAVEL, 1.5 * float(np.max(np.abs(pose - poses[i - 1]) / speed)))
-            times.append(times[-1] + travel)
-            knots.append(pose)
-        settled.append(times[-1] + SETTLE)
-        times.append(times[-1] + hold)
-        knots.append(pose)
+        if approach is None:
+            if i:
+                move(pose, MIN_TRAVEL)
+            stop()
+            continue
+        for side in (-1, 1):
+            move(offset_pose(arm, pose, side * approach), MIN_APPROACH)
+            move(pose, MIN_APPROACH)
+            stop()
     zero = np.zeros((poses.shape[1], len(knots)))
     return PiecewisePolynomial.CubicHermite(times, np.array(knots).T, zero), np.array(settled)
 
@@ -82,8 +98,8 @@ def collect_static_poses(
     model: IdentifiedModel,
     poses: NDArray[np.float64],
     *,
-    effort_noise: float,
-    generator: np.random.Generator,
+    approach: NDArray[np.float64] | None = None,
+    settle: float = SETTLE,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
     """Moves an arm to poses under position control and records the holding effort at each pose.
@@ -94,32 +110,32 @@ def collect_static_poses(
         station: Simulated arm. It becomes part of a Diagram and cannot be used in another one.
         model: Model used by the controller. The integrator of the controller compensates the errors of this model.
         poses: Poses (m, n) [rad, m] inside the limits (steps 1 to 3 of section III.G).
-        effort_noise: Standard deviation of the noise of one effort sample, as a share of the effort limit.
-        generator: Random generator of the noise.
+        approach: Distance (n,) [rad, m] from which the arm approaches each pose, from below and from above. In the mean
+            over both directions, dry friction cancels. None: the arm approaches each pose from the previous one.
+        settle: Settling time at a pose [s].
         progress: Function called with the finished share, 0..1.
 
     Returns:
-        Recording with one row per pose: means of `SAMPLES` samples of position and effort.
+        Recording with one row per pose: means of position and effort over `SAMPLES` samples and both approaches.
     """
     arm = station.arm
     name = arm.name.lower()
-    trajectory, settled = pose_visit_trajectory(arm, poses)
+    trajectory, settled = pose_visit_trajectory(arm, poses, approach, settle)
     builder = DiagramBuilder()
     desired = TrajectorySource(trajectory, output_derivative_order=1)
     add_closed_loop(builder, station, GravityPidController(model), desired)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.SetPositions(context, poses[0])
+    station.SetPositions(context, trajectory.value(0.0).ravel())
     position = station.GetOutputPort(f"{name}.position_measured")
     effort = station.GetOutputPort(f"{name}.effort_measured")
-    q, tau = np.zeros_like(poses), np.zeros_like(poses)
+    visits = np.zeros((len(settled), 2, arm.num_joints))
     for i, t in enumerate(settled):
         for sample in range(SAMPLES):
             simulator.AdvanceTo(t + sample * SAMPLE_SPACING)
-            q[i] += position.Eval(context) / SAMPLES
-            noise = effort_noise * arm.effort_limits * generator.normal(size=arm.num_joints)
-            tau[i] += (effort.Eval(context) + noise) / SAMPLES
-        progress((i + 1) / len(poses))
+            visits[i] += np.array([position.Eval(context), effort.Eval(context)]) / SAMPLES
+        progress((i + 1) / len(settled))
+    q, tau = visits.reshape(len(poses), -1, 2, arm.num_joints).mean(axis=1).transpose(1, 0, 2)
     return Recording(q=q, tau=tau, source="simulated poses")
 
 
@@ -225,23 +241,6 @@ def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) 
     return dataclasses.replace(arm, sdf=(str(path.resolve()),))
 
 
-def damped_station(
-    arm: Arm, ground_truth_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
-) -> ArmStation:
-    """Makes a station for `arm` that simulates `ground_truth_arm` with viscous damping of all joints.
-
-    `effects` are simulated in addition. For `closure`, see `add_arm`.
-    """
-    damping = arm.per_joint(0.03, 0.3) * arm.effort_limits
-
-    def damp(plant: MultibodyPlant) -> None:
-        set_joint_damping(plant, ground_truth_arm, damping)
-
-    return ArmStation(
-        arm, plant_arm=ground_truth_arm, meshcat=meshcat, closure=closure, modify_plant=damp, effects=effects
-    )
-
-
 #: Distance between a pose and the start of an approach to it [rad], [m]. In the mean over two opposite approaches, dry
 #: friction cancels.
 APPROACH = 0.2, 0.02
@@ -282,8 +281,6 @@ def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64],
     offset = arm.per_joint(*APPROACH)
     visited = np.concatenate([[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses])
     station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects, seed=seed)
-    generator = np.random.default_rng(seed)
-    nominal = IdentifiedModel.from_arm(arm)
-    recording = collect_static_poses(station, nominal, visited, effort_noise=0.0, generator=generator)
+    recording = collect_static_poses(station, IdentifiedModel.from_arm(arm), visited)
     rows = np.hstack([recording.q, recording.measured_effort()])
     return (rows[1::4] + rows[3::4]) / 2

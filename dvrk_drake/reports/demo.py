@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 
-from dvrk_drake.experiments.demo.demo import NO_DRY_FRICTION, DemoResult
+from dvrk_drake.experiments.demo.demo import DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.identification import print_static_parameters
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -22,11 +24,17 @@ With a real arm:
 4. Disable the gravity compensation of the dVRK controller. Otherwise gravity is
    compensated twice. Keep a hand on the emergency stop.
 5. Only if no verdict is "do not use":
-   dvrk-drake run --arm {arm} --model model.yaml --mode damped"""
+   dvrk-drake run --arm {arm} --model model.yaml --mode damped
+"""
+#: Note on the start of the release.
+START_OF_RELEASE = (
+    "The simulated arm has the friction, cables, stops and sensors of the arm file. At the start of the release, its "
+    "friction carries no load. After an approach from one side, friction moves the joints back by up to 20 mrad."
+)
 
 
 def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: bool = False) -> None:
-    """Prints the drift of the released arm, and the errors of the models at new poses.
+    """Prints whether the released arm stays at its pose, its drift, and the errors of the models at new poses.
 
     Args:
         console: Console to print to.
@@ -34,37 +42,44 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
         folder: Output folder of the demo.
         verbose: Whether to print the identified parameters, and instructions for a real arm.
     """
-    arm = result.arm
-    drifts = list(result.drift.values())
-    angles = [np.where(arm.prismatic, 0.0, drift) for drift in drifts[:2]]
-    identified, nominal = (f"{angle.max():.4f} rad ({arm.joint_names[int(np.argmax(angle))]})" for angle in angles)
+    arm, duration = result.arm, result.time[-1]
+    drifts = result.drifts
+    largest = {model: _largest_rotation(arm, drift) for model, drift in drifts.items()}
     print_answer(
         console,
-        f"Largest joint rotation of {arm.name} after a release without dry friction: {identified} with the identified "
-        f"model, {nominal} with the nominal model.",
-        f"open {folder}/arm.html in a browser",
+        f"Verdict: the identified model {'holds' if result.holds('identified') else 'does not hold'} the released "
+        f"{arm.name} for {duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the "
+        f"SDF, the same arm drifts by {largest['nominal']}.",
+        f"open {folder}/arm.html in a browser, or drift.png",
+        style="green" if result.holds("identified") else "yellow",
     )
     table = make_table(
-        f"RMS torque error at {result.fresh.poses} new poses [N m; N], drift and step error [rad; m]",
-        *("", "no model", "identified", "paper's method", "drift, identified", "drift, nominal", "step error"),
+        f"Drift after {duration:g} s [mrad; mm], RMS torque error at {result.fresh.poses} new poses [N m; N]",
+        *("", "drift, identified", "drift, SDF", "error, identified", "error, SDF", "no model"),
     )
-    for i, (ours, paper) in enumerate(zip(result.fresh.joints, result.fresh_paper.joints, strict=True)):
-        errors = (ours.rms_torque, ours.rms_error, paper.rms_error, *(drift[i] for drift in drifts))
-        table.add_row(ours.name, *(f"{e:.4f}" for e in errors), f"{result.step_error[i]:.5f}")
+    for i, (ours, sdf) in enumerate(zip(result.fresh.joints, result.fresh_nominal.joints, strict=True)):
+        drift = (f"{1e3 * drifts[model][i]:.1f}" for model in ("identified", "nominal"))
+        errors = (f"{error:.4f}" for error in (ours.rms_error, sdf.rms_error, ours.rms_torque))
+        table.add_row(ours.name, *drift, *errors)
     console.print(table)
     console.print()
-    print_note(console, NO_DRY_FRICTION)
+    console.print("Plots, parameters with intervals, excluded measurements:")
+    identify = f"dvrk-drake identify {folder}/poses.csv --arm {arm.source} --output again.yaml --report report.html"
+    console.print(f"  {identify}", markup=False, soft_wrap=True)
+    console.print("With a real arm:")
+    command = f"dvrk-drake identify POSES.csv --arm {arm.source} --output MODEL.yaml --report REPORT.html"
+    console.print(f"  {command}\n", markup=False, soft_wrap=True)
     if not verbose:
-        console.print(f"With a real arm: dvrk-drake identify POSES.csv --arm {arm.source} --output MODEL.yaml")
         return
+    print_note(console, START_OF_RELEASE)
     print_static_parameters(console, result.identification.model)
     console.print(WITH_A_REAL_ARM.format(arm=arm.source), markup=False)
-    if arm.coupled_limits:
-        print_note(
-            console,
-            "The simulated arm has no joint stops in q2 + q3. A real arm would hit these stops in the step and in the "
-            "release with the nominal model.",
-        )
+
+
+def _largest_rotation(arm: Arm, drift: NDArray[np.float64]) -> str:
+    """Returns the largest drift (n,) of the rotating joints with its unit and joint."""
+    angles = np.where(arm.prismatic, 0.0, drift)
+    return f"{1e3 * angles.max():.3g} mrad ({arm.joint_names[int(np.argmax(angles))]})"
 
 
 def print_teleoperation(console: Console, result: TeleoperationResult, file: str, *, verbose: bool = False) -> None:

@@ -1,75 +1,76 @@
-"""Runs the complete workflow on a simulated arm: pose collection, identification, validation, release and step."""
+"""Runs the complete workflow on a simulated arm: pose collection, identification, validation and release."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, MeshcatAnimation
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, VectorLogSink
+from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.analysis.static.validation import StaticValidation, validate_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
-from dvrk_drake.experiments.ground_truth import collect_static_poses, damped_station, perturbed_links, with_links
-from dvrk_drake.experiments.simulation import advance, recorded_in, sample_times, samples
+from dvrk_drake.experiments.ground_truth import APPROACH, collect_static_poses, perturbed_links, with_links
+from dvrk_drake.experiments.reproduction.drift_experiment import BAND
+from dvrk_drake.experiments.simulation import recorded_in, sample_times, samples
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view.page import start_meshcat
+from dvrk_drake.systems.arm_view.overlay import ArmOverlay
+from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-#: Numbers of poses for identification and for validation.
-POSES, FRESH_POSES = 40, 15
-#: Standard deviation of the noise of one effort sample, as a share of the effort limit.
-EFFORT_NOISE = 0.01
+#: Numbers of poses for identification and for validation. Settling time at a pose [s].
+POSES, FRESH_POSES, SETTLE = 24, 8, 0.5
 #: Maximum displacement of the ground-truth arm's centres of mass along each axis [m].
 MAX_SHIFT = 0.002
-#: End times of the segments of the release: regulated pose, released arm, motion to the home pose [s].
-HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
-#: Duration of the step response [s].
-STEP_DURATION = 4.0
-#: Sample period of the motions [s].
-SAMPLE_PERIOD = 0.01
-#: Note on the interpretation of the drift.
-NO_DRY_FRICTION = (
-    "The simulation has no dry friction, so every model error moves the released arm. On a real arm, dry friction "
-    "reduces this drift."
+#: Largest magnitude of a joint angle in the collected poses [rad]. Larger angles need more time.
+MAX_ANGLE = 2.0
+#: End times of the phases of the release: regulated pose, released arm, motion to the home pose [s].
+HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 1.0, 5.0, 8.0
+#: Sample period of the release [s]. The animation shows every third sample.
+SAMPLE_PERIOD, SAMPLES_PER_FRAME = 0.01, 3
+#: Name and colour of the ghost arm in the animation.
+GHOST = "nominal"
+#: Captions of the animation: the phases with their start times [s], and the meaning of the colours.
+PHASES = (
+    (0.0, "held: the controller regulates the pose"),
+    (HELD_UNTIL, "released: gravity compensation only"),
+    (RELEASED_UNTIL, "driven home: the controller regulates a motion"),
 )
+COLOURS = "grey: identified model    orange: model of the SDF, not identified"
 
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """Effects, poses and settings of the demo for one type of arm.
+    """Effects and poses of the demo for one type of arm.
 
     Attributes:
-        effects: Effects of the ground-truth arm that are not in the nominal model.
+        effects: Effects of the ground-truth arm that are neither in the nominal model nor in the arm file.
+        omitted: Names of effects of the arm file that the ground-truth arm does not have.
         release: Pose (n,) of the release [rad, m].
-        step: Start pose (n,) of the step to `home` [rad, m].
-        home: Desired pose (n,) at the end of both simulations, release and step [rad, m].
-        step_title: Title of the plot of the step.
-        closure: Method for closing the loops of the ground-truth arm's linkage, see `add_arm`.
+        home: Desired pose (n,) at the end of the simulation [rad, m].
     """
 
     effects: tuple[DriveEffect, ...]
     release: tuple[float, ...]
-    step: tuple[float, ...]
     home: tuple[float, ...]
-    step_title: str
-    closure: Closure = "mimic"
+    omitted: tuple[str, ...] = ()
 
 
 MTM_PLAN = DemoPlan(
@@ -79,10 +80,9 @@ MTM_PLAN = DemoPlan(
         DriveEffect("joint.wrist_pitch", "cable sine", 1.0, -0.03),
     ),
     release=(0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5),
-    # Start pose of the paper's Fig. 7. The sum q2 + q3 exceeds the limit of the real linkage.
-    step=(0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0),
     home=(0.0,) * 7,
-    step_title="Step of the paper's Fig. 7 to zero, gravity + PID",
+    # The spring balances a heavier wrist than that of the SDF, see `perturbed_ground_truth`.
+    omitted=("springs",),
 )
 PLANS = {
     "mtml": MTM_PLAN,
@@ -94,44 +94,47 @@ PLANS = {
             DriveEffect("joint.wrist_pitch", "offset", 0.0, 0.01),
         ),
         release=(0.4, 0.3, 0.15, 0.6, 0.5, -0.3, 0.5),
-        step=(0.5, -0.4, 0.2, -0.8, 0.6, 0.4, 0.8),
         home=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0),
-        step_title="Step of all joints, gravity + PID",
-        closure="ball",
     ),
 }
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Results of one run of the demo for n joints. The release has m samples, and the step has k samples.
+    """Results of one run of the demo for n joints.
 
     Attributes:
         arm: Arm of the demo.
         identification: Identification from the collected poses.
         fresh: Errors of the identified model at fresh poses, which are not used for identification.
-        fresh_paper: Errors at the fresh poses for the model identified by the paper's least-squares method.
-        release_time: Times (m,) of the release [s].
-        released: Positions (m, n) during the release with the identified model [rad, m].
-        released_nominal: Positions (m, n) during the release with the nominal model [rad, m].
-        drift: Largest distance (n,) of each joint from its release position [rad, m], by name of the model:
-            "identified" or "nominal".
-        step_time: Times (k,) of the step [s].
-        step: Positions (k, n) during the step to the home pose [rad, m].
-        step_error: Distance (n,) of each joint from its home position at the end of the step [rad, m].
+        fresh_nominal: Errors of the nominal model (SDF) at the fresh poses.
+        time: Times (m,) while the arm is released, from the release on [s].
+        identified: Positions (m, n) of the released arm with the identified model [rad, m].
+        nominal: Positions (m, n) of the released arm with the nominal model [rad, m].
     """
 
     arm: Arm
     identification: StaticIdentification
     fresh: StaticValidation
-    fresh_paper: StaticValidation
-    release_time: NDArray[np.float64]
-    released: NDArray[np.float64]
-    released_nominal: NDArray[np.float64]
-    drift: dict[str, NDArray[np.float64]]
-    step_time: NDArray[np.float64]
-    step: NDArray[np.float64]
-    step_error: NDArray[np.float64]
+    fresh_nominal: StaticValidation
+    time: NDArray[np.float64]
+    identified: NDArray[np.float64]
+    nominal: NDArray[np.float64]
+
+    @property
+    def drifts(self) -> dict[str, NDArray[np.float64]]:
+        """Largest distance (n,) of each joint from its release position [rad, m] by model: "identified", "nominal"."""
+        released = {"identified": self.identified, "nominal": self.nominal}
+        return {model: np.abs(q - q[0]).max(axis=0) for model, q in released.items()}
+
+    @property
+    def limits(self) -> NDArray[np.float64]:
+        """Largest drift (n,) of a joint that counts as held [rad, m]."""
+        return self.arm.per_joint(*BAND)
+
+    def holds(self, model: str) -> bool:
+        """Tells whether all joints of the released arm stay within `limits` with a model of `drifts`."""
+        return bool(np.all(self.drifts[model] <= self.limits))
 
 
 def run_demo(
@@ -164,20 +167,22 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     nominal = IdentifiedModel.from_arm(arm)
     links = perturbed_links(arm, generator, shift=MAX_SHIFT)
     ground_truth_arm = with_links(arm, links, true_sdf, "a simulated arm with random link inertias")
+    effects = _effects(arm, plan)
 
     def station(meshcat: Meshcat | None = None) -> ArmStation:
-        return damped_station(arm, ground_truth_arm, ArmEffects(cables=list(plan.effects)), plan.closure, meshcat)
+        return ArmStation(
+            arm, plant_arm=ground_truth_arm, meshcat=meshcat, closure="ball", effects=effects, seed=seed
+        )
 
     def collect(count: int, step: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)
-        # An operator rotates the platform and the handle (PSM: the roll joint) only within the range of a human wrist.
-        poses[:, [3, 6]] = np.clip(poses[:, [3, 6]], -1.5, 1.5)
+        poses = np.where(arm.prismatic, poses, np.clip(poses, -MAX_ANGLE, MAX_ANGLE))
         return collect_static_poses(
             station(),
             nominal,
             poses,
-            effort_noise=EFFORT_NOISE,
-            generator=generator,
+            approach=arm.per_joint(*APPROACH),
+            settle=SETTLE,
             progress=lambda share: progress(step, share),
         )
 
@@ -189,89 +194,108 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     model.save(output / "model.yaml")
     fresh_poses = collect(FRESH_POSES, "collecting fresh poses")
     write_recording(fresh_poses, output / "fresh_poses.csv")
-    fresh = validate_static(model, fresh_poses)
-    paper_model = identify_static(poses, arm, "paper").model
-    fresh_paper = validate_static(paper_model, fresh_poses)
 
-    def third(index: int) -> Callable[[float], object]:
-        return lambda share: progress("simulating release and step", (index + share) / 3)
+    def part(start: float, end: float) -> Callable[[float], object]:
+        return lambda share: progress("simulating the release", start + (end - start) * share)
 
+    t, with_nominal = _release(station(), nominal, plan, RELEASED_UNTIL, part(0.0, 0.3))
     meshcat = start_meshcat(arm)
-    t, released = _release(station(meshcat), model, plan, meshcat, third(0))
+    released = _animated_release(station(meshcat), model, plan, meshcat, with_nominal, part(0.3, 1.0))
     with atomic_write(output / "arm.html") as stream:
-        stream.write(meshcat.StaticHtml())
-    _, with_nominal = _release(station(), nominal, plan, None, third(1))
-    t_step, step = _step(station(), model, plan, third(2))
-
-    window = (t >= HELD_UNTIL) & (t <= RELEASED_UNTIL)
-    drift = {
-        label: np.abs(q[window] - q[window][0]).max(axis=0)
-        for label, q in (("identified", released), ("nominal", with_nominal))
-    }
+        stream.write(page_html(meshcat, f"{arm.name} (simulated) - dvrk-drake demo"))
+    window = slice(_index(HELD_UNTIL), _index(RELEASED_UNTIL) + 1)
     return DemoResult(
-        arm,
-        identification,
-        fresh,
-        fresh_paper,
-        t,
-        released,
-        with_nominal,
-        drift,
-        t_step,
-        step,
-        np.abs(step[-1] - plan.home),
+        arm=arm,
+        identification=identification,
+        fresh=validate_static(model, fresh_poses),
+        fresh_nominal=validate_static(nominal, fresh_poses),
+        time=t[window] - HELD_UNTIL,
+        identified=released[window],
+        nominal=with_nominal[window],
     )
 
 
-def _closed_loop(
-    station: ArmStation, model: IdentifiedModel, q_start: Sequence[float]
-) -> tuple[Simulator, VectorLogSink, GravityPidController, ConstantVectorSource]:
-    """Returns a simulator of the arm at q_start, the log of the arm's state, the controller, and the desired state."""
-    controller = GravityPidController(model)
-    desired = ConstantVectorSource(_at_rest(q_start))
-    builder = DiagramBuilder()
-    add_closed_loop(builder, station, controller, desired)
-    log = LogVectorOutput(station.GetOutputPort(f"{station.arm.name.lower()}.state_true"), builder, SAMPLE_PERIOD)
-    simulator = Simulator(builder.Build())
-    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.SetPositions(context, q_start)
-    return simulator, log, controller, desired
+def _effects(arm: Arm, plan: DemoPlan) -> ArmEffects:
+    effects = arm.effects
+    for name in plan.omitted:
+        effects = effects.without(name)
+    return dataclasses.replace(effects, cables=[*effects.cables, *plan.effects])
 
 
-def _at_rest(q: Sequence[float]) -> NDArray[np.float64]:
-    return np.concatenate([q, np.zeros(len(q))])
+def _index(time: float) -> int:
+    """Returns the index of the sample at `time` [s]."""
+    return round(time / SAMPLE_PERIOD)
 
 
 def _release(
     station: ArmStation,
     model: IdentifiedModel,
     plan: DemoPlan,
-    meshcat: Meshcat | None,
+    duration: float,
     progress: Callable[[float], object],
+    draw: Callable[[int, NDArray[np.float64]], object] = lambda index, q: None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Simulates regulation, release with gravity compensation, and motion home; returns t (m,) and q (m, n)."""
-    simulator, log, controller, desired = _closed_loop(station, model, plan.release)
-    root = simulator.get_mutable_context()
-    settings = controller.GetMyMutableContextFromRoot(root)
-    t = sample_times(HOME_UNTIL, SAMPLE_PERIOD)
-    held, released = (int(np.searchsorted(t, end - 1e-9)) + 1 for end in (HELD_UNTIL, RELEASED_UNTIL))
+    """Simulates regulation, release with gravity compensation, and motion home; returns t (m,) and q (m, n).
+
+    At the start, the arm is at rest, and the presliding springs of its friction carry no force. `draw` is called with
+    the index and the pose of each sample.
+    """
+    arm = station.arm
+    knots = np.array([plan.release, plan.release, plan.home, plan.home]).T
+    times = [0.0, RELEASED_UNTIL, 0.75 * HOME_UNTIL + 0.25 * RELEASED_UNTIL, HOME_UNTIL]
+    desired = TrajectorySource(
+        PiecewisePolynomial.CubicHermite(times, knots, np.zeros_like(knots)), output_derivative_order=1
+    )
+    controller = GravityPidController(model)
+    builder = DiagramBuilder()
+    add_closed_loop(builder, station, controller, desired)
+    log = LogVectorOutput(station.GetOutputPort(f"{arm.name.lower()}.state_true"), builder, SAMPLE_PERIOD)
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    station_context = station.GetMyMutableContextFromRoot(context)
+    station.SetPositions(station_context, plan.release)
+    settings = controller.GetMyMutableContextFromRoot(context)
+    t = sample_times(duration, SAMPLE_PERIOD)
+    for i, time in enumerate(t):
+        if i == 0:
+            simulator.Initialize()  # AdvanceTo(0) would perform the first step of the plant
+        else:
+            simulator.AdvanceTo(time)
+        draw(i, station.GetPositions(station_context))
+        progress(time / t[-1])
+        if i == _index(HELD_UNTIL):
+            controller.SetMode(settings, "gravity")
+        elif i == _index(RELEASED_UNTIL):
+            controller.SetMode(settings, "hold")
+    return t, samples(log, simulator)[:, : arm.num_joints]
+
+
+def _animated_release(
+    station: ArmStation,
+    model: IdentifiedModel,
+    plan: DemoPlan,
+    meshcat: Meshcat,
+    ghost: NDArray[np.float64],
+    progress: Callable[[float], object],
+) -> NDArray[np.float64]:
+    """Simulates the release and records an endless animation; returns q (m, n).
+
+    The animation shows the poses `ghost` (k, n) of another simulation as a ghost arm until the release ends.
+    """
+    overlay = ArmOverlay(station.arm, meshcat)
+    overlay.add_ghost(GHOST)
+    overlay.captions.set_text("colours", COLOURS, v=-0.82)
+
+    def draw(i: int, q: NDArray[np.float64]) -> None:
+        if i % SAMPLES_PER_FRAME:
+            return
+        time = i * SAMPLE_PERIOD
+        overlay.set_phase([text for start, text in PHASES if start <= time][-1], time)
+        overlay.draw(q, ghosts={GHOST: ghost[i]} if i < len(ghost) else None, time=time)
+
     with recorded_in(meshcat):
-        advance(simulator, t[:held])
-        controller.SetMode(settings, "gravity")
-        advance(simulator, t[held:released], lambda share: progress(share * RELEASED_UNTIL / HOME_UNTIL))
-        desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))
-        controller.SetMode(settings, "hold")
-        advance(simulator, t[released:], progress)
-    return t, samples(log, simulator)[:, : station.arm.num_joints]
-
-
-def _step(
-    station: ArmStation, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], object]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Simulates the step to the home pose with gravity compensation and PID; returns t (m,) [s] and q (m, n)."""
-    simulator, log, _, desired = _closed_loop(station, model, plan.step)
-    root = simulator.get_mutable_context()
-    desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))
-    t = sample_times(STEP_DURATION, SAMPLE_PERIOD)
-    advance(simulator, t, progress)
-    return t, samples(log, simulator)[:, : station.arm.num_joints]
+        _, q = _release(station, model, plan, HOME_UNTIL, progress, draw)
+        animation = meshcat.get_mutable_recording()
+        animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
+        animation.set_repetitions(10_000)
+    return q

@@ -6,38 +6,60 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.experiments.demo.demo import (
-    HELD_UNTIL,
-    NO_DRY_FRICTION,
-    PLANS,
-    RELEASED_UNTIL,
-    DemoResult,
-)
-from dvrk_drake.reports.figures.identification import plot_static_identification, plot_torque_error
-from dvrk_drake.reports.figures.simulation import plot_positions
+from dvrk_drake.experiments.demo.demo import DemoResult
+from dvrk_drake.reports.figures.colours import FITTED, LIMIT, REFERENCE
+from dvrk_drake.reports.figures.identification import plot_torque_error
+from dvrk_drake.reports.figures.style import add_legend, joint_title, panel_grid, save_figure, set_title
+
+#: Smallest half-width of the drift axis, as a multiple of the limit of the drift.
+_MIN_RANGE = 2.0
 
 
 def plot_demo(output: Path, result: DemoResult) -> None:
-    """Writes torque_error.png, predicted.png, fresh_torque_error.png, release.png and step.png into `output`."""
-    arm = result.arm
-    plot_static_identification(output, result.identification)
+    """Writes drift.png and torque_error.png into the folder `output`."""
+    plot_drift(output / "drift.png", result)
+    errors = {"identified model": result.fresh, "model of the SDF": result.fresh_nominal}
     plot_torque_error(
-        output / "fresh_torque_error.png",
-        arm,
-        np.array([j.rms_torque for j in result.fresh.joints]),
-        {
-            "identified": np.array([j.rms_error for j in result.fresh.joints]),
-            "least squares of the paper": np.array([j.rms_error for j in result.fresh_paper.joints]),
-        },
-        f"{arm.name} (simulated): RMS torque error at {result.fresh.poses} poses that were not used for fitting",
+        output / "torque_error.png",
+        result.arm,
+        np.array([joint.rms_torque for joint in result.fresh.joints]),
+        {label: np.array([joint.rms_error for joint in fresh.joints]) for label, fresh in errors.items()},
+        f"{result.arm.name} (simulated): RMS torque error at {result.fresh.poses} poses that were not used for fitting",
     )
-    plot_positions(
-        output / "release.png",
-        arm,
-        result.release_time,
-        {"identified model": result.released, "nominal model (SDF)": result.released_nominal},
-        f"{arm.name} (simulated without dry friction): regulated until {HELD_UNTIL} s, gravity compensation until "
-        f"{RELEASED_UNTIL} s, then motion to the home position\n{NO_DRY_FRICTION}",
+
+
+def plot_drift(path: Path, result: DemoResult) -> None:
+    """Writes a PNG of the drift of the released arm with both models.
+
+    Each joint has one panel, in which both models have the same scale. The panel shows the largest drift of a held
+    joint, and the position limits of the joint that are inside its range.
+    """
+    arm, t = result.arm, result.time
+    figure, axes = panel_grid(arm.num_joints, height=2.5)
+    for j, ax in enumerate(axes):
+        q0, held = result.identified[0, j], 1e3 * result.limits[j]
+        drift = {
+            "model of the SDF (not identified)": (1e3 * (result.nominal[:, j] - result.nominal[0, j]), REFERENCE, "--"),
+            "identified model": (1e3 * (result.identified[:, j] - q0), FITTED, "-"),
+        }
+        ax.axhspan(-held, held, color=LIMIT, alpha=0.15, linewidth=0, label="held: within 15 mrad or 1.5 mm")
+        for label, (values, colour, line) in drift.items():
+            ax.plot(t, values, line, color=colour, linewidth=1.8, label=label)
+        low, high = ax.get_ylim()
+        low, high = min(low, -_MIN_RANGE * held), max(high, _MIN_RANGE * held)
+        for stop in (arm.position_lower[j], arm.position_upper[j]):
+            if low <= 1e3 * (stop - q0) <= high:
+                ax.axhline(1e3 * (stop - q0), color=LIMIT, linestyle=":", linewidth=1.5, label="joint limit")
+        ax.set_ylim(low, high)
+        ax.set_title(joint_title(arm, j))
+        ax.set_ylabel(f"drift [{'mm' if arm.prismatic[j] else 'mrad'}]")
+        ax.set_xlabel("time since the release [s]")
+    add_legend(figure)
+    verdict = "holds" if result.holds("identified") else "does not hold"
+    set_title(
+        figure,
+        f"The identified model {verdict} the released {arm.name}. "
+        + ("The model of the SDF also holds it." if result.holds("nominal") else "With the model of the SDF it falls.")
+        + "\nDrift from the release position; simulation with friction, cables, joint stops and sensors",
     )
-    title = PLANS[arm.name.lower()].step_title
-    plot_positions(output / "step.png", arm, result.step_time, {"identified model": result.step}, title)
+    save_figure(figure, path)

@@ -11,11 +11,12 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.experiments.ground_truth import collect_static_poses, damped_station, perturbed_links, with_links
+from dvrk_drake.experiments.ground_truth import collect_static_poses, perturbed_links, with_links
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
-from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, set_joint_damping
 from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.systems.arm_station import ArmStation
 
 COUNT = 16
 
@@ -36,14 +37,15 @@ def recording(arm, ground_truth_arm):
     """Collects poses with the nominal model, so that the integrator compensates its errors."""
     generator = np.random.default_rng(6)
     laws = [DriveEffect("joint.yaw", "offset", 0.0, 0.05), DriveEffect("joint.roll", "cable sine", 1.0, 0.03)]
-    effects = ArmEffects(cables=laws)
-    return collect_static_poses(
-        damped_station(arm, ground_truth_arm, effects, "ball"),
-        IdentifiedModel.from_arm(arm),
-        arm.sample_poses(COUNT, generator, margin=0.1),
-        effort_noise=0.0,
-        generator=generator,
+    station = ArmStation(
+        arm,
+        plant_arm=ground_truth_arm,
+        closure="ball",
+        modify_plant=lambda plant: set_joint_damping(plant, ground_truth_arm, arm.per_joint(0.03, 0.3) * arm.effort_limits),
+        effects=ArmEffects(cables=laws),
     )
+    poses = arm.sample_poses(COUNT, generator, margin=0.1)
+    return collect_static_poses(station, IdentifiedModel.from_arm(arm), poses)
 
 
 def true_torque(arm, ground_truth_arm, poses):
