@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.camera import Camera, geometry_corners
 from dvrk_drake.systems.arm_view.captions import Captions
-from dvrk_drake.systems.arm_view.overlay import ArmOverlay
+from dvrk_drake.systems.arm_view.overlay import TITLE_EDGE, ArmOverlay
 from dvrk_drake.systems.arm_view.page import add_ground, start_meshcat
 from dvrk_drake.systems.arm_view.scene import Scene
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
@@ -20,9 +20,9 @@ from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 #: Positions of the bases in the world frame [m]. Both bases have the same orientation.
 BASE_POSITIONS = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
 #: The target is right of the arms, so that the control panel in the upper right corner does not cover them.
-CAMERA, TARGET, ZOOM = (1.9, 0.65, 0.55), (0.0, 0.08, 0.08), 2.6
-#: Upper edges of the captions, see `systems.arm_view.camera.Camera.point`.
-TITLE_EDGE, STATUS_EDGE = 0.97, -0.62
+CAMERA, TARGET = (2.4, 0.86, 0.68), (0.0, 0.1, 0.08)
+#: Upper edge of the caption with clutch, scale and error, see `systems.arm_view.camera.Camera.point`.
+STATUS_EDGE = -0.62
 
 
 class TeleoperationScene:
@@ -67,9 +67,9 @@ class TeleoperationScene:
         if (now := monotonic()) < self._next_text:
             return
         self._next_text = now + 0.2
-        clutch = "clutch closed: PSM follows" if follows else "clutch open: PSM holds"
-        error = "tracking error -" if tracking is None else f"tracking error {1e3 * tracking:.1f} mm"
-        self._captions.set_text("status", f"{clutch}   scale {scale:.2f}   {error}", v=STATUS_EDGE)
+        clutch = "clutch closed: PSM follows" if follows else "clutch open: PSM holds its pose"
+        error = "" if tracking is None else f"   tracking error {1e3 * tracking:.1f} mm"
+        self._captions.set_text("status", f"{clutch}   scale {scale:.2f}{error}", v=STATUS_EDGE)
 
 
 def _captions(meshcat: Meshcat) -> Captions:
@@ -81,7 +81,7 @@ def start_scene(port: int | None = None) -> Meshcat:
 
     If `port` is None, Meshcat uses a free port.
     """
-    meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
+    meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET)
     _captions(meshcat).set_text("title", "Loading MTML and PSM ...", v=TITLE_EDGE)
     corners = []
     for name, p_WB in BASE_POSITIONS.items():

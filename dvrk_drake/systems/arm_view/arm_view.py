@@ -18,8 +18,8 @@ from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 #: Buttons of the view, besides those of the camera positions.
 FRAMES, NAMES, EFFORTS = "frames", "joint names", "gravity efforts"
 HOME, RANDOM, DEGREES = "home pose", "random pose", "degrees / radians"
-#: Upper edges of the captions, see `Camera.point`.
-TITLE_EDGE, LIMIT_EDGE = 0.97, 0.74
+#: Upper edge of the caption of a coupled limit, see `Camera.point`.
+LIMIT_EDGE = 0.74
 
 
 class ArmView:
@@ -57,7 +57,7 @@ class ArmView:
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self.overlay = ArmOverlay(arm, meshcat)
-        self.overlay.captions.set_text("title", arm.name, v=TITLE_EDGE)
+        self.overlay.set_title(arm.name)
         self._q = home_position(arm)
         self._sliders: JointSliders | None = None
         self._clicks: dict[str, int] = {}

@@ -70,7 +70,7 @@ class Captions:
             self._phases.append(text)
             path = f"phase/{len(self._phases)}"
             self.set_image(path, text_image(text), 0.0, PHASE_EDGE)
-            self._scene.set_visible(path, False, 0.0 if time is not None else None)
+            self._scene.set_visible(path, False)
         if text != self._phase:
             for name, visible in ((self._phase, False), (text, True)):
                 if name:

@@ -16,6 +16,8 @@ FULL_ANGLE = np.radians(300)
 #: Colours at 0 %, 50 % and 100 % of the effort limit. They differ in lightness, so that a colour-blind person
 #: distinguishes them.
 _STOPS = np.array([[0.13, 0.44, 0.71], [0.97, 0.82, 0.20], [0.75, 0.10, 0.10]])
+#: Colour of the line that shows the length of an arc at the effort limit.
+SCALE_COLOR = Rgba(0.15, 0.18, 0.22)
 #: Radius of the tube and of the base of the arrow head, as multiples of the radius of the arc.
 _TUBE, _HEAD = 0.075, 0.2
 _SIDES = 8
@@ -34,14 +36,17 @@ class EffortArcs:
     """One arc per joint around its axis. A prismatic joint has a straight arrow instead.
 
     Length and colour show the share of the effort limit, rounded to the nearest of `LEVELS`. The arrow head points in
-    the direction of the effort.
+    the direction of the effort. A thin line shows the length of a positive effort at the limit.
     """
 
     def __init__(self, arm: Arm, joints: ArmJoints, scene: Scene, radii: NDArray[np.float64]) -> None:
         """Adds the arcs. `radii` (n,) are their radii [m]."""
         self._arm, self._joints, self._scene = arm, joints, scene
         self._levels = np.zeros(arm.num_joints, int)
+        scene.set_visible("efforts", False)
         for i, name in enumerate(arm.joint_names):
+            scale = _line(1.0, radii[i]) if arm.prismatic[i] else _arc(1.0, radii[i])
+            scene.meshcat.SetLine(scene.path(f"efforts/{name}/scale"), np.asfortranarray(scale), 2.0, SCALE_COLOR)
             for level, share in enumerate(LEVELS[1:], 1):
                 points = _line(share, radii[i]) if arm.prismatic[i] else _arc(share, radii[i])
                 vertices, faces = _arrow(points, radii[i])
@@ -55,7 +60,7 @@ class EffortArcs:
                     scene.set_visible(path, False)
 
     def draw(self, effort: ArrayLike, time: float | None = None) -> None:
-        """Shows the efforts (n,) [N m, N]. A recording stores them at `time` [s]."""
+        """Draws the efforts (n,) [N m, N]. A recording stores them at `time` [s]."""
         share = np.asarray(effort, float) / self._arm.effort_limits
         nearest = np.searchsorted((np.array(LEVELS[1:]) + LEVELS[:-1]) / 2, np.abs(np.nan_to_num(share)))
         levels = (np.sign(np.nan_to_num(share)) * nearest).astype(int)

@@ -24,8 +24,8 @@ WHOLE_ARM = "whole arm"
 #: Pose of the camera of `Camera` in Meshcat's camera.
 _X_CAMERA = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])))
 DESIRED = "desired"
-#: Upper edge of the legend, see `Camera.point`.
-LEGEND_EDGE = -0.78
+#: Upper edges of title and legend, see `Camera.point`.
+TITLE_EDGE, LEGEND_EDGE = 0.97, -0.78
 #: Largest radius of the effort arcs, length of the frames' axes, radius of the RCM, and distance below which arcs have
 #: different radii, as multiples of the size of the arm.
 _ARC, _AXIS, _RCM, _NEAR = 0.085, 0.07, 0.009, 0.05
@@ -89,11 +89,12 @@ class ArmOverlay:
         self._efforts = EffortArcs(arm, self._joints, self._scene, radii)
         self._frames = FrameAxes(self._joints, self._scene, _AXIS * size)
         self._ghosts: dict[str, GhostArm] = {}
-        self._shows_names, self._needs_legend = False, legend
+        self._shows_names, self._shows_efforts, self._has_legend = False, False, legend
         rcm = arm.view.remote_center
         self._rcm = RemoteCenter(self._joints, self._scene, rcm, _RCM * size) if rcm else None
         self._trace = TipTrace(self._joints, self._scene, arm.view.tip) if arm.view.tip else None
         self._scene.set_visible("names", False)
+        self._legend_drawn = False
         self._tracked = RigidTransform()
         self._whole_distance, self._scale = self._camera.distance, 1.0
 
@@ -122,7 +123,8 @@ class ArmOverlay:
         self._q = np.array(q, float)
         self._joints.set_positions(self._q)
         if effort is not None:
-            self._show_legend()
+            if not self._shows_efforts:
+                self.show_efforts(True)
             self._efforts.draw(effort, time)
         poses = dict(ghosts or {})
         if desired is not None:
@@ -146,6 +148,10 @@ class ArmOverlay:
         """Shows the name of a phase, e.g. "released". "" shows nothing. A recording stores the change at `time` [s]."""
         self.captions.set_phase(text, time)
 
+    def set_title(self, text: str) -> None:
+        """Shows a title at the upper edge of the view."""
+        self.captions.set_text("title", text, v=TITLE_EDGE)
+
     def show_frames(self, visible: bool) -> None:
         """Shows or hides the frames of the DH convention (x red, y green, z blue); see `ArmJoints.frame_names`."""
         self._frames.show(visible)
@@ -157,9 +163,16 @@ class ArmOverlay:
         self._draw_names()
 
     def show_efforts(self, visible: bool) -> None:
-        """Shows or hides the efforts of the joints and their legend. They are visible after `draw` with an effort."""
+        """Shows or hides the efforts of the joints and their legend. `draw` with an effort shows them."""
+        self._shows_efforts = visible
         self._scene.set_visible("efforts", visible)
-        self._scene.set_visible("legend", visible)
+        if self._has_legend:
+            if visible and not self._legend_drawn:
+                colors = [share_color(share) for share in np.linspace(0, 1, 50)]
+                image = color_scale_image("joint effort / effort limit", colors, ("0 %", "50 %", "100 %"))
+                self.captions.set_image("legend", image, 0.0, LEGEND_EDGE)
+                self._legend_drawn = True
+            self._scene.set_visible("legend", visible)
 
     def clear_trace(self) -> None:
         """Deletes the trace of the tip."""
@@ -209,13 +222,6 @@ class ArmOverlay:
         if self._shows_names:
             names = [f"{i + 1} {name}" for i, name in enumerate(self.arm.joint_names)]
             self.captions.place_names(names, self._origins())
-
-    def _show_legend(self) -> None:
-        if self._needs_legend:
-            colors = [share_color(share) for share in np.linspace(0, 1, 50)]
-            image = color_scale_image("joint effort / effort limit", colors, ("0 %", "50 %", "100 %"))
-            self.captions.set_image("legend", image, 0.0, LEGEND_EDGE)
-            self._needs_legend = False
 
 
 def _radii(origins: NDArray[np.float64], size: float) -> NDArray[np.float64]:

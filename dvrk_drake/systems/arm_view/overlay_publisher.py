@@ -66,7 +66,7 @@ def add_overlay(
     desired: OutputPort | None = None,
     phase: Callable[[float], str] = lambda time: "",
 ) -> OverlayPublisher:
-    """Adds an `OverlayPublisher` for a station with the measured efforts to a diagram.
+    """Adds an `OverlayPublisher` for a station to a diagram. It shows the measured efforts and the arm's name.
 
     Args:
         builder: Builder with the station.
@@ -76,6 +76,7 @@ def add_overlay(
         phase: Function that returns the name of the phase at a time [s].
     """
     name = station.arm.name.lower()
+    overlay.set_title(station.arm.name)
     publisher = builder.AddNamedSystem(f"{name}_overlay", OverlayPublisher(overlay, phase))
     builder.Connect(station.GetOutputPort(f"{name}.state_true"), publisher.GetInputPort("state"))
     builder.Connect(station.GetOutputPort(f"{name}.effort_measured"), publisher.GetInputPort("effort"))

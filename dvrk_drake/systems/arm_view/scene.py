@@ -20,6 +20,7 @@ class Scene:
         self.meshcat, self._root = meshcat, root
         self._transforms: dict[str, NDArray[np.float64]] = {}
         self._visible: dict[str, bool] = {}
+        self._recorded: set[str] = set()
         meshcat.Delete(root)
 
     def path(self, name: str) -> str:
@@ -44,6 +45,12 @@ class Scene:
 
     def set_visible(self, name: str, visible: bool, time: float | None = None) -> None:
         """Shows or hides `name`. A recording stores the change at `time` [s]."""
-        if self._visible.get(name) != visible:
-            self._visible[name] = visible
-            self.meshcat.SetProperty(self.path(name), "visible", visible, time)
+        before = self._visible.get(name)
+        if before == visible:
+            return
+        self._visible[name] = visible
+        if time is not None and name not in self._recorded:
+            # An animation uses its first value also for earlier times.
+            self._recorded.add(name)
+            self.meshcat.SetProperty(self.path(name), "visible", before is not False, 0.0)
+        self.meshcat.SetProperty(self.path(name), "visible", visible, time)
