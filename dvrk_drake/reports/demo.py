@@ -54,7 +54,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
         style="green" if result.holds("identified") else "yellow",
     )
     table = make_table(
-        f"Drift after {duration:g} s [mrad; mm], RMS torque error at {result.fresh.poses} new poses [N m; N]",
+        f"Largest drift in {duration:g} s [mrad; mm], RMS torque error at {result.fresh.poses} new poses [N m; N]",
         *("", "drift, identified", "drift, SDF", "error, identified", "error, SDF", "no model"),
     )
     for i, (ours, sdf) in enumerate(zip(result.fresh.joints, result.fresh_nominal.joints, strict=True)):
@@ -79,7 +79,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
 def _largest_rotation(arm: Arm, drift: NDArray[np.float64]) -> str:
     """Returns the largest drift (n,) of the rotating joints with its unit and joint."""
     angles = np.where(arm.prismatic, 0.0, drift)
-    return f"{1e3 * angles.max():.3g} mrad ({arm.joint_names[int(np.argmax(angles))]})"
+    return f"{1e3 * angles.max():.1f} mrad ({arm.joint_names[int(np.argmax(angles))]})"
 
 
 def print_teleoperation(console: Console, result: TeleoperationResult, file: str, *, verbose: bool = False) -> None:

@@ -114,10 +114,16 @@ def forces(console, verbose):
 
 def demonstrated(console, verbose):
     identified, validation = poses()
-    t, q = np.arange(3.0), np.zeros((3, 7))
-    drift = {"identified": np.full(7, 0.0123), "nominal": np.full(7, 1.234)}
+    t = np.arange(3.0)
+    q = np.outer(t, np.ones(7))
     result = DemoResult(
-        identified.model.arm, identified, validation, validation, t, q, q, drift, t, q, np.full(7, 1.2e-4)
+        arm=identified.model.arm,
+        identification=identified,
+        fresh=validation,
+        fresh_nominal=validation,
+        time=t,
+        identified=0.005 * q,
+        nominal=0.5 * q,
     )
     demo.print_demo(console, result, Path("demo_output"), verbose=verbose)
 

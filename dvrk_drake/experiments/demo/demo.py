@@ -170,9 +170,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     effects = _effects(arm, plan)
 
     def station(meshcat: Meshcat | None = None) -> ArmStation:
-        return ArmStation(
-            arm, plant_arm=ground_truth_arm, meshcat=meshcat, closure="ball", effects=effects, seed=seed
-        )
+        return ArmStation(arm, plant_arm=ground_truth_arm, meshcat=meshcat, closure="ball", effects=effects, seed=seed)
 
     def collect(count: int, step: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)

@@ -41,7 +41,9 @@ def recording(arm, ground_truth_arm):
         arm,
         plant_arm=ground_truth_arm,
         closure="ball",
-        modify_plant=lambda plant: set_joint_damping(plant, ground_truth_arm, arm.per_joint(0.03, 0.3) * arm.effort_limits),
+        modify_plant=lambda plant: set_joint_damping(
+            plant, ground_truth_arm, arm.per_joint(0.03, 0.3) * arm.effort_limits
+        ),
         effects=ArmEffects(cables=laws),
     )
     poses = arm.sample_poses(COUNT, generator, margin=0.1)

@@ -9,85 +9,113 @@ from rich.console import Console
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.experiments.demo import demo
-from dvrk_drake.experiments.ground_truth import perturbed_links, pose_visit_trajectory
+from dvrk_drake.experiments.ground_truth import (
+    APPROACH,
+    MIN_APPROACH,
+    collect_static_poses,
+    perturbed_links,
+    pose_visit_trajectory,
+)
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.reports.demo import print_demo
 from dvrk_drake.reports.figures import demo as demo_figures
+from dvrk_drake.reports.figures.demo import plot_demo
+from dvrk_drake.systems.arm_station import ArmStation
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
+    """Returns the folder and the result of a demo with fewer poses, and the reported progress."""
     folder = tmp_path_factory.mktemp("demo")
-    shorter = pytest.MonkeyPatch()
-    shorter.setattr(demo, "POSES", 20)
-    shorter.setattr(demo, "FRESH_POSES", 6)
-    stages, plot = [], demo_figures.plot_positions
-    shorter.setattr(
-        demo_figures,
-        "plot_positions",
-        lambda path, *rest: (PLOT_TITLES.update({path.name: rest[-1]}), plot(path, *rest)),
-    )
-    outcome = demo.run_demo(folder, progress=lambda step, share: stages.append((step, share)))
-    demo_figures.plot_demo(folder, outcome)
-    yield folder, outcome, stages
-    shorter.undo()
-
-
-#: Titles of the position plots by file name.
-PLOT_TITLES: dict[str, str] = {}
+    stages = []
+    with pytest.MonkeyPatch.context() as shorter:
+        shorter.setattr(demo, "POSES", 20)
+        shorter.setattr(demo, "FRESH_POSES", 4)
+        outcome = demo.run_demo(folder, progress=lambda step, share: stages.append((step, share)))
+    plot_demo(folder, outcome)
+    return folder, outcome, stages
 
 
 def test_demo_writes_everything(result):
-    folder, _, stages = result
-    names = {path.name for path in folder.iterdir()}
-    assert names == {
-        "arm.html",
-        "fresh_poses.csv",
-        "fresh_torque_error.png",
-        "model.yaml",
-        "poses.csv",
-        "predicted.png",
-        "release.png",
-        "step.png",
-        "torque_error.png",
-    }
-    assert "<html" in (folder / "arm.html").read_text()[:200].lower()
-    assert len(read_recording(folder / "poses.csv")) == 20
-    assert IdentifiedModel.load(folder / "model.yaml").arm.name == "MTML"
+    folder, outcome, stages = result
+    files = {path.name: path for path in folder.iterdir()}
+    pages = {"arm.html"}
+    pictures = {"drift.png", "torque_error.png"}
+    assert set(files) == pages | pictures | {"fresh_poses.csv", "model.yaml", "poses.csv"}
+    assert len(read_recording(files["poses.csv"])) == 20
+    assert IdentifiedModel.load(files["model.yaml"]).arm.name == "MTML"
     assert all(0.0 <= share <= 1.0 for _, share in stages)
     assert len({step for step, _ in stages}) == 4
+    assert outcome.time[0] == 0.0 and outcome.time[-1] == demo.RELEASED_UNTIL - demo.HELD_UNTIL
 
 
-def test_demo_error_is_below_zero_torque_and_paper(result):
+def test_identified_model_holds_and_nominal_model_falls(result):
     _, outcome, _ = result
-    for ours, paper in zip(outcome.fresh.joints[1:], outcome.fresh_paper.joints[1:], strict=True):
-        assert ours.rms_error < 0.2 * ours.rms_torque, ours
-        assert ours.rms_error < paper.rms_error, (ours, paper)
+    assert outcome.holds("identified") and np.all(outcome.drifts["identified"] < 0.015)
+    assert not outcome.holds("nominal") and outcome.drifts["nominal"].max() > 0.3
 
 
-def test_demo_identifies_simulated_springs(result):
+def test_demo_error_is_below_zero_torque_and_nominal_model(result):
+    """The outer yaw axis is vertical, so gravity causes no torque there."""
     _, outcome, _ = result
-    found = {(e.coordinate, e.kind): e.coefficient for e in outcome.identification.model.effects}
-    assert found["joint.wrist_platform", "cable sine"] == pytest.approx(0.05, abs=0.01)
-    assert found["joint.wrist_pitch", "cable sine"] == pytest.approx(-0.03, abs=0.003)
+    for ours, nominal in zip(outcome.fresh.joints[1:], outcome.fresh_nominal.joints[1:], strict=True):
+        assert ours.rms_error < 0.3 * ours.rms_torque, ours
+        assert ours.rms_error < nominal.rms_error, (ours, nominal)
 
 
-def test_demo_drifts_less_than_nominal_and_stops(result):
+def test_drift_plot_shows_both_models_and_the_limit(result, tmp_path, monkeypatch):
     _, outcome, _ = result
-    assert outcome.drift["identified"].max() < 0.3 * outcome.drift["nominal"].max()
-    assert outcome.step_error.max() < 1e-3
+    drawn = []
+    monkeypatch.setattr(demo_figures, "save_figure", lambda figure, path: drawn.append(figure))
+    demo_figures.plot_drift(tmp_path / "drift.png", outcome)
+    (figure,) = drawn
+    assert len(figure.axes) == 7
+    for j, ax in enumerate(figure.axes):
+        lines = {line.get_label(): line.get_ydata() for line in ax.lines}
+        largest = np.abs(lines["identified model"]).max()
+        assert largest == pytest.approx(1e3 * outcome.drifts["identified"][j], abs=1e-9)
+        low, high = ax.get_ylim()
+        assert low < -15 and high > 15, "the limit is visible"
+        assert low <= min(map(np.min, lines.values())) and high >= max(map(np.max, lines.values()))
+    assert "holds" in figure.get_suptitle()
 
 
-def test_drift_output_states_absence_of_friction(result):
+def test_demo_prints_verdict_and_next_commands(result):
     folder, outcome, _ = result
-    assert "without dry friction" in PLOT_TITLES["release.png"] and demo.NO_DRY_FRICTION in PLOT_TITLES["release.png"]
     console = Console(record=True, width=120, file=io.StringIO())
     print_demo(console, outcome, folder)
     text = console.export_text()
+    assert text.startswith("Verdict: the identified model holds the released MTML for 4 s.")
     assert f"Next: open {folder}/arm.html in a browser" in text
-    printed = " ".join(text.split())
-    assert demo.NO_DRY_FRICTION in printed
+    assert f"dvrk-drake identify {folder}/poses.csv --arm mtml --output again.yaml --report report.html" in text
+
+
+def test_mean_of_both_approach_directions_cancels_friction():
+    arm = load_arm("mtml")
+    poses = arm.sample_poses(2, np.random.default_rng(4), margin=0.2)
+    effects = arm.effects.only(["friction"])
+    nominal = IdentifiedModel.from_arm(arm)
+    error = []
+    for approach in (None, arm.per_joint(*APPROACH)):
+        recording = collect_static_poses(ArmStation(arm, effects=effects), nominal, poses, approach=approach)
+        error.append(recording.measured_effort() - nominal.holding_torque(recording.q))
+    one_side, both_sides = (np.sqrt(np.mean(np.square(e), axis=0))[:6] for e in error)
+    # The friction of the elbow has a travel of 0.25 rad, which is larger than the approach.
+    assert np.all(both_sides < 0.5 * one_side), (one_side, both_sides)
+
+
+def test_poses_are_approached_from_both_sides():
+    arm = load_arm("mtml")
+    poses = arm.sample_poses(3, np.random.default_rng(0), margin=0.2)
+    approach = arm.per_joint(*APPROACH)
+    trajectory, settled = pose_visit_trajectory(arm, poses, approach, settle=0.5)
+    for pose, times in zip(poses, settled.reshape(-1, 2), strict=True):
+        for t, side in zip(times, (-1, 1), strict=True):
+            np.testing.assert_allclose(trajectory.value(t).ravel(), pose, atol=1e-12)
+            arrival = t - 0.5
+            before = trajectory.value(arrival - MIN_APPROACH / 2).ravel() - pose
+            assert np.all(side * before >= -1e-12) and np.any(side * before > 0)
 
 
 def test_perturbed_links_are_consistent_and_differ():
