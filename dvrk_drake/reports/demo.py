@@ -63,12 +63,11 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
         table.add_row(ours.name, *drift, *errors)
     console.print(table)
     console.print()
-    console.print("Plots, parameters with intervals, excluded measurements:")
-    identify = f"dvrk-drake identify {folder}/poses.csv --arm {arm.source} --output again.yaml --report report.html"
-    console.print(f"  {identify}", markup=False, soft_wrap=True)
-    console.print("With a real arm:")
-    command = f"dvrk-drake identify POSES.csv --arm {arm.source} --output MODEL.yaml --report REPORT.html"
-    console.print(f"  {command}\n", markup=False, soft_wrap=True)
+    for purpose, command in (
+        ("Plots and parameters with intervals:", f"{folder}/poses.csv --arm {arm.source} --report report.html"),
+        ("With a real arm:", f"POSES.csv --arm {arm.source} --output MODEL.yaml"),
+    ):
+        console.print(f"{purpose}\n  dvrk-drake identify {command}", markup=False, soft_wrap=True)
     if not verbose:
         return
     print_note(console, START_OF_RELEASE)

@@ -88,7 +88,7 @@ def test_demo_prints_verdict_and_next_commands(result):
     text = console.export_text()
     assert text.startswith("Verdict: the identified model holds the released MTML for 4 s.")
     assert f"Next: open {folder}/arm.html in a browser" in text
-    assert f"dvrk-drake identify {folder}/poses.csv --arm mtml --output again.yaml --report report.html" in text
+    assert f"dvrk-drake identify {folder}/poses.csv --arm mtml --report report.html" in text
 
 
 def test_mean_of_both_approach_directions_cancels_friction():
@@ -100,8 +100,10 @@ def test_mean_of_both_approach_directions_cancels_friction():
     for approach in (None, arm.per_joint(*APPROACH)):
         recording = collect_static_poses(ArmStation(arm, effects=effects), nominal, poses, approach=approach)
         error.append(recording.measured_effort() - nominal.holding_torque(recording.q))
-    one_side, both_sides = (np.sqrt(np.mean(np.square(e), axis=0))[:6] for e in error)
-    # The friction of the elbow has a travel of 0.25 rad, which is larger than the approach.
+    # The friction of the elbow has a travel of 0.25 rad, which is larger than the approach. The friction of the wrist
+    # roll is direction-dependent.
+    joints = [0, 1, 3, 4, 5]
+    one_side, both_sides = (np.sqrt(np.mean(np.square(e), axis=0))[joints] for e in error)
     assert np.all(both_sides < 0.5 * one_side), (one_side, both_sides)
 
 
