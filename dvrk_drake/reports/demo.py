@@ -64,7 +64,10 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     console.print(table)
     console.print()
     for purpose, command in (
-        ("Plots and parameters with intervals:", f"{folder}/poses.csv --arm {arm.source} --report report.html"),
+        (
+            "Plots and parameters with intervals:",
+            f"{folder}/poses.csv --arm {arm.source} \\\n    --output new_model.yaml --report report.html",
+        ),
         ("With a real arm:", f"POSES.csv --arm {arm.source} --output MODEL.yaml"),
     ):
         console.print(f"{purpose}\n  dvrk-drake identify {command}", markup=False, soft_wrap=True)
