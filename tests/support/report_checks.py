@@ -10,7 +10,8 @@ PLOT_TEXT = ".canvas text"
 def check_report(open_page, path):
     """Opens a report at both sizes and checks it.
 
-    Checks errors, requests, overlaps, the width of the page, the smallest text of the plots, and the size of the file.
+    Checks errors, requests, overlaps, the width of the page, the smallest text of the plots, the size of the file, and
+    the headings of the printed page.
 
     Returns:
         The page, 1280 px wide.
@@ -27,6 +28,10 @@ def check_report(open_page, path):
         )
         assert min(sizes, default=12) >= 12, "9 pt are 12 px"
     assert path.stat().st_size < 10e6
+    text = printed_text(opened, path.parent)
+    if text is not None:
+        words = " ".join(text.split())
+        assert all(" ".join(title.split()) in words for title in opened.page.locator("h1, h2").all_inner_texts())
     return opened
 
 

@@ -44,26 +44,22 @@ def payload_page(result: PayloadIdentification, provenance: Provenance, model_pa
 def _link_plot(estimates: Sequence[Payload], chosen: Payload) -> Plot:
     """Returns the cross-validated error and the mass with its interval for a payload on each link."""
     figure = make_subplots(rows=1, cols=2, shared_yaxes=True, horizontal_spacing=0.06)
-    names = [payload.link for payload in estimates]
-    colours = [FITTED if payload is chosen else REFERENCE for payload in estimates]
-    markers = {"size": 10, "color": colours}
-    errors = [100 * payload.relative_error for payload in estimates]
-    figure.add_scatter(x=errors, y=names, mode="markers", marker=markers, name="error", row=1, col=1)
-    found = [payload.found for payload in estimates]
-    figure.add_scatter(
-        x=[p.body.mass if ok else None for p, ok in zip(estimates, found, strict=True)],
-        y=names,
-        error_x={"array": [p.quantile * p.mass_error for p in estimates], "thickness": 2, "width": 6},
-        mode="markers",
-        marker=markers,
-        name="mass",
-        row=1,
-        col=2,
-    )
+    for name, colour, symbol, shown in (
+        (chosen.link, FITTED, "diamond", [chosen]),
+        ("other links", REFERENCE, "circle", [payload for payload in estimates if payload is not chosen]),
+    ):
+        found = [payload for payload in shown if payload.found]
+        style = {"mode": "markers", "marker": {"size": 10, "color": colour, "symbol": symbol}, "name": name}
+        errors, masses = [100 * payload.relative_error for payload in shown], [payload.body.mass for payload in found]
+        reach = {"array": [p.quantile * p.mass_error for p in found], "thickness": 2, "width": 6}
+        figure.add_scatter(x=errors, y=[payload.link for payload in shown], **style, row=1, col=1)
+        links = [payload.link for payload in found]
+        figure.add_scatter(x=masses, y=links, error_x=reach, **style, showlegend=False, row=1, col=2)
     figure.update_xaxes(title="cross-validated error / error without payload [%]", row=1, col=1)
     figure.update_xaxes(title=f"mass with {100 * CONFIDENCE:.0f} % interval [kg]", rangemode="tozero", row=1, col=2)
-    figure.update_yaxes(autorange="reversed", type="category")
-    figure.update_layout(height=120 + 32 * len(estimates), showlegend=False, margin={"t": 16})
+    order = [payload.link for payload in estimates]
+    figure.update_yaxes(autorange="reversed", type="category", categoryorder="array", categoryarray=order)
+    figure.update_layout(height=150 + 32 * len(estimates))
     return Plot(figure, "Error and mass for a payload on each link, best link first; no mass: no payload found")
 
 

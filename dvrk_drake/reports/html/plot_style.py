@@ -81,7 +81,7 @@ def joint_panels(names: Sequence[str], x_title: str = "", x_titles: Sequence[str
         subplot_titles=list(names),
         shared_xaxes="all" if x_title else False,
         vertical_spacing=gap / (rows * height),
-        horizontal_spacing=0.09,
+        horizontal_spacing=0.14,
     )
     for j in range(len(names)):
         title = x_titles[j] if x_titles else x_title if j >= len(names) - 2 else ""

@@ -104,5 +104,5 @@ def _distribution_plot(measure: Measure, study: Study, rows: Mapping[int, Row]) 
     figure.update_yaxes(title="cumulative share of runs [%]", range=[-3, 103])
     text = f"{measure.column}: cumulative distribution over the runs"
     if infinite:
-        text += f" (not drawn, because the value is infinite: {infinite} of {len(rows)} runs)"
+        text += f"; {infinite} of {len(rows)} are infinite"
     return Plot(figure, text, half=True)

@@ -1,16 +1,20 @@
 """Reports of study, tune, transparency, payload and compare-gc: content, and layout in a browser."""
 
+import hashlib
 import tempfile
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from command_output import refusal
 from loaded_arm import two_days
 from report_checks import check_report
 from report_results import operator_forces, study_results, tuning_result
 
 import dvrk_drake as dvrk
+from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
@@ -74,7 +78,7 @@ def test_study_plots_show_all_runs_and_name_infinite_values():
     held = [np.mean([rows[k].values.get("held", False) for k in indices]) for indices in cases]
     assert [trace.x[0] for trace in share.figure.data] == pytest.approx([100 * x for x in held], abs=1e-9)
     assert sum(len(trace.x) for trace in drift.figure.data) == len(rows) - 1
-    assert "the value is infinite: 1 of 24 runs" in drift.caption
+    assert "1 of 24 are infinite" in drift.caption
 
 
 def test_tuning_plot_shows_each_response_and_the_goal():
@@ -108,3 +112,38 @@ def test_payload_report_shows_the_interval_of_the_mass():
     other = next(one for one in result.estimates if one.link == "insertion_link")
     page = payload_page(replace(result, payload=other, link=other.link), ORIGIN)
     assert page.level == "warning" and page.subtitle.startswith("No payload found on insertion_link")
+
+
+@pytest.fixture
+def gc_file(tmp_path, monkeypatch):
+    """Name of a gravity-compensation file in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtml"))
+    dvrk.export_model(model, "gc-MTML.json", "dvrk-gc", tolerance=1.0)
+    return "gc-MTML.json"
+
+
+def test_command_writes_report_with_provenance(gc_file, capsys):
+    words = ["compare-gc", gc_file, "--arm", "mtml", "--report", "report.html"]
+    assert main(words) == 0
+    assert capsys.readouterr().out.endswith("wrote report.html: report\n")
+    html = Path("report.html").read_text()
+    assert f"dvrk-drake {' '.join(words)}" in html
+    assert hashlib.sha256(Path(gc_file).read_bytes()).hexdigest() in html
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("report.pdf", "--report writes HTML; the name of the file must end in .html"),
+        ("old.html", "already exists. Choose another file, or replace it with --overwrite."),
+        ("missing/report.html", "cannot be written: its folder does not exist"),
+    ],
+)
+def test_report_path_is_checked_before_the_work(gc_file, path, message, capsys):
+    Path("old.html").write_text("old")
+    assert main(["compare-gc", gc_file, "--arm", "mtml", "--report", path]) == 2
+    output = capsys.readouterr()
+    assert not output.out and message in refusal(output.err)
+    assert sorted(file.name for file in Path().iterdir()) == [gc_file, "old.html"]
+    assert Path("old.html").read_text() == "old"
