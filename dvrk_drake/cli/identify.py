@@ -31,6 +31,7 @@ from dvrk_drake.cli.support import (
     print_notes,
     print_warnings,
     print_written,
+    quiet_drake,
     write_json,
 )
 from dvrk_drake.errors import ModelError
@@ -123,6 +124,8 @@ def _write_report(
         print("--report FILE.html writes plots, parameters with intervals and a 3D view of the recording.", flush=True)
         return
     from dvrk_drake.reports.html.identification import identification_page
+
+    quiet_drake()
 
     def page(provenance: Provenance) -> Page:
         return identification_page(result, provenance, model_path=model, file_options=file.as_text(), saved=saved)

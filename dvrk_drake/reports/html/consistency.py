@@ -76,7 +76,7 @@ def link_table(links: Sequence[LinkInertia], nominal: Sequence[LinkInertia], box
                 f"{link.parameters[0]:.4g}",
                 f"{sdf.parameters[0]:.4g}",
                 ", ".join(f"{value:.2g}" for value in eigenvalues),
-                ", ".join(f"{1e3 * x + 0.0:.0f}" for x in com),
+                ", ".join(f"{round(1e3 * x)}" for x in com),
                 "" if box is None else _box(box),
                 _result(link, sdf, box, float(eigenvalues[0])),
             )

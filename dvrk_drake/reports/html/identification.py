@@ -165,7 +165,7 @@ def _efforts(efforts: Efforts) -> Section:
     if isinstance(efforts, MotionEfforts):
         figure, drawn = efforts_over_time(efforts)
         cut_off = efforts.grid.settings.effort_cut_off
-        caption = f"Efforts of the actuators after low-pass filtering at {cut_off:.3g} Hz. {drawn}"
+        caption = f"Efforts of the actuators after low-pass filtering at {cut_off:.3g} Hz"
         grid, tau = efforts.grid, efforts.recording.in_joint_coordinates(arm).measured_effort()
         on_grid = np.column_stack([np.interp(grid.t, grid.row_times, x) for x in tau.T])
         view = _view(efforts, grid.t - grid.row_times[0], grid.q, on_grid)
@@ -173,14 +173,15 @@ def _efforts(efforts: Efforts) -> Section:
     else:
         poses = efforts.recording.in_joint_coordinates(arm)
         view = _view(efforts, np.arange(len(poses), dtype=float), poses.q, poses.measured_effort())
-        caption = "Holding effort of each pose. The 3D view shows one pose per second."
+        drawn = "The 3D view shows one pose per second. Excluded efforts beyond the axes are drawn at their edge."
+        caption = "Holding effort of each pose"
         scatter = "Predicted against measured effort of each pose, without excluded measurements"
         blocks = [
             *view,
             Plot(efforts_of_poses(efforts), caption, time=True),
             Plot(predicted_over_measured(efforts), scatter),
         ]
-    return Section(title, blocks, note=_EXPLANATION[efforts.judged])
+    return Section(title, blocks, note=f"{_EXPLANATION[efforts.judged]} {drawn}")
 
 
 _EXPLANATION = {

@@ -207,8 +207,8 @@ def coverage_table(result: Result, q: NDArray[np.float64], v: NDArray[np.float64
             cells += [f"{np.sqrt(np.mean(v[:, j] ** 2)):.3g}", f"{np.abs(v[:, j]).max():.3g}"]
         rows.append(tuple(cells))
     header = ("joint", "unit", "position limits", "recorded", "covered")
-    speeds = () if v is None else ("RMS speed [1/s]", "peak speed [1/s]")
-    note = "" if v is None else "The arm file states no speed limits, so the speeds have no share."
+    speeds = () if v is None else ("RMS speed [unit/s]", "peak speed [unit/s]")
+    note = "" if v is None else "The arm file states no speed limits, so the table contains no shares of the speeds."
     return Table((*header, *speeds), rows, caption="Positions and speeds of the joints in the recording", note=note)
 
 

@@ -19,6 +19,8 @@ from dvrk_drake.reports.html.page import Block, Cell, Table, Verdict
 #: Ratio of half the width of a 95 % interval to the standard error of a normal distribution.
 INTERVAL = 1.96
 _UNITS = dict(zip(PARAMETER_NAMES, ("kg", *3 * ["kg m"], *6 * ["kg m²"]), strict=True))
+#: Largest absolute value that is considered a rounding error [kg, kg m, kg m^2].
+_ROUNDING = 1e-13
 _HEADER = ("estimate", "95 % interval", "SDF")
 _NOTE = (
     "The intervals describe the scatter of the measurements. They do not include errors of the kinematics or of the "
@@ -34,13 +36,22 @@ def parameter_tables(model: IdentifiedModel) -> list[Block]:
     arm = model.arm.with_gravity(section.gravity_expected or section.gravity)
     regressor = DynamicRegressor(arm)
     return [
-        _base_parameters(section, regressor),
+        *_base_parameters(section, regressor),
         *_correlations(section),
         _links(section, regressor),
         _rotors(section, regressor),
         *_effects(arm, section.effects),
         _all_link_parameters(section, regressor),
     ]
+
+
+def _estimate(value: float, standard_error: float) -> tuple[str, str]:
+    return f"{value:.4g}", interval(value, standard_error)
+
+
+def _number(value: float) -> str:
+    """Returns a value as text, "0" if it is a rounding error."""
+    return f"{value:.4g}" if abs(value) > _ROUNDING else "0"
 
 
 def interval(value: float, standard_error: float) -> str:
@@ -59,9 +70,8 @@ def _gravity_parameters(model: IdentifiedModel) -> Table:
     rows = [
         (
             p.name,
-            f"{p.value:.4g}",
-            interval(p.value, p.standard_error),
-            f"{nominal:.4g}",
+            *_estimate(p.value, p.standard_error),
+            _number(nominal),
             _unit(unit),
             _distinguishable(p),
         )
@@ -74,47 +84,45 @@ def _gravity_parameters(model: IdentifiedModel) -> Table:
         rows,
         caption="Base parameters of gravity. They are the combinations of masses and centres of mass that holding "
         "torques determine.",
-        note=f"Poses determine {rank} base parameters (condition number {provenance.condition_number:.3g}). {_NOTE}",
+        note=f"Poses determine {rank} base parameters (condition number {provenance.condition_number:.3g}). Weakly: "
+        f"the interval contains 0. {_NOTE}",
     )
 
 
 def _distinguishable(estimate: object) -> Verdict:
     if getattr(estimate, "distinguishable", False):
         return Verdict("yes", "good")
-    return Verdict("weakly", "warning", "the interval contains 0")
+    return Verdict("weakly", "warning", "contains 0")
 
 
-def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> Table:
+def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> list[Block]:
     base = derive_base_parameters(regressor, coupled_rotors=False)
     B = base.combination
     nominal = dict(zip(base.base.names, B @ regressor.values[: B.shape[1]], strict=True))
-    rows: list[tuple[Cell, ...]] = []
+    identifiable: list[tuple[Cell, ...]] = []
+    others: list[tuple[Cell, ...]] = []
     for p in section.base_parameters:
-        identifiable = Verdict("yes", "good")
+        sdf = _number(nominal[p.name]) if p.name in nominal else ""
+        row = (p.name, *_estimate(p.value, p.standard_error), sdf, _unit(p.unit), f"{p.identifiability:.2f}")
         if p.identifiability < MIN_IDENTIFIABILITY:
-            identifiable = Verdict("no", "bad", "the value comes from the SDF")
+            others.append(row)
         elif abs(p.value) < INTERVAL * p.standard_error:
-            identifiable = Verdict("weakly", "warning", "the interval contains 0")
-        sdf = f"{nominal[p.name]:.4g}" if p.name in nominal else ""
-        rows.append(
-            (
-                p.name,
-                f"{p.value:.4g}",
-                interval(p.value, p.standard_error),
-                sdf,
-                _unit(p.unit),
-                f"{p.identifiability:.2f}",
-                identifiable,
-            )
-        )
-    count = sum(p.identifiability >= MIN_IDENTIFIABILITY for p in section.base_parameters)
-    return Table(
-        ("base parameter", *_HEADER, "unit", "identifiability", "identifiable"),
-        rows,
-        caption=f"Base parameters of the dynamics: {count} of {len(rows)} are identifiable from this motion.",
-        note="Identifiability: reduction of the variance relative to the prior, from 0 (value of the SDF) to 1 (value "
-        f"of the recording). {_NOTE}",
+            identifiable.append((*row, Verdict("weakly", "warning", "contains 0")))
+        else:
+            identifiable.append((*row, Verdict("yes", "good")))
+    header = ("base parameter", *_HEADER, "unit", "identifiability")
+    count = f"{len(identifiable)} of {len(section.base_parameters)} base parameters of the dynamics"
+    note = (
+        "Identifiability: reduction of the variance relative to the prior, from 0 (value of the SDF) to 1 (value of "
+        f"the recording). Weakly: the interval contains 0. {_NOTE}"
     )
+    blocks: list[Block] = [
+        Table((*header, "identifiable"), identifiable, caption=f"{count} are identifiable from this motion", note=note)
+    ]
+    if others:
+        caption = f"{len(others)} base parameters that are not identifiable. Their values come from the SDF."
+        blocks.append(Table(header, others, caption=caption, collapsed=True))
+    return blocks
 
 
 def _correlations(section: DynamicSection) -> list[Block]:
@@ -143,8 +151,7 @@ def _links(section: DynamicSection, regressor: DynamicRegressor) -> Table:
         rows.append(
             (
                 link.link,
-                f"{mass:.4g}",
-                interval(mass, error),
+                *_estimate(mass, error),
                 f"{nominal.parameters[0]:.4g}",
                 _position(com),
                 _position(of_sdf),
@@ -165,8 +172,7 @@ def _rotors(section: DynamicSection, regressor: DynamicRegressor) -> Table:
     rows = [
         (
             r.actuator,
-            f"{r.value:.3g}",
-            interval(r.value, r.standard_error),
+            *_estimate(r.value, r.standard_error),
             f"{sdf.value:.3g}",
             _unit("kg" if slides else "kg m²"),
         )
@@ -189,8 +195,7 @@ def _effects(arm: Arm, effects: list[DriveEffect]) -> list[Block]:
                 e.coordinate,
                 e.kind,
                 scale,
-                f"{e.coefficient:.3g}",
-                interval(e.coefficient, e.standard_error),
+                *_estimate(e.coefficient, e.standard_error),
                 _unit(unit),
             )
         )
@@ -201,7 +206,7 @@ def _effects(arm: Arm, effects: list[DriveEffect]) -> list[Block]:
 
 def _all_link_parameters(section: DynamicSection, regressor: DynamicRegressor) -> Table:
     rows = [
-        (link.link, name, f"{value:.4g}", interval(value, error), f"{sdf:.4g}", _unit(_UNITS[name]))
+        (link.link, name, *_estimate(value, error), _number(sdf), _unit(_UNITS[name]))
         for link, nominal in zip(section.links, regressor.links, strict=True)
         for name, value, error, sdf in zip(
             PARAMETER_NAMES, link.parameters, link.standard_errors or 10 * [0.0], nominal.parameters, strict=True

@@ -99,10 +99,17 @@ def efforts_of_poses(efforts: PoseEfforts) -> go.Figure:
             use = efforts.usable[:, j]
             figure.add_trace(_dots(name, poses[use], values[use, j], first=j == 0), row=j + 1, col=1)
         left_out = efforts.drawn[:, j] & ~efforts.usable[:, j]
-        excluded = _dots("excluded", poses[left_out], efforts.measured[left_out, j], first=j == 0)
-        excluded.text = [_reason(efforts.excluded, int(row), j) for row in poses[left_out]]
-        excluded.hovertemplate = "%{y:.4g} at pose %{x}: %{text}"
+        lower, upper = _range(efforts, j)
+        values = efforts.measured[left_out, j]
+        excluded = _dots("excluded", poses[left_out], np.clip(values, lower, upper), first=j == 0)
+        reasons = [_reason(efforts.excluded, int(row), j) for row in poses[left_out]]
+        excluded.text = [
+            f"{value:.4g} at pose {row}: {why}"
+            for value, row, why in zip(values, poses[left_out], reasons, strict=True)
+        ]
+        excluded.hovertemplate = "%{text}"
         figure.add_trace(excluded, row=j + 1, col=1)
+        figure.update_yaxes(range=[lower, upper], row=j + 1, col=1)
         figure.update_yaxes(title_text=f"[{effort_unit(arm, j)}]", row=j + 1, col=1)
     figure.update_xaxes(title_text="pose", row=n, col=1)
     figure.update_layout(height=height)
@@ -156,6 +163,15 @@ def residuals_over_position(efforts: PoseEfforts) -> tuple[go.Figure, str]:
             residuals = efforts.residuals[use, j]
             panels.append((joint_label(arm, j), axis, effort_unit(arm, j), efforts.recording.q[use, j], residuals))
     return binned_residuals(panels, columns=min(3, arm.num_joints))
+
+
+def _range(efforts: PoseEfforts, joint: int) -> tuple[float, float]:
+    """Returns the range of the axis of a joint. It contains all efforts except excluded ones."""
+    use = efforts.usable[:, joint]
+    shown = [efforts.measured[use, joint], *(values[use, joint] for values in efforts.predicted.values()), [0.0]]
+    values = np.concatenate(shown)
+    margin = 0.08 * (float(np.ptp(values)) or 1e-3)
+    return float(values.min()) - margin, float(values.max()) + margin
 
 
 def _dots(name: str, x: NDArray, y: NDArray[np.float64], first: bool) -> go.Scatter:
