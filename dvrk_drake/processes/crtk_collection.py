@@ -21,6 +21,7 @@ from dvrk_drake.recordings.arm_bag import joint_state_topics
 from dvrk_drake.recordings.mcap_writer import GrowingMcap, Topic
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.ros_bag import JOINT_STATE
+from dvrk_drake.systems.ros.discovery import wait_unless_stopped
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
@@ -187,7 +188,8 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None, dialog: Dialog) -> Crt
     """Returns a client of an arm that is enabled and homed.
 
     Raises:
-        DvrkDrakeError: The arm is not found or not ready, or another process could move it.
+        DvrkDrakeError: The arm is not found or not ready, another process could move it, or `dialog.stopped` returns
+            true.
     """
     from dvrk_drake.systems.ros.crtk_client import connect_client
 
@@ -198,14 +200,15 @@ def _connect(ros: RosDomain, arm: Arm, topic: str | None, dialog: Dialog) -> Crt
         return not client.not_ready_reason
 
     # The first state that arrives may be an older one, because the topic is latched.
-    if not ros.wait_until(is_ready, _STATES):
+    what = f"the connection to {client.namespace}"
+    if not wait_unless_stopped(ros, is_ready, _STATES, dialog.stopped, what):
         raise CollectionError(f"{client.namespace}: {client.not_ready_reason}. Enable and home the arm at its console")
 
     def is_measured() -> bool:
         client.receive()
         return client.measurement is not None and not client.measurement.problem
 
-    if not ros.wait_until(is_measured, _FIRST):
+    if not wait_unless_stopped(ros, is_measured, _FIRST, dialog.stopped, what):
         assert client.measurement is not None
         raise CollectionError(client.measurement.problem)
     return client

@@ -24,7 +24,7 @@ class Observer:
         self.listens, self.ended = threading.Event(), threading.Event()
         self.thread = threading.Thread(target=self.listen, args=(name, url), daemon=True)
         self.thread.start()
-        assert self.listens.wait()
+        assert self.listens.wait(TIMEOUT)
         self.running.add(self)
 
     def end(self):

@@ -53,7 +53,7 @@ def start_simulated_arm(arm, name, rate=RATE, output=subprocess.DEVNULL):
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(TIMEOUT)
         process.kill()
-        process.wait()
+        process.wait(TIMEOUT)
 
 
 class Observer:

@@ -140,7 +140,7 @@ class Console:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(20)
             self.process.kill()
-        self.process.communicate(timeout=TIMEOUT)
+        self.process.wait(TIMEOUT)
         # After `kill -9` of its parent, the console continues.
         with contextlib.suppress(OSError):
             if b"dvrk_console" in Path(f"/proc/{self.pid}/cmdline").read_bytes():
@@ -176,11 +176,20 @@ def start_console(arm, folder, *, rate=1000.0, motion=False, gravity_compensatio
     if domain is not None:
         environment["ROS_DOMAIN_ID"] = str(domain)
     command = [sys.executable, *script, arm, *options]
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    line = process.stdout.readline()
-    found = re.search(r"console pid (\d+)", line)
-    assert found, f"the dVRK console did not start: {line}{process.communicate(timeout=TIMEOUT)[0]}"
-    console = Console(arm, process, int(found[1]), events, RosDomain(domain))
+    # A pipe that nobody reads would stop the process when it is full.
+    output = Path(folder) / f"{arm}_process.log"
+    with output.open("w") as stream:
+        process = subprocess.Popen(command, env=environment, stdout=stream, stderr=subprocess.STDOUT)
+
+    def pid():
+        return re.search(r"console pid (\d+)", output.read_text(errors="replace"))
+
+    try:
+        wait_until(pid, "start of the dVRK console", process)
+    except AssertionError as error:
+        process.kill()
+        raise AssertionError(f"{error}: {output.read_text(errors='replace')}") from None
+    console = Console(arm, process, int(pid()[1]), events, RosDomain(domain))
     try:
         wait_until(console.state, "operating state", process)
         wait_until(lambda: "ready" in console.events(), "start", process)

@@ -30,6 +30,7 @@ import time
 from pathlib import Path
 
 import pytest
+from waiting import within_time_limit
 
 INSIDE = "DVRK_DRAKE_OWN_NETWORK"
 PROCESSES = ("--pid", "--mount-proc", "--kill-child")
@@ -162,4 +163,4 @@ def end(process, number=signal.SIGKILL):
     """Ends a process and returns its output."""
     process.send_signal(number)
     process.wait(60)
-    return process.stdout.read()
+    return within_time_limit(process.stdout.read, "end of the output")

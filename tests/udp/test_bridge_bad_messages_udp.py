@@ -12,7 +12,7 @@ import pytest
 from own_network import inside, outside, run_inside
 from ros_bridge import CommandMonitor, Operator, start_bridge, start_controller, wait_for_line
 from ros_publisher import DOMAIN_FILE
-from waiting import wait_until
+from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
@@ -68,7 +68,7 @@ class BadArm:
 
     def end(self):
         self.ended.set()
-        self.thread.join()
+        self.thread.join(TIMEOUT)
 
 
 @pytest.fixture

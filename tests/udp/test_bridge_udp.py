@@ -64,9 +64,14 @@ def wait_for_mode(console, mode, *processes):
 
 
 def start_efforts(arm, folder, console, *options):
-    """Returns a bridge and a controller whose efforts act."""
+    """Returns a bridge and a controller whose efforts act. Ends them if the efforts do not act."""
     bridge, controller = start_bridge(arm, folder, *options), start_controller(arm)
-    wait_for_efforts(console, bridge)
+    try:
+        wait_for_efforts(console, bridge)
+    except BaseException:
+        bridge.end()
+        controller.end()
+        raise
     return bridge, controller
 
 
@@ -253,5 +258,6 @@ def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
             assert not [name for name, *_ in monitor.receive() if name != "hold"]
             before = len(bridge.output())
             operator.reset(bridge)
-            wait_until(lambda: monitor.first(["servo_jp"], 0), "commands after the reset", bridge)
+            # The guard may hold the arm for less time than DDS needs to discover the monitor.
+            wait_until(lambda: monitor.first(["servo_jp", "servo_jf"], 0), "commands after the reset", bridge)
             wait_for_efforts(console, bridge, before)

@@ -14,7 +14,7 @@ from command_output import refusal
 from dvrk_console import start_console
 from own_network import end, inside, outside, run_inside, start
 from ros_publisher import DOMAIN_FILE
-from waiting import TIMEOUT, wait_until
+from waiting import TIMEOUT, wait_until, within_time_limit
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -157,7 +157,7 @@ def test_interruption_ends_the_search_for_the_arm(command, tmp_path):
     process = start(*COMMAND, command, *options[command], "--arm", "mtml", "--domain", "8")
     lines = []
     while not lines or lines[-1] != "searching for /MTML/measured_js in ROS domain 8\n":
-        lines.append(process.stdout.readline())
+        lines.append(within_time_limit(process.stdout.readline, "a line"))
         assert lines[-1], lines
     output = end(process, signal.SIGINT)
     assert output == "dvrk-drake: error: ROS domain 8: the search for /MTML/measured_js was stopped\n"
@@ -197,7 +197,7 @@ def test_closed_terminal_holds_the_arm(tmp_path, action):
             process.wait(TIMEOUT)
         finally:
             process.kill()
-            process.wait()
+            process.wait(TIMEOUT)
     assert len(read_recording(tmp_path / "p_1.mcap", MTML)) > 0
 
 

@@ -369,7 +369,7 @@ def connect_bridge(
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         report: Function that is called with one line for each change of the state.
-        stopped: Function that returns whether to end the search for the arm.
+        stopped: Function that returns whether to end the connection, e.g. after Ctrl-C.
         polled: Whether the caller calls `CrtkBridge.update` all the time; see `CrtkClient`.
 
     Returns:
@@ -382,9 +382,13 @@ def connect_bridge(
     ros = open_ros_domain(domain)
     commands = ("servo_jp", "servo_jf", "hold")
     client = connect_client(ros, arm, topic, commands, report=report, stopped=stopped, polled=polled)
-    deadman = DeadmanProcess(client.namespace, domain)
+    deadman = DeadmanProcess(client.namespace, domain, stopped)
     report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
-    return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)
+    try:
+        return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)
+    except BaseException:
+        deadman.close()
+        raise
 
 
 def compile_guard(arm: Arm, driver: DvrkDriver) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
-from dvrk_drake.systems.ros.discovery import find_topic
+from dvrk_drake.systems.ros.discovery import find_topic, wait_unless_stopped
 from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement, JointStateReader, shown
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
@@ -321,18 +321,19 @@ def connect_client(
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         commands: Names of the commands to which the arm must subscribe, see `CrtkClient.unheard_commands`.
         report: Function that is called with one line if the search for the arm takes longer than a second.
-        stopped: Function that returns whether to end the search.
+        stopped: Function that returns whether to end the search and the connection, e.g. after Ctrl-C.
         polled: See `CrtkClient`.
 
     Raises:
         RecordingError: See `find_topic`.
         ControllerError: Another process could move the arm, no operating state or measurement arrives, the joints do
-            not fit, or no process receives the commands.
+            not fit, no process receives the commands, or the connection was stopped.
     """
     namespace = find_arm(domain, arm, topic, report=report, stopped=stopped)
+    what = f"the connection to {namespace}"
     # The publishers of a new client would stop a bridge that already runs. So their check comes first. DDS considers a
     # killed process as present for about a second.
-    if not domain.wait_until(lambda: not other_publishers(domain, arm, namespace), _ENDED):
+    if not wait_unless_stopped(domain, lambda: not other_publishers(domain, arm, namespace), _ENDED, stopped, what):
         raise ControllerError(
             f"another process publishes {', '.join(other_publishers(domain, arm, namespace))}. Only one process may "
             "command an arm: end the other one, e.g. another bridge, teleoperation or a script"
@@ -349,7 +350,7 @@ def connect_client(
         has_messages = client.operating_state is not None and client.measurement is not None
         return has_messages and not problem() and not client.unheard_commands(commands)
 
-    if not domain.wait_until(is_complete, _FIRST):
+    if not wait_unless_stopped(domain, is_complete, _FIRST, stopped, what):
         messages = {"measured_js": client.measurement, "operating_state": client.operating_state}
         if missing := [name for name, message in messages.items() if message is None]:
             raise ControllerError(f"no message on {namespace}/{missing[0]} within {_FIRST:g} s. Is it a dVRK?")

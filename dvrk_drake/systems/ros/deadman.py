@@ -171,15 +171,16 @@ class DeadmanProcess:
         pid: Identifier of the process.
     """
 
-    def __init__(self, namespace: str, domain: int | None) -> None:
+    def __init__(self, namespace: str, domain: int | None, stopped: Callable[[], bool] = lambda: False) -> None:
         """Starts the process and waits until it receives commands; see `Deadman`.
 
         Args:
             namespace: Namespace of the topics, e.g. "/MTML".
             domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+            stopped: Function that returns whether to end the start, e.g. after Ctrl-C. It is called every 0.05 s.
 
         Raises:
-            DvrkDrakeError: The process did not start.
+            DvrkDrakeError: The process did not start, or its start was stopped. It has ended.
         """
         command = [sys.executable, "-m", __name__, namespace, "" if domain is None else str(domain)]
         # A session of its own, so that Ctrl-C in a terminal ends only the bridge.
@@ -187,21 +188,34 @@ class DeadmanProcess:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
         )
         self.pid, self._is_blind = self._process.pid, False
-        assert self._process.stdout is not None
-        started = select.select([self._process.stdout], [], [], _START)[0]
-        if not started or not self._is_ready():
-            self._process.kill()
-            self.close()
+        is_ready = False
+        try:
+            end = time.monotonic() + _START
+            while not (has_line := self._has_line(_CONNECTION)) and not stopped() and time.monotonic() < end:
+                pass
+            is_ready = has_line and self._is_ready() and not stopped()
+        finally:
+            if not is_ready:
+                # The bridge has not commanded the arm. So the process must end without `hold`.
+                self._process.kill()
+                self.close()
+        if stopped():
+            raise DvrkDrakeError("the start of the deadman process was stopped; no command was sent to the arm")
+        if not is_ready:
             raise DvrkDrakeError("the deadman process did not start. Without it, the bridge commands no arm")
 
     def problem(self) -> str:
         """Returns a text if the process has ended or receives no commands, or "" while it can hold the arm."""
         if self._process.poll() is not None:
             return "the deadman process has ended. Restart the bridge"
-        assert self._process.stdout is not None
-        if select.select([self._process.stdout], [], [], 0.0)[0]:
+        if self._has_line(0.0):
             self._is_blind = not self._is_ready()
         return "the deadman process is not connected to the topics of the arm" if self._is_blind else ""
+
+    def _has_line(self, seconds: float) -> bool:
+        """Waits at most `seconds` [s] until the process has written a line or ended. Returns whether it has."""
+        assert self._process.stdout is not None
+        return bool(select.select([self._process.stdout], [], [], seconds)[0])
 
     def _is_ready(self) -> bool:
         """Returns whether the last line that the process has written is `_READY`."""

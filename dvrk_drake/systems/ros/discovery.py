@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from dvrk_drake.errors import RecordingError
+from dvrk_drake.errors import ControllerError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.topic_choice import MEASURED_JS, check_namespace, choose_topic, fitting_topics
 
@@ -79,3 +79,24 @@ def find_topic(
             "and the network"
         )
     return choose_topic(domain.name, arm, topic, {name: name for name in topics})
+
+
+def wait_unless_stopped(
+    domain: RosDomain, condition: Callable[[], bool], seconds: float, stopped: Callable[[], bool], what: str
+) -> bool:
+    """Waits until a condition is true, at most `seconds` [s]. Returns whether it is true.
+
+    Args:
+        domain: ROS domain whose messages may change the condition.
+        condition: Condition, checked after each message and at least every 0.02 s.
+        seconds: Longest time to wait [s].
+        stopped: Function that returns whether to end the wait, e.g. after Ctrl-C. It is called as often as `condition`.
+        what: Purpose of the wait, for the message.
+
+    Raises:
+        ControllerError: The wait was stopped.
+    """
+    is_met = domain.wait_until(lambda: stopped() or condition(), seconds)
+    if stopped():
+        raise ControllerError(f"{what} was stopped; no command was sent to the arm")
+    return is_met

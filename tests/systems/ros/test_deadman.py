@@ -13,7 +13,7 @@ pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.systems.ros import confirmation, deadman
-from dvrk_drake.systems.ros.deadman import Deadman
+from dvrk_drake.systems.ros.deadman import Deadman, DeadmanProcess
 
 ARM = "/MTML"
 #: Number of messages until hold is confirmed.
@@ -217,6 +217,27 @@ def test_hold_that_cannot_be_published_is_repeated(monkeypatch):
     bench.send("servo_jf", 1)
     assert bench.run(lambda: bench.hold.published > 4) == 3 + TWICE
     assert "published hold at" in bench.lines[0]
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt])
+def test_stopped_start_leaves_no_process(monkeypatch, error):
+    started, calls = [], []
+
+    def start(command, **options):
+        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"], **options))
+        return started[0]
+
+    def stopped():
+        calls.append(None)
+        if error is not None:
+            raise error
+        return len(calls) > 1
+
+    monkeypatch.setattr(deadman, "subprocess", SimpleNamespace(Popen=start, PIPE=subprocess.PIPE))
+    with pytest.raises(error or DvrkDrakeError) as raised:
+        DeadmanProcess(ARM, None, stopped)
+    assert error or "the start of the deadman process was stopped; no command was sent" in str(raised.value)
+    assert started[0].poll() is not None
 
 
 def test_changes_of_the_connection_are_reported():
