@@ -22,6 +22,8 @@ WORLD = "world"
 _DH_FRAME = re.compile(r"dh_\d+")
 #: Elements of a URDF for programs that draw the arm.
 _DRAWN = ("link", "joint")
+#: Colour of the links (red, green, blue, alpha), which is visible on a white and on a black background.
+_COLOR = "0.36 0.45 0.56 1"
 
 
 class FrameTransform(NamedTuple):
@@ -105,6 +107,8 @@ def drawable_urdf(arm: Arm) -> str:
     for element in list(robot):
         if element.tag not in _DRAWN:
             robot.remove(element)
+    for visual in robot.iter("visual"):
+        ElementTree.SubElement(ElementTree.SubElement(visual, "material", name="link"), "color", rgba=_COLOR)
     for element, attribute in (
         *((link, "name") for link in robot.iter("link")),
         *((end, "link") for joint in robot.iter("joint") for end in joint if end.tag in ("parent", "child")),
