@@ -154,6 +154,11 @@ def test_printed_page_has_text_tables_and_plots(opened, tmp_path):
         pytest.skip("needs pdftotext (apt-get install poppler-utils)")
     for part in ("MTML & <friends>", "do not use", "0.1 < 0.2", "shoulder", "effort [N m]", "SHA-256", "validate"):
         assert part in text
+    # The plots have their former size again.
+    opened.wait_for(
+        "[...document.querySelectorAll('.canvas')].every((c) => Math.abs(c._fullLayout.width - c.clientWidth) < 2)"
+    )
+    assert opened.page.evaluate("document.querySelector('[data-time]')._fullLayout.height") == 480
     # The frame of the 3D view does not print, so its picture does.
     assert opened.page.evaluate(
         """() => {

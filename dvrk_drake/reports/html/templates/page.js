@@ -1,8 +1,8 @@
 "use strict";
 // Draws the plots, and links the time cursor of the plots with the animations of Meshcat.
 (async function () {
-  // Width of the text of a printed A4 page with margins of 14 mm [px].
-  const PRINT_WIDTH = 680;
+  // Width of the text of a printed A4 page with margins of 14 mm, and height of a plot with its caption [px].
+  const PRINT_WIDTH = 680, PRINT_HEIGHT = 920;
   const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
 
   // Returns the text of an element whose content is Base64 of gzip.
@@ -168,7 +168,10 @@
   // Plots have a width in pixels, and a frame may print empty.
   window.addEventListener("beforeprint", () => {
     document.querySelectorAll("details").forEach((details) => { details.open = true; });
-    plots.forEach((plot) => Plotly.relayout(plot, { width: PRINT_WIDTH }));
+    for (const plot of plots) {
+      plot.screenHeight = plot.layout.height;
+      Plotly.relayout(plot, { width: PRINT_WIDTH, height: Math.min(plot.screenHeight, PRINT_HEIGHT) });
+    }
     for (const view of views) {
       const viewer = viewerOf(view), printed = view.figure.querySelector(".printed");
       if (!viewer) continue;
@@ -179,6 +182,8 @@
       printed.getContext("2d").drawImage(picture, 0, 0);
     }
   });
-  window.addEventListener("afterprint", () => plots.forEach((plot) => Plotly.relayout(plot, { width: null, autosize: true })));
+  window.addEventListener("afterprint", () => {
+    for (const plot of plots) Plotly.relayout(plot, { width: null, height: plot.screenHeight, autosize: true });
+  });
   document.documentElement.dataset.ready = "yes";
 })();
