@@ -101,7 +101,8 @@ def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
     rms, intervals = _errors_and_intervals({"zero torque": tau, label: tau - predicted}, usable)
     if validation.excluded:
         squares = np.where(validation.measured, (tau - predicted) ** 2, np.nan)
-        rms["model, with excluded measurements"] = _rms_of_squares(squares)
+        differs = np.any(validation.measured & ~usable, axis=0)
+        rms["model, with excluded measurements"] = np.where(differs, _rms_of_squares(squares), np.nan)
     name = Path(recording.source).name
     plot_torque_error(
         folder / "torque_error.png",

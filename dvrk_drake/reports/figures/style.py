@@ -127,7 +127,3 @@ def save_figure(figure: Figure, path: Path) -> None:
     with atomic_write(path, "wb") as stream:
         figure.savefig(stream, dpi=DPI, format="png")
     plt.close(figure)
-
-
-#: Former colours, until all figures use the roles.
-MODEL_COLOUR, ZERO_COLOUR, MEASURED_COLOUR = "#397bdc", "#c4c8cf", "#1f1f1f"

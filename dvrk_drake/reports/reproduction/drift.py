@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,11 +16,22 @@ from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.experiments.tuning.model_based import friction
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
-from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, save_figure
+from dvrk_drake.reports.figures.colours import FITTED, LIMIT, MEASURED, REFERENCE
+from dvrk_drake.reports.figures.style import (
+    add_legend,
+    joint_title,
+    panel_grid,
+    position_unit,
+    save_figure,
+    set_title,
+)
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
 
 #: Interval over which a drift rate is averaged [s].
 RATE_TIME = 1.0
+#: Smallest drawn drift [rad; m]. Smaller drifts are drawn at this value.
+SMALLEST_DRIFT = 1e-5
+_BAND_LABEL = f"limit for a held joint: {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm)"
 _UNPUBLISHED = ("-",)
 
 
@@ -300,8 +310,9 @@ def _plots(
     """Writes <name>_time.png and <name>_distribution.png, and returns the captions by file name."""
     wrist = np.abs(paper.final[:, 4:]).max(axis=1)
     typical = int(np.argsort(wrist)[len(wrist) // 2])
-    _plot_time(folder / f"{name}_time.png", what, ours.positions[typical], paper.positions[typical], trial)
-    _plot_distribution(folder / f"{name}_distribution.png", what, ours, paper, means)
+    _plot_time(folder / f"{name}_time.png", what, ours, paper, typical, trial)
+    releases = {"the paper's parameters": (REFERENCE, paper), "ours": (FITTED, ours)}
+    plot_largest_drifts(folder / f"{name}_distribution.png", what, releases, means)
     return {
         f"{name}_time.png": f"Drift after release, {what}, at the pose with the median wrist drift of the paper's "
         "parameters",
@@ -309,49 +320,61 @@ def _plots(
     }
 
 
-def _plot_time(
-    path: Path, what: str, ours: NDArray[np.float64], paper: NDArray[np.float64], trial: Sequence[float]
-) -> None:
-    figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained")
-    t = SAMPLE_PERIOD * np.arange(len(ours))
-    for j, ax in enumerate(axes.flat[:7]):
-        ax.axhspan(-BAND[0], BAND[0], color="#dddddd", label="15 mrad")
-        ax.plot(t, paper[:, j] - paper[0, j], color=MEASURED_COLOUR, label="the paper's parameters, simulated")
-        ax.plot(t, ours[:, j] - ours[0, j], color=MODEL_COLOUR, label="ours, simulated")
+def _plot_time(path: Path, what: str, ours: Drifts, paper: Drifts, release: int, trial: Sequence[float]) -> None:
+    arm = ours.arm
+    figure, panels = panel_grid(arm.num_joints, sharex=True)
+    t = SAMPLE_PERIOD * np.arange(ours.positions.shape[1])
+    for j, ax in enumerate(panels):
+        for drifts, colour, label in ((paper, REFERENCE, "the paper's parameters"), (ours, FITTED, "ours")):
+            q = drifts.positions[release, :, j]
+            ax.plot(t, q - q[0], color=colour, label=f"{label}, simulated")
+        for sign in (-1, 1):
+            ax.axhline(sign * BAND[0], color=LIMIT, linestyle="--", linewidth=1.0, label=_BAND_LABEL)
         if j:
-            ax.axhline(trial[j - 1], color="black", linestyle=":", label="published, end of the trial")
-        ax.set_title(_JOINTS[j], fontsize=10)
-        ax.tick_params(labelsize=7)
-        ax.grid(alpha=0.3)
-        ax.set_ylabel("drift [rad]", fontsize=8)
-        ax.set_xlabel("time since release [s]", fontsize=8)
-    axes.flat[7].axis("off")
-    axes.flat[7].legend(*axes.flat[1].get_legend_handles_labels(), loc="center", fontsize=9)
-    figure.suptitle(f"Drift after release, {what}")
+            ax.axhline(trial[j - 1], color=MEASURED, linestyle=":", label="published (measured), end of the trial")
+        ax.set_title(joint_title(arm, j))
+        ax.set_ylabel("drift [rad]")
+        ax.set_xlabel("time since release [s]")
+    set_title(figure, f"Drift after release, {what}: a held joint stays between the dashed lines")
+    add_legend(figure)
     save_figure(figure, path)
 
 
-def _plot_distribution(path: Path, what: str, ours: Drifts, paper: Drifts, means: Sequence[float]) -> None:
-    figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained", sharey=True)
-    for j, ax in enumerate(axes.flat[:7]):
-        for drifts, colour, label in ((paper, MEASURED_COLOUR, "the paper's parameters"), (ours, MODEL_COLOUR, "ours")):
-            sizes = np.sort(np.maximum(drifts.largest[:, j], 1e-5))
+def plot_largest_drifts(
+    path: Path,
+    what: str,
+    releases: Mapping[str, tuple[str, Drifts]],
+    published_means: Sequence[float] | None = None,
+) -> None:
+    """Plots the cumulative distribution of the largest drift of each release, with the same range for all joints.
+
+    Args:
+        path: PNG file to write.
+        what: Condition of the experiment, for the title.
+        releases: Mapping from the name of a model to its colour and its drifts.
+        published_means: Published mean drifts (n - 1,) of all joints but the first [rad].
+    """
+    first = next(iter(releases.values()))[1]
+    arm, band = first.arm, first.arm.per_joint(*BAND)
+    largest = max(float(drifts.largest.max()) for _, drifts in releases.values())
+    figure, panels = panel_grid(arm.num_joints, sharex="all", sharey="all")
+    for j, ax in enumerate(panels):
+        for label, (colour, drifts) in releases.items():
+            sizes = np.sort(np.maximum(drifts.largest[:, j], SMALLEST_DRIFT))
             shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
             ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
-        ax.axvline(BAND[0], color="#8d8d8d", label="15 mrad")
-        if j:
-            ax.axvline(means[j - 1], color="black", linestyle=":", label="published, mean of five trials")
+        ax.axvline(band[j], color=LIMIT, linestyle="--", label=_BAND_LABEL)
+        if published_means is not None and j:
+            ax.axvline(published_means[j - 1], color=MEASURED, linestyle=":", label="published, mean of five trials")
         ax.set_xscale("log")
-        ax.set_xlim(8e-6, 20)  # the range of the roll joint is 15 rad
-        ax.set_title(_JOINTS[j], fontsize=10)
-        ax.tick_params(labelsize=7)
-        ax.grid(alpha=0.3)
-        ax.set_ylabel("cumulative share of poses [%]", fontsize=8)
-        ax.set_xlabel("largest drift [rad]", fontsize=8)
-    axes.flat[7].axis("off")
-    axes.flat[7].legend(*axes.flat[1].get_legend_handles_labels(), loc="center", fontsize=9)
-    figure.suptitle(
-        f"Largest drift of each release, {what}: {len(ours.positions)} poses with ours, {len(paper.positions)} with "
-        "the paper's parameters"
+        ax.set_title(joint_title(arm, j))
+        ax.set_xlabel(f"largest drift [{position_unit(arm, j)}]")
+        ax.set_ylabel("cumulative share [%]")
+    panels[0].set_xlim(0.8 * SMALLEST_DRIFT, 1.5 * max(largest, 10 * SMALLEST_DRIFT))
+    counts = ", ".join(f"{len(drifts.positions)} poses with {label}" for label, (_, drifts) in releases.items())
+    set_title(
+        figure,
+        f"Largest drift of each release, {what}: {counts}\nThe share at the dashed line is the share of held joints",
     )
+    add_legend(figure)
     save_figure(figure, path)

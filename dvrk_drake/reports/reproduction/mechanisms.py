@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib.pyplot as plt
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
-from dvrk_drake.experiments.reproduction.drift_experiment import BAND, Drifts
+from dvrk_drake.experiments.reproduction.drift_experiment import BAND
 from dvrk_drake.experiments.reproduction.mechanisms import (
     POSES,
     PSM_POSES,
@@ -20,7 +17,8 @@ from dvrk_drake.experiments.reproduction.published import PAPER_ARM, TABLE_1
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
-from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
+from dvrk_drake.reports.figures.colours import FITTED, REFERENCE
+from dvrk_drake.reports.reproduction.drift import plot_largest_drifts
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
 
 
@@ -86,7 +84,8 @@ def reproduce_psm(session: ReproductionSession) -> Section:
     psm_nominal = type(psm.model).from_arm(load_arm("psm"))
     psm_nominal.save(nominal_file)
     nominal = session.release("psm", psm.truth, nominal_file, poses, "PSM: releasing the nominal model")
-    _plot(session.folder / _FILE, ours, nominal)
+    releases = {"nominal model": (REFERENCE, nominal), "ours": (FITTED, ours)}
+    plot_largest_drifts(session.folder / _FILE, "PSM", releases)
     names = ours.arm.joint_names
     disabled = [joint.name for joint in psm.model.joints if joint.feedforward_scale == 0.0]
     rows = (
@@ -156,26 +155,3 @@ def _facts() -> ResultTable:
 
 def _instance(plant: MultibodyPlant) -> str:
     return plant.GetModelInstanceName(plant.GetBodyByName("base_link").model_instance())
-
-
-def _plot(path: Path, ours: Drifts, nominal: Drifts) -> None:
-    names, prismatic = ours.arm.joint_names, ours.arm.prismatic
-    figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained", sharey=True)
-    band = ours.arm.per_joint(*BAND)
-    for j, ax in enumerate(axes.flat[: len(names)]):
-        for drifts, colour, label in ((nominal, "#8d8d8d", "nominal model"), (ours, MODEL_COLOUR, "ours")):
-            sizes = np.sort(np.maximum(drifts.largest[:, j], 1e-6))
-            shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
-            ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
-        ax.axvline(band[j], color="black", linestyle=":", label="15 mrad (1.5 mm)")
-        ax.set_xscale("log")
-        ax.set_title(names[j], fontsize=10)
-        ax.set_xlabel(f"largest drift [{'m' if prismatic[j] else 'rad'}]", fontsize=8)
-        ax.set_ylabel("cumulative share of poses [%]", fontsize=8)
-        ax.tick_params(labelsize=7)
-        ax.grid(alpha=0.3)
-    for ax in axes.flat[len(names) :]:
-        ax.axis("off")
-    axes.flat[-1].legend(*axes.flat[0].get_legend_handles_labels(), loc="center", fontsize=9)
-    figure.suptitle(f"PSM: largest drift after release at {len(ours.positions)} random poses")
-    save_figure(figure, path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +22,8 @@ from dvrk_drake.experiments.reproduction.step_response import (
     simulate_paper_controller,
 )
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.reports.figures.style import save_figure
+from dvrk_drake.reports.figures.colours import COMMANDED, SERIES
+from dvrk_drake.reports.figures.style import add_legend, panel_grid, save_figure, set_title
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 
 _FILE = "fig7.png"
@@ -87,7 +87,7 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
         rows,
     )
     shows = (
-        "Step to zero: the paper's controller on the paper's arm (top), ours on the ground-truth arm (bottom); "
+        "Step to zero: ours on the ground-truth arm (top), the paper's controller on the paper's arm (bottom); "
         "right: enlarged"
     )
     finding = (
@@ -103,21 +103,23 @@ def _late(q: NDArray[np.float64], from_time: float | None = None) -> NDArray[np.
 
 
 def _plot(path: Path, faulty: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
-    figure, axes = plt.subplots(2, 2, figsize=(13, 7.5), layout="constrained")
-    for row, (q, label) in enumerate(
-        ((faulty, "the paper's controller on the paper's arm"), (ours, "ours on the ground-truth arm"))
-    ):
+    figure, panels = panel_grid(4, columns=2, height=3.4)
+    names = load_arm(PAPER_ARM).joint_names
+    runs = ((ours, "ours on the ground-truth arm"), (faulty, "the paper's controller on the paper's arm"))
+    for row, (q, label) in enumerate(runs):
         t = PERIOD * np.arange(len(q))
-        for column, ax in enumerate(axes[row]):
-            for j in range(7):
-                ax.plot(t, q[:, j], linewidth=1.1, label=_JOINTS[j], color=f"C{j}")
-            ax.set_title(f"{label}{', enlarged' if column else ''}", fontsize=10)
-            ax.set_xlabel("time [s]", fontsize=8)
-            ax.set_ylabel("position [rad]", fontsize=8)
-            ax.grid(alpha=0.3)
-            ax.tick_params(labelsize=7)
+        for column, ax in enumerate(panels[2 * row : 2 * row + 2]):
+            for j, (joint, name) in enumerate(zip(_JOINTS, names, strict=True)):
+                ax.plot(t, q[:, j], color=SERIES[j], linestyle=("-", "--")[j % 2], label=f"{joint} {name}")
+            ax.axhline(0.0, color=COMMANDED, linestyle=":", label="target")
+            ax.set_title(f"{label}, {t[-1]:.0f} s{', enlarged' if column else ''}")
+            ax.set_xlabel("time [s]")
+            ax.set_ylabel("position [rad]")
             if column:
                 ax.set_ylim(-0.1, 0.1)
-    axes[0, 0].legend(ncols=4, fontsize=8, loc="upper right")
-    figure.suptitle("Fig. 7 reproduced: joint positions in the step to zero")
+    set_title(
+        figure,
+        "Fig. 7 reproduced: joint positions in the step to zero. The oscillation of the paper's controller persists",
+    )
+    add_legend(figure)
     save_figure(figure, path)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.experiments.reproduction.published import FIGURE_4_MEANS, PAPER_ARM, PaperRecordings
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR, save_figure
+from dvrk_drake.reports.figures.colours import HELD_OUT, LIMIT, MEASURED, REFERENCE
+from dvrk_drake.reports.figures.style import add_legend, joint_title, panel_grid, save_figure, set_title
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 
 _FILE = "fig4.png"
@@ -116,27 +116,28 @@ def _plot(
     zero: NDArray[np.float64],
     included: NDArray[np.bool_],
 ) -> None:
-    figure, axes = plt.subplots(3, 2, figsize=(13, 9), layout="constrained", sharex=True)
+    arm = ours.model.arm
+    figure, panels = panel_grid(6, columns=3, height=3.0)
     pose = np.arange(1, len(zero) + 1)
-    for j, ax in zip(range(1, 7), axes.flat, strict=True):
+    for j, ax in enumerate(panels, start=1):
         for values, label, colour, marker in (
-            (zero, "zero torque", "#8d8d8d", "_"),
-            (paper.leave_one_out_residuals, "the paper's least squares", MEASURED_COLOUR, "."),
-            (ours.leave_one_out_residuals, "ours", MODEL_COLOUR, "."),
+            (zero, "zero torque", MEASURED, "_"),
+            (paper.leave_one_out_residuals, "the paper's least squares, leave-one-out", REFERENCE, "s"),
+            (ours.leave_one_out_residuals, "ours, leave-one-out", HELD_OUT, "o"),
         ):
             squared = np.maximum(values[:, j] ** 2, FLOOR)
             use = included[:, j]
-            ax.semilogy(pose[use], squared[use], marker, color=colour, markersize=6, label=label)
-            ax.semilogy(pose[~use], squared[~use], "x", color=colour, markersize=4)
+            ax.semilogy(pose[use], squared[use], marker, color=colour, markersize=3.5, label=label)
+            ax.semilogy(pose[~use], squared[~use], "x", color=colour, markersize=5)
         ax.set_ylim(bottom=FLOOR / 2)
-        ax.set_title(f"J{j + 1} {ours.model.joints[j].name}", fontsize=10)
-        ax.set_ylabel("squared error [(N m)$^2$]", fontsize=8)
-        ax.tick_params(labelsize=7)
-        ax.grid(alpha=0.3)
-    for ax in axes[-1]:
-        ax.set_xlabel("pose", fontsize=8)
-    axes.flat[0].plot([], [], "x", color=ZERO_COLOUR, label="excluded measurement")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
-    figure.suptitle("Fig. 4 reproduced: squared torque error, leave-one-out, recording of the paper")
+        ax.set_title(joint_title(arm, j))
+        ax.set_ylabel("squared error [(N m)$^2$]")
+        ax.set_xlabel("pose")
+    panels[0].plot([], [], "x", color=LIMIT, label="excluded measurement (in the colour of its series)")
+    set_title(
+        figure,
+        f"Fig. 4 reproduced: squared torque error at {len(zero)} poses of the paper. Each pose was not used to fit "
+        "(leave-one-out)",
+    )
+    add_legend(figure)
     save_figure(figure, path)
