@@ -158,7 +158,9 @@ def compare_gc(
         from dvrk_drake.reports.figures.export import plot_compensation
 
         plot_compensation(
-            folder / "compensation.png", comparison, f"Static torque of {Path(file).name} and {origin} over the joint range"
+            folder / "compensation.png",
+            comparison,
+            f"Static torque of {Path(file).name} and of {origin} over the joint range",
         )
         print_written(folder)
     if json is not None:

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from command_output import refusal
+from figure_rules import checked_figures
 from rich.console import Console
 from scipy.optimize import brentq
 
@@ -415,5 +416,6 @@ def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
     print_tuning(console, tuning, verbose=True)
     printed = console.export_text()
     assert all(name in printed for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
-    plot_steps(tmp_path / "steps.png", tuning.comparison)
+    with checked_figures(monkeypatch):
+        plot_steps(tmp_path / "steps.png", tuning.comparison)
     assert (tmp_path / "steps.png").stat().st_size > 10_000

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_output import refusal
+from figure_rules import checked_figures
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import joint_row
@@ -342,7 +343,7 @@ def test_invalid_file_is_rejected_in_one_line(change, message, tmp_path, capsys)
     assert message in error and str(path) in error
 
 
-def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path):
+def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path, monkeypatch):
     model = balanced()
     file = compensation_from_model(model)
     clean = compare_compensation(file, model)
@@ -366,7 +367,8 @@ def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path):
     opposed = compare_compensation(mirrored, model).joints
     assert opposed[1].opposed > 0.8 and opposed[4].opposed > 0.5
     path = tmp_path / "plot.png"
-    plot_compensation(path, found, "test")
+    with checked_figures(monkeypatch):
+        plot_compensation(path, found, "test")
     assert path.read_bytes().startswith(b"\x89PNG")
 
 

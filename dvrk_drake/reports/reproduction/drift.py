@@ -15,6 +15,7 @@ from dvrk_drake.experiments.reproduction.drift_experiment import APPROACH, BAND,
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.experiments.tuning.model_based import friction
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
 from dvrk_drake.reports.figures.colours import FITTED, LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.figures.style import (
@@ -31,7 +32,6 @@ from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, 
 RATE_TIME = 1.0
 #: Smallest drawn drift [rad; m]. Smaller drifts are drawn at this value.
 SMALLEST_DRIFT = 1e-5
-_BAND_LABEL = f"limit for a held joint: {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm)"
 _UNPUBLISHED = ("-",)
 
 
@@ -320,6 +320,11 @@ def _plots(
     }
 
 
+def _band_label(arm: Arm) -> str:
+    length = f" ({1e3 * BAND[1]:.1f} mm)" if np.any(arm.prismatic) else ""
+    return f"limit for a held joint: {1e3 * BAND[0]:.0f} mrad{length}"
+
+
 def _plot_time(path: Path, what: str, ours: Drifts, paper: Drifts, release: int, trial: Sequence[float]) -> None:
     arm = ours.arm
     figure, panels = panel_grid(arm.num_joints, sharex=True)
@@ -329,7 +334,7 @@ def _plot_time(path: Path, what: str, ours: Drifts, paper: Drifts, release: int,
             q = drifts.positions[release, :, j]
             ax.plot(t, q - q[0], color=colour, label=f"{label}, simulated")
         for sign in (-1, 1):
-            ax.axhline(sign * BAND[0], color=LIMIT, linestyle="--", linewidth=1.0, label=_BAND_LABEL)
+            ax.axhline(sign * BAND[0], color=LIMIT, linestyle="--", linewidth=1.0, label=_band_label(arm))
         if j:
             ax.axhline(trial[j - 1], color=MEASURED, linestyle=":", label="published (measured), end of the trial")
         ax.set_title(joint_title(arm, j))
@@ -363,7 +368,7 @@ def plot_largest_drifts(
             sizes = np.sort(np.maximum(drifts.largest[:, j], SMALLEST_DRIFT))
             shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
             ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
-        ax.axvline(band[j], color=LIMIT, linestyle="--", label=_BAND_LABEL)
+        ax.axvline(band[j], color=LIMIT, linestyle="--", label=_band_label(arm))
         if published_means is not None and j:
             ax.axvline(published_means[j - 1], color=MEASURED, linestyle=":", label="published, mean of five trials")
         ax.set_xscale("log")

@@ -84,7 +84,7 @@ def reproduce_psm(session: ReproductionSession) -> Section:
     psm_nominal = type(psm.model).from_arm(load_arm("psm"))
     psm_nominal.save(nominal_file)
     nominal = session.release("psm", psm.truth, nominal_file, poses, "PSM: releasing the nominal model")
-    releases = {"nominal model": (REFERENCE, nominal), "ours": (FITTED, ours)}
+    releases = {"the nominal model": (REFERENCE, nominal), "ours": (FITTED, ours)}
     plot_largest_drifts(session.folder / _FILE, "PSM", releases)
     names = ours.arm.joint_names
     disabled = [joint.name for joint in psm.model.joints if joint.feedforward_scale == 0.0]

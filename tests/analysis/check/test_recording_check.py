@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from check_findings import ARMS, changed, found
 from command_output import refusal
+from figure_rules import checked_figures
 from rich.console import Console
 from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
@@ -185,10 +186,11 @@ def test_lcm_log(tmp_path):
     assert {finding.kind for finding in report.findings} == {"reading", "repetition"}
 
 
-def test_command_prints_findings_and_writes_json(tmp_path, capsys):
+def test_command_prints_findings_and_writes_json(tmp_path, capsys, monkeypatch):
     path, output = tmp_path / "motion.csv", tmp_path / "check.json"
     write_recording(changed(clean_motion(), "qd", 4, lambda x: 1.1 * x), path)
-    assert main(["check", str(path), "--arm", "psm", "--json", str(output), "--plots", str(tmp_path / "p")]) == 0
+    with checked_figures(monkeypatch):
+        assert main(["check", str(path), "--arm", "psm", "--json", str(output), "--plots", str(tmp_path / "p")]) == 0
     assert (tmp_path / "p" / "spectra.png").stat().st_size > 10_000
     text = " ".join(capsys.readouterr().out.split())
     assert "warning: wrist_pitch: qd5 is 1.1 times dq/dt" in text

@@ -7,6 +7,7 @@ from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
+from figure_rules import checked_figures
 from rich.console import Console
 from scipy.stats import norm
 
@@ -265,7 +266,7 @@ def test_wilson_interval_counts_failed_runs_as_worst(tmp_path):
     assert drift.largest == math.inf
 
 
-def test_report_lists_all_measures_and_errors(tmp_path):
+def test_report_lists_all_measures_and_errors(tmp_path, monkeypatch):
     study = make_study()
     with ThreadPoolExecutor(1) as executor:
         rows = run_study(study, executor, tmp_path / "r.csv")
@@ -275,7 +276,8 @@ def test_report_lists_all_measures_and_errors(tmp_path):
     for word in ("held exact: ", "; wrong, a lot: ", " of 12 runs", "24 of 24 runs"):
         assert word in text
     assert "drift" in text and "RuntimeError: the solver failed" in text
-    plot_study(tmp_path / "study.png", study, rows)
+    with checked_figures(monkeypatch):
+        plot_study(tmp_path / "study.png", study, rows)
     assert (tmp_path / "study.png").stat().st_size > 10_000
 
 
