@@ -62,8 +62,8 @@ def start_meshcat(
         ) from error
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetProperty("/Background", "top_color", TOP)
-    meshcat.SetProperty("/Background", "bottom_color", BOTTOM)
+    meshcat.SetProperty("/Background/<object>", "top_color", TOP)
+    meshcat.SetProperty("/Background/<object>", "bottom_color", BOTTOM)
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", zoom)
     meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
     if arm is not None:
