@@ -144,7 +144,7 @@ def validation():
 
 
 @pytest.mark.parametrize("is_fitted", [True, False])
-def test_motion_figures_show_held_out_predictions_and_errors(validation, is_fitted, monkeypatch, tmp_path):
+def test_motion_figures_show_held_out_predictions(validation, is_fitted, monkeypatch, tmp_path):
     held_out = validation.predicted * 0.9 if is_fitted else None
     with checked_figures(monkeypatch) as figures:
         motion.plot_motion(tmp_path, validation, held_out)

@@ -30,7 +30,7 @@ def test_drift_figures_name_the_joints(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_distributions_have_one_range_and_show_the_share_of_held_joints(name, monkeypatch, tmp_path):
+def test_distributions_have_one_range_for_all_joints(name, monkeypatch, tmp_path):
     released = drifts(name, 0.02)
     with checked_figures(monkeypatch) as figures:
         drift.plot_largest_drifts(tmp_path / "a.png", "test", {"ours": (drift.FITTED, released)})
