@@ -134,8 +134,8 @@ def predicted_over_measured(efforts: PoseEfforts) -> go.Figure:
         measured = efforts.measured[use, j]
         for name, values in efforts.predicted.items():
             figure.add_trace(_dots(name, measured, values[use, j], first=j == 0), **at)
-        every = np.concatenate([measured, *(values[use, j] for values in efforts.predicted.values()), [0.0]])
-        ends = [every.min(), every.max()]
+        every = np.concatenate([measured, *(values[use, j] for values in efforts.predicted.values())])
+        ends = [every.min(), every.max()] if len(every) else [0.0, 0.0]
         figure.add_scatter(
             x=ends,
             y=ends,
@@ -168,8 +168,8 @@ def residuals_over_position(efforts: PoseEfforts) -> tuple[go.Figure, str]:
 def _range(efforts: PoseEfforts, joint: int) -> tuple[float, float]:
     """Returns the range of the axis of a joint. It contains all efforts except excluded ones."""
     use = efforts.usable[:, joint]
-    shown = [efforts.measured[use, joint], *(values[use, joint] for values in efforts.predicted.values()), [0.0]]
-    values = np.concatenate(shown)
+    shown = [efforts.measured[use, joint], *(values[use, joint] for values in efforts.predicted.values())]
+    values = np.concatenate(shown) if np.any(use) else np.zeros(1)
     margin = 0.08 * (float(np.ptp(values)) or 1e-3)
     return float(values.min()) - margin, float(values.max()) + margin
 

@@ -224,6 +224,7 @@ def test_command_names_the_report_or_the_option(tmp_path, capsys):
     assert "dvrk-drake validate" in report.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["motion", "poses"])
 def test_page_in_a_browser(case, request, open_page, tmp_path):
     path = tmp_path / "report.html"
