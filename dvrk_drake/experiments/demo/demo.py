@@ -53,7 +53,7 @@ PHASES = (
     (HELD_UNTIL, "released: gravity compensation only"),
     (RELEASED_UNTIL, "driven home: the controller regulates a motion"),
 )
-COLOURS = "grey: identified model    orange: model of the SDF, not identified"
+COLOURS = "grey arm: identified model     orange arm: model of the SDF, not identified"
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,7 @@ def _animated_release(
 ) -> NDArray[np.float64]:
     """Simulates the release and records an endless animation; returns q (m, n).
 
-    The animation shows the poses `ghost` (k, n) of another simulation as a ghost arm until the release ends.
+    While the arm is released, the animation shows the poses `ghost` (k, n) of another simulation as a ghost arm.
     """
     overlay = ArmOverlay(station.arm, meshcat)
     overlay.add_ghost(GHOST)
@@ -289,7 +289,8 @@ def _animated_release(
             return
         time = i * SAMPLE_PERIOD
         overlay.set_phase([text for start, text in PHASES if start <= time][-1], time)
-        overlay.draw(q, ghosts={GHOST: ghost[i]} if i < len(ghost) else None, time=time)
+        ghosts = {GHOST: ghost[i]} if _index(HELD_UNTIL) <= i < len(ghost) else None
+        overlay.draw(q, ghosts=ghosts, time=time)
 
     with recorded_in(meshcat):
         _, q = _release(station, model, plan, HOME_UNTIL, progress, draw)

@@ -36,13 +36,14 @@ def plot_drift(path: Path, result: DemoResult) -> None:
     """
     arm, t = result.arm, result.time
     figure, axes = panel_grid(arm.num_joints, height=2.5)
+    limits = "15 mrad or 1.5 mm" if np.any(arm.prismatic) else "15 mrad"
     for j, ax in enumerate(axes):
         q0, held = result.identified[0, j], 1e3 * result.limits[j]
         drift = {
             "model of the SDF (not identified)": (1e3 * (result.nominal[:, j] - result.nominal[0, j]), REFERENCE, "--"),
             "identified model": (1e3 * (result.identified[:, j] - q0), FITTED, "-"),
         }
-        ax.axhspan(-held, held, color=LIMIT, alpha=0.15, linewidth=0, label="held: within 15 mrad or 1.5 mm")
+        ax.axhspan(-held, held, color=LIMIT, alpha=0.15, linewidth=0, label=f"limit of a held joint: {limits}")
         for label, (values, colour, line) in drift.items():
             ax.plot(t, values, line, color=colour, linewidth=1.8, label=label)
         low, high = ax.get_ylim()
@@ -59,7 +60,11 @@ def plot_drift(path: Path, result: DemoResult) -> None:
     set_title(
         figure,
         f"The identified model {verdict} the released {arm.name}. "
-        + ("The model of the SDF also holds it." if result.holds("nominal") else "With the model of the SDF it falls.")
+        + (
+            "The model of the SDF also holds it."
+            if result.holds("nominal")
+            else "With the model of the SDF, it moves away."
+        )
         + "\nDrift from the release position; simulation with friction, cables, joint stops and sensors",
     )
     save_figure(figure, path)
