@@ -33,6 +33,7 @@ _ERROR_STYLES = {
     "zero torque": (MEASURED, "o"),
     "leave-one-out": (FITTED, "s"),
     "least squares of the paper": (REFERENCE, "D"),
+    "model of the SDF": (REFERENCE, "D"),
     "model, with excluded measurements": (LIMIT, "x"),
 }
 #: Number of random samples for a bootstrap interval.
