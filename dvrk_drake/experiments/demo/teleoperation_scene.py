@@ -63,10 +63,10 @@ class TeleoperationScene:
         self._captions.set_phase(text, time)
 
     def show_status(self, follows: bool, scale: float, tracking: float | None) -> None:
-        """Shows clutch, scale and tracking error [m] at most five times per second."""
+        """Shows clutch, scale and tracking error [m] at most twice per second."""
         if (now := monotonic()) < self._next_text:
             return
-        self._next_text = now + 0.2
+        self._next_text = now + 0.5
         clutch = "clutch closed: PSM follows" if follows else "clutch open: PSM holds its pose"
         error = "" if tracking is None else f"   tracking error {1e3 * tracking:.1f} mm"
         self._captions.set_text("status", f"{clutch}   scale {scale:.2f}{error}", v=STATUS_EDGE)

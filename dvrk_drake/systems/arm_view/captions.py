@@ -21,6 +21,8 @@ LINE_HEIGHT = 0.06
 NEARER = 0.6
 #: Upper edge of the caption of the phase. Distance of the joint names to the right of their joints.
 PHASE_EDGE, NAME_OFFSET = 0.84, 0.16
+#: Number of images of a changing text that exist at the same time.
+NUM_IMAGES = 32
 #: Largest |u| and |v| of a point with a name, see `Camera.point`.
 NAMES_INSIDE = 1.4, 0.78
 #: Rotation of a text (x right, y into the view, z up) in the camera (x right, y up, z towards the viewer).
@@ -38,7 +40,7 @@ class Captions:
     def __init__(self, scene: Scene, camera: Camera, X_WB: RigidTransform) -> None:
         """Starts without texts. `X_WB` is the pose of the scene's root in the world."""
         self._scene, self._camera, self._X_BW = scene, camera, X_WB.inverse()
-        self._texts: dict[str, str] = {}
+        self._texts: dict[str, tuple[int, str]] = {}  # number of the image, and the text
         self._sizes: dict[str, tuple[float, float]] = {}  # width and height, as multiples of half the view's height
         self._places: dict[str, tuple[float, float]] = {}
         self._phases: list[str] = []
@@ -52,9 +54,14 @@ class Captions:
 
     def set_text(self, name: str, text: str, u: float = 0.0, v: float = 0.0) -> None:
         """Shows a text with the middle of its upper edge at (u, v), see `Camera.point`. "" hides the caption."""
-        if text and text != self._texts.get(name):
-            self._texts[name] = text
-            self.set_image(name, text_image(text), u, v)
+        count, shown = self._texts.get(name, (-1, ""))
+        if text and text != shown:
+            # Meshcat deletes the image of a replaced object, although a slow browser may not have loaded it yet.
+            self._scene.set_visible(f"{name}/{count % NUM_IMAGES}", False)
+            count += 1
+            self._texts[name] = count, text
+            self.set_image(f"{name}/{count % NUM_IMAGES}", text_image(text), u, v)
+            self._scene.set_visible(f"{name}/{count % NUM_IMAGES}", True)
         self._scene.set_visible(name, bool(text))
 
     def set_image(self, name: str, image: Image.Image, u: float, v: float) -> None:
