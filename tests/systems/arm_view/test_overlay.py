@@ -146,7 +146,7 @@ def test_images():
     assert share_color(0.0)[2] > share_color(1.0)[2]  # blue to red
 
 
-def test_simulation_draws_the_overlay_and_gives_the_same_result():
+def test_drawing_does_not_change_a_simulation():
     arm = load_arm("mtml")
     meshcat = start_meshcat(arm)
     options = {"effects": False, "duration": 0.2, "targets": [(0.1, [0, 0.1, 0, 0, 0, 0, 0])]}

@@ -13,7 +13,7 @@ from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
-def test_each_slider_moves_its_joint_and_keeps_the_loop_closed(open_page, name):
+def test_sliders_keep_the_loop_closed(open_page, name):
     arm = load_arm(name)
     view = ArmView(arm, start_meshcat(arm))
     view.add_view_buttons()
