@@ -393,14 +393,14 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     if not verbose:
         return
     print_note(console, f"{rule_text(in_motion=True)} Low-pass filter: {validation.cut_off:g} Hz.")
-    table = make_table("Shares of the squared error", "", *SHARE_LABELS)
+    table = make_table("Shares of the squared error", "", *(label.replace("-dependent", "") for label in SHARE_LABELS))
     for a in validation.actuators:
         table.add_row(a.name, *("-" if share is None else f"{100 * share:.0f} %" for share in a.shares))
     console.print(table)
     print_note(
         console,
-        "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent "
-        "share indicates that the cables changed. No model reduces the share that does not repeat between periods.",
+        "position, acceleration, posture: errors that depend on it. If the share of the bias or of the friction-like "
+        "error is large, recalibrate. A large position share indicates that the cables changed. No model reduces the share that does not repeat between periods.",
     )
 
 

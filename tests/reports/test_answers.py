@@ -174,7 +174,7 @@ CASES = {
     ),
     "compare-gc": (
         r"Largest difference between file and model: \d\.\d{3} N m \(\w+\)\. "
-        r"Poses with a torque at limit, runaway or opposed: [1-9][\d.]* % ",
+        r"Poses with a torque at limit, runaway or opposed: [1-9][\d.]* %",
         compared,
     ),
     "simulate, hold": (r"Largest tracking error \S+ \w+ \(\w+\)", lambda c, v: simulated(c, v, [])),

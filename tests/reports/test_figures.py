@@ -140,6 +140,7 @@ def validation():
         period=6.0,
         measured=measured,
         predicted=predicted,
+        grid=None,
     )
 
 
