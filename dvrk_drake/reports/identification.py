@@ -400,7 +400,8 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     print_note(
         console,
         "position, acceleration, posture: errors that depend on it. If the share of the bias or of the friction-like "
-        "error is large, recalibrate. A large position share indicates that the cables changed. No model reduces the share that does not repeat between periods.",
+        "error is large, recalibrate. A large position share indicates that the cables changed. No model reduces the "
+        "share that does not repeat between periods.",
     )
 
 
