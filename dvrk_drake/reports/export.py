@@ -229,7 +229,7 @@ def print_comparison(
     print_answer(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). Poses with a torque "
-        f"at limit, runaway or opposed: {marked:.3g} %{'' if verbose else ' (--verbose explains these columns)'}.",
+        f"at limit, runaway or opposed: {marked:.3g} %.",
         _next_step(comparison.model, model_name),
         "yellow" if marked else "green",
     )
@@ -241,9 +241,10 @@ def print_comparison(
         shares = (f"{100 * x:.0f} %" if x else "" for x in (joint.clipped, joint.runaway, joint.opposed))
         table.add_row(joint.name, f"{largest:.3f}", _number(joint.rms_inside), _number(joint.rms_outside), *shares)
     console.print(table)
-    console.print()
     if not verbose:
+        print_note(console, "--verbose explains these columns.")
         return
+    console.print()
     print_note(
         console,
         f"Sweep: joint positions of the recording from which the file was computed ({_sweep(comparison)}). At "

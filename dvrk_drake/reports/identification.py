@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -393,15 +394,19 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     if not verbose:
         return
     print_note(console, f"{rule_text(in_motion=True)} Low-pass filter: {validation.cut_off:g} Hz.")
-    table = make_table("Shares of the squared error", "", *(label.replace("-dependent", "") for label in SHARE_LABELS))
+    table = make_table("Largest shares of the squared error", "", "share", "cause", "share", "cause")
     for a in validation.actuators:
-        table.add_row(a.name, *("-" if share is None else f"{100 * share:.0f} %" for share in a.shares))
+        causes = [(share, label) for share, label in zip(a.shares, SHARE_LABELS, strict=True) if share is not None]
+        largest = sorted(causes, reverse=True)[:2]
+        table.add_row(a.name, *chain.from_iterable((f"{100 * share:.0f} %", label) for share, label in largest))
+    for column in (2, 4):
+        table.columns[column].justify = "left"
     console.print(table)
     print_note(
         console,
-        "position, acceleration, posture: errors that depend on it. If the share of the bias or of the friction-like "
-        "error is large, recalibrate. A large position share indicates that the cables changed. No model reduces the "
-        "share that does not repeat between periods.",
+        "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent "
+        "share indicates that the cables changed. No model reduces the share that does not repeat between periods. "
+        "--report shows all shares.",
     )
 
 
