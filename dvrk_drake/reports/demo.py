@@ -29,7 +29,7 @@ With a real arm:
 #: Note on the start of the release.
 START_OF_RELEASE = (
     "The simulated arm has the friction, cables, stops and sensors of the arm file. At the start of the release, its "
-    "friction carries no load. After an approach from one side, friction moves the joints back by up to 20 mrad."
+    "friction carries no load. After an approach from one side, a joint can move back or slip further than the limit."
 )
 
 

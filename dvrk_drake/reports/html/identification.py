@@ -222,15 +222,16 @@ def _error_budget(efforts: Efforts) -> Section:
     caption = f"Relative RMS error of the {_adjective(efforts)} efforts and its causes"
     if isinstance(efforts, MotionEfforts):
         note = (
-            "Each bar is divided by shares of the squared error. A share is what its cause explains in addition to the "
-            "previous ones: an offset, friction of the actuator, its position, accelerations, and the positions of the "
-            "other actuators. The rest differs between periods, is faster than 2 Hz, or is slow (other)."
+            "Each bar is divided by shares of the squared error. The causes are fitted in this order: offset, friction "
+            "and position of the actuator, accelerations, positions of the other actuators. Each share is the "
+            "additional reduction of the squared error. The remaining error has three parts: differences between "
+            "periods, frequencies above 2 Hz, and other."
         )
         budgets = motion_budget(efforts)
     else:
         note = (
-            "Each bar is divided by shares of the squared error: an offset, what a sine and a cosine of the position "
-            "explain, and the rest, such as friction and measurement noise (other)."
+            "Each bar is divided by shares of the squared error: offset, sine and cosine of the position, and other, "
+            "such as friction and measurement noise."
         )
         budgets = pose_budget(efforts)
     return Section("Error budget", [Plot(error_budget(budgets), caption)], note=note)

@@ -208,7 +208,7 @@ def coverage_table(result: Result, q: NDArray[np.float64], v: NDArray[np.float64
         rows.append(tuple(cells))
     header = ("joint", "unit", "position limits", "recorded", "covered")
     speeds = () if v is None else ("RMS speed [unit/s]", "peak speed [unit/s]")
-    note = "" if v is None else "The arm file states no speed limits, so the table contains no shares of the speeds."
+    note = "" if v is None else "The arm file states no speed limits, so the table lists no relative speeds."
     return Table((*header, *speeds), rows, caption="Positions and speeds of the joints in the recording", note=note)
 
 

@@ -14,7 +14,7 @@ from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.html.labels import NO_BREAK
-from dvrk_drake.reports.html.page import Block, Cell, Table, Verdict
+from dvrk_drake.reports.html.page import Block, Cell, Table
 
 #: Ratio of half the width of a 95 % interval to the standard error of a normal distribution.
 INTERVAL = 1.96
@@ -23,8 +23,9 @@ _UNITS = dict(zip(PARAMETER_NAMES, ("kg", *3 * ["kg m"], *6 * ["kg m²"]), stric
 _ROUNDING = 1e-13
 _HEADER = ("estimate", "95 % interval", "SDF")
 _NOTE = (
-    "The intervals describe the scatter of the measurements. They do not include errors of the kinematics or of the "
-    "effort calibration."
+    "The intervals describe the scatter of the measurements. They do not include the selection of effects, and errors "
+    "of the kinematics or of the effort calibration. On simulated arms, they contain less than 95 % of the true values "
+    "(docs/benchmarks.md, coverage of the intervals)."
 )
 
 
@@ -73,26 +74,19 @@ def _gravity_parameters(model: IdentifiedModel) -> Table:
             *_estimate(p.value, p.standard_error),
             _number(nominal),
             _unit(unit),
-            _distinguishable(p),
+            "yes" if p.distinguishable else "no",
         )
         for p, nominal, unit in zip(model.base_parameters, gravity.base_values, gravity.base.units, strict=True)
     ]
     provenance = model.provenance
     rank = f"{provenance.rank} of {len(model.base_parameters)}" if provenance.rank else "unknown"
     return Table(
-        ("base parameter", *_HEADER, "unit", "identifiable"),
+        ("base parameter", *_HEADER, "unit", "interval excludes 0"),
         rows,
         caption="Base parameters of gravity. They are the combinations of masses and centres of mass that holding "
         "torques determine.",
-        note=f"Poses determine {rank} base parameters (condition number {provenance.condition_number:.3g}). Weakly: "
-        f"the interval contains 0. {_NOTE}",
+        note=f"Poses determine {rank} base parameters (condition number {provenance.condition_number:.3g}). {_NOTE}",
     )
-
-
-def _distinguishable(estimate: object) -> Verdict:
-    if getattr(estimate, "distinguishable", False):
-        return Verdict("yes", "good")
-    return Verdict("weakly", "warning", "contains 0")
 
 
 def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> list[Block]:
@@ -104,23 +98,16 @@ def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> li
     for p in section.base_parameters:
         sdf = _number(nominal[p.name]) if p.name in nominal else ""
         row = (p.name, *_estimate(p.value, p.standard_error), sdf, _unit(p.unit), f"{p.identifiability:.2f}")
-        if p.identifiability < MIN_IDENTIFIABILITY:
-            others.append(row)
-        elif abs(p.value) < INTERVAL * p.standard_error:
-            identifiable.append((*row, Verdict("weakly", "warning", "contains 0")))
-        else:
-            identifiable.append((*row, Verdict("yes", "good")))
+        (identifiable if p.identifiability >= MIN_IDENTIFIABILITY else others).append(row)
     header = ("base parameter", *_HEADER, "unit", "identifiability")
     count = f"{len(identifiable)} of {len(section.base_parameters)} base parameters of the dynamics"
     note = (
         "Identifiability: reduction of the variance relative to the prior, from 0 (value of the SDF) to 1 (value of "
-        f"the recording). Weakly: the interval contains 0. {_NOTE}"
+        f"the recording). A parameter counts as identifiable from {MIN_IDENTIFIABILITY:g} on. {_NOTE}"
     )
-    blocks: list[Block] = [
-        Table((*header, "identifiable"), identifiable, caption=f"{count} are identifiable from this motion", note=note)
-    ]
+    blocks: list[Block] = [Table(header, identifiable, caption=f"{count} are identifiable from this motion", note=note)]
     if others:
-        caption = f"{len(others)} base parameters that are not identifiable. Their values come from the SDF."
+        caption = f"{len(others)} base parameters that are not identifiable. Their values depend mainly on the SDF."
         blocks.append(Table(header, others, caption=caption, collapsed=True))
     return blocks
 
@@ -133,11 +120,11 @@ def _correlations(section: DynamicSection) -> list[Block]:
             pair.first,
             pair.second,
             f"{pair.correlation:+.3f}",
-            f"a scaled {'difference' if pair.correlation > 0 else 'sum'}",
+            f"weighted {'difference' if pair.correlation > 0 else 'sum'}",
         )
         for pair in section.correlations
     ]
-    header = ("first", "second", "correlation", "identifiable is")
+    header = ("first", "second", "correlation", "identifiable combination")
     return [Table(header, rows, caption="Parameters that are not identifiable separately", collapsed=len(rows) > 6)]
 
 
@@ -200,8 +187,10 @@ def _effects(arm: Arm, effects: list[DriveEffect]) -> list[Block]:
             )
         )
     header = ("coordinate", "effect", "scale", "estimate", "95 % interval", "unit")
-    caption = f"{len(rows)} friction, cable and spring effects of the drives. Section 9 shows them as curves."
-    return [Table(header, rows, caption=caption, collapsed=len(rows) > 12)]
+    caption = f"{len(rows)} friction, cable and spring effects of the drives, drawn in Friction and cable curves"
+    scales = {e.kind: EFFECT_KINDS[e.kind].scale for e in effects}
+    note = "".join(f"{kind}: the scale is the {text}. " for kind, text in sorted(scales.items()) if text)
+    return [Table(header, rows, caption=caption, note=note, collapsed=len(rows) > 12)]
 
 
 def _all_link_parameters(section: DynamicSection, regressor: DynamicRegressor) -> Table:
