@@ -180,7 +180,16 @@ def plot_torque_error(
         shown = np.where(values > 0, values, np.nan)
         lower, upper = intervals.get(label, np.array([values, values]))
         bars = np.abs(np.array([np.minimum(lower, values), np.maximum(upper, values)]) - values)
-        axes.errorbar(shown, y, xerr=bars, fmt=marker, color=colour, capsize=3, markersize=6, label=label)
+        axes.errorbar(
+            shown,
+            y,
+            xerr=bars if label in intervals else None,
+            fmt=marker,
+            color=colour,
+            capsize=3,
+            markersize=6,
+            label=label,
+        )
         for value, bar, yi in zip(shown, bars[1], y, strict=True):
             if np.isfinite(value):
                 axes.annotate(
