@@ -1,6 +1,6 @@
 """Measures the time from a measurement of a dVRK to the effort that answers it, through the bridge.
 
-    python benchmarks/crtk_latency.py [--seconds 20] [--realtime] [--core 1]
+    python benchmarks/crtk_latency.py [--seconds 20] [--realtime]
 
 This process plays the arm: it publishes `measured_js` at 1 kHz and receives `servo_jf`. The position and the effort of
 the last joint contain the number of the measurement. These paths are measured in one run, one after the other:
@@ -10,8 +10,6 @@ the last joint contain the number of the measurement. These paths are measured i
     controller on LCM    without DDS: this process publishes the status, and the controller answers it over LCM
     bridge               `dvrk-drake bridge`, and the same controller
     polling bridge       the same with --poll
-
-With --core, the bridge uses only this processor core, as with `taskset`.
 
 The table lists the round-trip times, the largest interval between two measurements, and the measurements without an
 answer. The nominal interval is 1 ms. A much larger interval shows that the system suspended this process. The counters
@@ -100,10 +98,8 @@ def controller(realtime: bool) -> None:
         network.handle()
 
 
-def bridge(folder: str, realtime: bool, core: int | None, poll: bool) -> None:
+def bridge(folder: str, realtime: bool, poll: bool) -> None:
     """Runs the bridge with a guard that tolerates an arm without efforts."""
-    if core is not None:
-        os.sched_setaffinity(0, {core})
     driver = Path(folder, "driver.yaml")
     driver.write_text(LENIENT_DRIVER)
     options = [option for option, used in (("--realtime", realtime), ("--poll", poll)) if used]
@@ -196,13 +192,13 @@ def guard_counters() -> str:
     return ", ".join(f"{getattr(found[-1], f'num_{name}')} {name}" for name in ("accepted", "lost", "refused"))
 
 
-def measure(name: str, seconds: float, realtime: bool, folder: str, core: int | None) -> tuple[np.ndarray, np.ndarray]:
+def measure(name: str, seconds: float, realtime: bool, folder: str) -> tuple[np.ndarray, np.ndarray]:
     """Measures one path over DDS. Returns times of sending and round-trip times [s]."""
     is_bridge = name.endswith("bridge")
     domain, namespace = RosDomain(), "/MTML" if is_bridge else f"/ECHO_{name[-3:].strip().upper()}"
     arm = Arm(domain, namespace)
     if is_bridge:
-        processes = start((bridge, folder, realtime, core, name != "bridge"), (controller, realtime))
+        processes = start((bridge, folder, realtime, name != "bridge"), (controller, realtime))
     else:
         processes = start((echo, namespace, realtime, name != "echo"))
     try:
@@ -245,7 +241,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--realtime", action="store_true")
-    parser.add_argument("--core", type=int, help="processor core of the bridge")
     options = parser.parse_args()
     os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
     if options.realtime:
@@ -261,7 +256,7 @@ def main() -> None:
             if name == "controller on LCM":
                 sent, trips = measure_lcm(options.seconds, options.realtime)
             else:
-                sent, trips = measure(name, options.seconds, options.realtime, folder, options.core)
+                sent, trips = measure(name, options.seconds, options.realtime, folder)
             valid = 1e3 * trips[np.isfinite(trips)]
             quantiles = np.quantile(valid, [0.5, 0.99, 0.999, 1.0])
             p50[name] = quantiles[0]

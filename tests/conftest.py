@@ -35,6 +35,7 @@ ONE_PYTHON = (
     *("systems/ros/test_deadman", "systems/ros/test_discovery", "systems/ros/test_domain", "systems/ros/test_joint"),
     *("systems/ros/test_messages", "processes/test_crtk_coll", "processes/test_ros_", "processes/test_dvrk_console"),
     "processes/test_simulated_ros_arm",
+    *("reports/", "systems/arm_view/test_view_in_browser"),
 )
 
 
