@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.identified_model import ControlModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
+from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
@@ -75,7 +76,7 @@ class CrtkMonitor:
         if client.domain.num_changes != self._num_changes:
             self._num_changes = client.domain.num_changes
             if others := ", ".join(client.other_publishers()):
-                raise CollectionError(f"another process publishes {others}. End it")
+                raise CollectionError(f"another process publishes {others}. {END_OTHER_PROCESS}")
         measurement = client.measurement
         if measurement is None or now - 1e-9 * measurement.arrival > SILENCE:
             raise CollectionError(f"no message on {topic} for {SILENCE:g} s")

@@ -19,8 +19,11 @@ from ros_publisher import DOMAIN_FILE
 from waiting import wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 
 EFFORT, POSITION = "JOINT_SPACE/EFFORT_MODE", "JOINT_SPACE/POSITION_MODE"
+#: Time for which DDS by default lists a killed process [s].
+DDS_LEASE = 10.0
 #: Environment of all processes. Each test file has a network of its own, so the number of the domain is free.
 os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
 
@@ -124,8 +127,8 @@ def test_efforts_act_and_other_bridge_is_refused(console, operator, tmp_path):
         assert "/MTML: switched off the dVRK's own gravity compensation" in bridge.output()
         assert other.wait() == missing.wait() == 2
         assert other.output().splitlines()[-1] == (
-            "dvrk-drake: error: another process publishes /MTML/move_jp, /MTML/servo_jf, /MTML/servo_jp. Only one "
-            "process may command an arm: end the other one, e.g. another bridge, teleoperation or a script"
+            "dvrk-drake: error: another process publishes /MTML/move_jp, /MTML/servo_jf, /MTML/servo_jp, e.g. "
+            "another bridge, teleoperation or a script. Only one process may command an arm. " + END_OTHER_PROCESS
         )
         assert "has no topic /MTMR/measured_js. Topics with JointState messages: /MTML/" in missing.output()
         # The first bridge is not affected.
@@ -246,6 +249,7 @@ def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
     with start_console("MTML", tmp_path, domain=9) as console:
         console.enable_and_home()
         bridge, controller = start_efforts("mtml", tmp_path, console, "--domain", "9")
+    ended = time.monotonic()
     with running(bridge, controller):
         wait_for_line(bridge, "fault: ")
         with start_console("MTML", tmp_path, domain=9) as console:
@@ -256,6 +260,8 @@ def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
             wait_until(lambda: len(operator.received) > count + 300, "statuses", bridge)
             assert operator.last.guard_state == Status.STATE_FAULT
             assert not [name for name, *_ in monitor.receive() if name != "hold"]
+            # Until the lease of the killed console has expired, the bridge considers it as a second arm.
+            wait_until(lambda: time.monotonic() > ended + DDS_LEASE + 1.0, "end of the lease", bridge)
             before = len(bridge.output())
             operator.reset(bridge)
             # The guard may hold the arm for less time than DDS needs to discover the monitor.

@@ -20,6 +20,7 @@ from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess
+from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
@@ -209,7 +210,7 @@ class CrtkBridge:
         if not self._was_answered:
             self._find_other_publishers()
         if self._other_publishers:
-            guard.report_fault(f"another process publishes {self._other_publishers}. End it")
+            guard.report_fault(f"another process publishes {self._other_publishers}. {END_OTHER_PROCESS}")
         self._blocked = self._block_reason()
         guard.block(self._blocked)
         output = self._step_guard(now)

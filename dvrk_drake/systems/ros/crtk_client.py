@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
-from dvrk_drake.systems.ros.discovery import find_topic, wait_unless_stopped
+from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS, find_topic, wait_unless_stopped
 from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement, JointStateReader, shown
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
 from dvrk_drake.systems.ros.topic import Publisher, Subscription
 
 #: Longest time until the arm has sent its state and a measurement [s]. Longest time until DDS detects the end of a
-#: killed process [s].
+#: killed process of this package [s].
 _FIRST, _ENDED = 5.0, 3.0
 #: Topics with which a client moves an arm. A second publisher on one of them could move the arm at the same time.
 _MOTION_TOPICS = (
@@ -331,12 +331,12 @@ def connect_client(
     """
     namespace = find_arm(domain, arm, topic, report=report, stopped=stopped)
     what = f"the connection to {namespace}"
-    # The publishers of a new client would stop a bridge that already runs. So their check comes first. DDS considers a
-    # killed process as present for about a second.
+    # The publishers of a new client would stop a bridge that already runs, so this check comes first. DDS lists a
+    # killed process of this package for about a second, and others for 10 s.
     if not wait_unless_stopped(domain, lambda: not other_publishers(domain, arm, namespace), _ENDED, stopped, what):
         raise ControllerError(
-            f"another process publishes {', '.join(other_publishers(domain, arm, namespace))}. Only one process may "
-            "command an arm: end the other one, e.g. another bridge, teleoperation or a script"
+            f"another process publishes {', '.join(other_publishers(domain, arm, namespace))}, e.g. another bridge, "
+            f"teleoperation or a script. Only one process may command an arm. {END_OTHER_PROCESS}"
         )
     client = CrtkClient(domain, arm, namespace, polled=polled)
 

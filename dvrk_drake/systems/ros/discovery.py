@@ -16,6 +16,8 @@ from dvrk_drake.recordings.topic_choice import MEASURED_JS, check_namespace, cho
 if TYPE_CHECKING:
     from dvrk_drake.systems.ros.domain import RosDomain
 
+#: Advice if another process publishes commands or measurements of the arm. 10 s is the default lease of DDS.
+END_OTHER_PROCESS = "End it. A killed process is listed for up to 10 s"
 #: Longest time to wait for the topic of an arm [s]. Time after which the search is reported [s]. Time to wait for other
 #: topics of the domain after the first one [s].
 _DISCOVERY, _NOTICE, _OTHERS = 10.0, 1.0, 1.0

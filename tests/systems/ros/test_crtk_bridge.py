@@ -11,6 +11,7 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import MessageKey, create_key_file
+from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 
 HOME = "/MTML: switched off the dVRK's own gravity compensation"
 
@@ -170,7 +171,7 @@ def test_second_publisher_is_a_fault_as_long_as_it_exists(bench):
     bench.clear()
     bench.run(10)
     assert set(bench.names()) == {"servo_jp"}
-    assert bench.status.fault_text == "another process publishes /MTML/servo_jf, /MTML/servo_jp. End it"
+    assert bench.status.fault_text == "another process publishes /MTML/servo_jf, /MTML/servo_jp. " + END_OTHER_PROCESS
     bench.reset()
     assert bench.status.guard_state == Status.STATE_FAULT
     bench.client.others, bench.client.domain.num_changes = [], 2
