@@ -1,4 +1,4 @@
-# make demo | make test | make lint | make benchmark. Each installs its packages in .venv first. PYTHON=python3.12 selects
+# make demo | make test | make lint | make docs | make package | make benchmark. Each installs its packages in .venv first. PYTHON=python3.12 selects
 # another Python.
 PYTHON ?= python3
 VENV ?= .venv
@@ -12,7 +12,7 @@ RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/u
 MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-busy test-fast test-udp test-ros test-recordings mutants lint benchmark clean
+.PHONY: demo test test-busy test-fast test-udp test-ros test-recordings mutants lint docs package benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --folder demo_output --overwrite
@@ -50,6 +50,16 @@ lint: $(VENV)/.installed-lint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The documentation site, in docs/_build/html. The tutorials are executed; unchanged ones are taken from a cache. The
+# build needs no network.
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "wrote docs/_build/html/index.html"
+
+# Wheel and source distribution, in dist.
+package: $(VENV)/bin/python
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+
 benchmark: $(VENV)/.installed-benchmark
 	$(BIN)/python benchmarks/gravity_regressor.py
 	$(BIN)/python benchmarks/dynamic_regressor.py
@@ -71,4 +81,4 @@ $(VENV)/.installed-%: $(VENV)/.installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo_output
+	rm -rf $(VENV) demo_output docs/_build docs/generated dist
