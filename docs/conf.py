@@ -15,7 +15,7 @@ os.environ["COLUMNS"] = "100"
 
 project = "dvrk_drake"
 author = "the dvrk_drake authors"
-copyright = "2026, the dvrk_drake authors"  # noqa: A001
+copyright = "2026, the dvrk_drake authors"
 version = release = installed_version("dvrk-drake")
 
 extensions = [

@@ -12,6 +12,7 @@ class PydrakeSystem(SphinxDirective):
     has_content = True
 
     def run(self) -> list[nodes.Node]:
+        """Returns the table."""
         system = yaml.safe_load("\n".join(self.content))
         inputs, outputs = (
             nodes.entry("", *(nodes.paragraph("", "", nodes.literal(text=str(port))) for port in system.get(key, [])))

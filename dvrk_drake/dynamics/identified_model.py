@@ -30,6 +30,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.models.schema_fault import formerly, missing_key, schema_fault, with_current_keys, within
@@ -42,10 +43,8 @@ if TYPE_CHECKING:
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
 #: Format of the files that `IdentifiedModel.save` writes.
-FORMAT = "dvrk_drake identified model 5"
-#: Formats of earlier versions that can be read. Formats 2 to 4 have no locked joints. In format 2, `arm` is a
-#: name or an absolute path.
-_EARLIER_FORMATS = tuple(f"dvrk_drake identified model {version}" for version in (4, 3, 2))
+#: Versions 2 to 4 have no locked joints. In version 2, `arm` is a name or an absolute path.
+FORMAT = FileFormat("dvrk_drake identified model", 5, oldest=2)
 #: Allowed range of measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
 
@@ -165,7 +164,7 @@ class _Header:
         locked_joints: Positions of the joints that were not recorded [rad, m], see `Arm.with_locked_joints`.
     """
 
-    format: str = ""
+    format: str = field(default="", metadata=FORMAT.metadata)
     arm: str = ""
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
     locked_joints: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
@@ -250,11 +249,14 @@ class IdentifiedModel(_Identified):
         """
         content = load_yaml(path, ModelError)
         # Reject an unknown version before its keys are checked.
-        version = content.get("format") if isinstance(content, dict) else None
-        if version and version not in (FORMAT, *_EARLIER_FORMATS):
-            raise ModelError(f'{path}: format is "{version}"; allowed: "{FORMAT}", 4, 3 and 2. Identify the arm again')
+        version = FORMAT.major
+        if isinstance(content, dict) and content.get("format"):
+            try:
+                version = FORMAT.major_of(content["format"])
+            except ValueError as error:
+                raise ModelError(f"{path}: {error}") from error
         content = with_current_keys(ModelFile, content, str(path))
-        if version in _EARLIER_FORMATS:
+        if version < 5:
             content.setdefault("locked_joints", {})
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A missing number would otherwise silently become 0.
@@ -292,7 +294,7 @@ class IdentifiedModel(_Identified):
     def _file(self, arm: str) -> ModelFile:
         parts = {part.name: getattr(self, part.name) for part in fields(_Identified)}
         header = {"gravity": self.arm.gravity.tolist(), "locked_joints": dict(self.arm.locked_joints)}
-        return ModelFile(format=FORMAT, arm=arm, **header, **parts)
+        return ModelFile(format=str(FORMAT), arm=arm, **header, **parts)
 
     def check(self) -> None:
         """Raises ModelError unless the parameters match the arm."""

@@ -8,6 +8,7 @@ from pydrake.common.yaml import yaml_dump
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
@@ -150,6 +151,7 @@ class Mechanism:
     publishes the efforts on the ROS topic gravity_compensation/setpoint_js. `view` are the parts that a 3D view shows.
     """
 
+    format: str = field(default="", metadata=FileFormat("dvrk_drake mechanism", 1).metadata)
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
     gains: Gains = field(default_factory=Gains)
@@ -175,6 +177,7 @@ class Instrument:
     to the close-ups of the mechanism, and replaces its other entries.
     """
 
+    format: str = field(default="", metadata=FileFormat("dvrk_drake instrument", 1).metadata)
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
     separate_joint: str = ""
@@ -192,6 +195,7 @@ class Instrument:
 class ArmDescription:
     """Schema of `arms/*.yaml`.
 
+    `format` is the version of the file, see `FileFormat`. A file without this key has version 1.0.
     `mechanism` and `instrument` are names of files in the folders `mechanisms` and `instruments`, or paths of YAML
     files relative to the folder of the arm file. `sdf` in a mechanism or instrument file is a path relative to the
     folder of that file. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `mirrored_links` maps an SDF
@@ -200,6 +204,7 @@ class ArmDescription:
     upper] for this arm, e.g. after the calibration of a joint stop. These values replace the values of the mechanism.
     """
 
+    format: str = field(default="", metadata=FileFormat("dvrk_drake arm", 1).metadata)
     name: str = ""
     mechanism: str = ""
     instrument: str = ""

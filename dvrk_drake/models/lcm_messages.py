@@ -23,6 +23,9 @@ from dvrk_drake.models.files import open_input
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
+#: Version of both message types. The first 8 bytes of a message, its fingerprint, depend on all fields of its type. A
+#: changed field therefore makes a new major version. Receivers ignore messages of other versions (docs/versions.md).
+MESSAGE_VERSION = "1.0"
 #: Minimum and maximum length of a key, and length of a new key [bytes]. The maximum is that of BLAKE2b.
 _MIN_LENGTH, _MAX_LENGTH, _NEW_LENGTH = 16, 64, 32
 #: Length of a message authentication code [bytes].
@@ -120,7 +123,7 @@ _STATE_NAMES = {
 
 _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_NONE: "none",
-    lcmt_dvrk_status.REFUSAL_UNREADABLE: "unreadable message",
+    lcmt_dvrk_status.REFUSAL_UNREADABLE: f"not an lcmt_dvrk_command of version {MESSAGE_VERSION}",
     lcmt_dvrk_status.REFUSAL_WRONG_ARM: "command for another arm",
     lcmt_dvrk_status.REFUSAL_WRONG_SIZE: "wrong number of joints",
     lcmt_dvrk_status.REFUSAL_NOT_FINITE: "numbers that are not finite",
@@ -186,8 +189,8 @@ class StatusFilter:
 
     Attributes:
         last: Last accepted status, or None if no status has been accepted.
-        ignored: Mapping from a reason (OTHER_SESSION, JUMP, OLD, NOT_AUTHENTIC, UNREADABLE) to the number of messages
-            ignored since the last accepted status.
+        ignored: Mapping from a reason (OTHER_SESSION, JUMP, OLD, NOT_AUTHENTIC, OTHER_VERSION, UNREADABLE) to the
+            number of messages ignored since the last accepted status.
     """
 
     OTHER_SESSION = "of another session"
@@ -195,6 +198,7 @@ class StatusFilter:
     OLD = "not newer than the last one"
     NOT_AUTHENTIC = "not signed with this key"
     UNREADABLE = "unreadable or of another arm"
+    OTHER_VERSION = f"not an lcmt_dvrk_status of version {MESSAGE_VERSION}"
 
     def __init__(
         self,
@@ -261,7 +265,7 @@ class StatusFilter:
     def _reason(self, data: bytes, now: float) -> str:
         """Returns the reason to ignore a message, or "". Only the header and the authentication code are examined."""
         if len(data) < 32 or data[:8] != self._fingerprint:
-            return self.UNREADABLE
+            return self.OTHER_VERSION
         utime, sequence, session_id = struct.unpack_from(">qqq", data, 8)
         last = self.last
         if last is None:

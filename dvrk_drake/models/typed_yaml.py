@@ -9,6 +9,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import read_text_input
 from dvrk_drake.models.schema_fault import schema_fault, with_current_keys
 
@@ -39,7 +40,7 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
     """Returns the content of the file at `path` as an object of the schema.
 
     Args:
-        schema: Dataclass, see `schema_fault`.
+        schema: Dataclass, see `schema_fault`. A `FileFormat` in its metadata is checked first.
         path: Path of the file.
         error: Type of error to raise.
         what: Kind of file that is expected, for messages, e.g. "a gains file".
@@ -53,6 +54,11 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
 
 def typed_content(schema: type[Schema], content: Any, where: str, error: type[DvrkDrakeError], what: str) -> Schema:
     """Converts parsed content as `load_typed_yaml` does; `where` names the source of the content."""
+    if (expected := FileFormat.of(schema)) is not None and isinstance(content, dict) and "format" in content:
+        try:
+            expected.major_of(content["format"])
+        except ValueError as cause:
+            raise error(f"{where}: {cause}") from cause
     content = with_current_keys(schema, content, where)
     if fault := schema_fault(schema, content, what):
         raise error(f"{where}: {fault}")

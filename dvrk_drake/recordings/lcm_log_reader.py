@@ -24,7 +24,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
-from dvrk_drake.models.lcm_messages import STATUS_PREFIX, decode, status_channel
+from dvrk_drake.models.lcm_messages import MESSAGE_VERSION, STATUS_PREFIX, decode, status_channel
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.recording import Recording
 
@@ -130,7 +130,7 @@ def _event(content: mmap.mmap, start: int) -> LcmEvent:
     return LcmEvent(number, utime, name, content[data : data + data_length])
 
 
-_UNREADABLE = "not an lcmt_dvrk_status of this version"
+_UNREADABLE = f"not an lcmt_dvrk_status of version {MESSAGE_VERSION}"
 _FOREIGN = "of another arm or number of joints"
 _LATE = "not later than the previous one"
 _NOT_FINITE = "with a measurement that is not finite"

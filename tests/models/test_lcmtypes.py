@@ -9,6 +9,7 @@ from waiting import TIMEOUT
 
 from dvrk_drake import lcmtypes
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.lcm_messages import MESSAGE_VERSION
 
 FOLDER = Path(lcmtypes.__file__).parent
 LCM_GEN = Path(sys.executable).with_name("lcm-gen")
@@ -48,3 +49,9 @@ def test_codes_of_one_kind_are_distinct():
     for prefix in ("STATE_", "FAULT_", "REFUSAL_", "FLAG_"):
         codes = [value for name, value in vars(lcmt_dvrk_status).items() if name.startswith(prefix)]
         assert len(codes) == len(set(codes)) > 3
+
+
+def test_layout_is_that_of_the_stated_version():
+    """A changed layout needs a new major `MESSAGE_VERSION`, because released programs cannot decode it."""
+    fingerprints = {type_._get_packed_fingerprint().hex() for type_ in (lcmt_dvrk_command, lcmt_dvrk_status)}
+    assert (MESSAGE_VERSION, fingerprints) == ("1.0", {"b48fa772aafdf43e", "f52d1b790e9d6998"})

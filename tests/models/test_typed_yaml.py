@@ -31,7 +31,11 @@ def test_the_files_themselves_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        ("arm", ("name:", "nam:"), 'key "nam" is unknown; did you mean "name"? allowed in an arm file: name, mech'),
+        (
+            "arm",
+            ("name:", "nam:"),
+            'key "nam" is unknown; did you mean "name"? allowed in an arm file: format, name, mech',
+        ),
         ("arm", ("name: PSM", "name: PSM\neffort_limit: abc"), 'key "effort_limit" is unknown; '),
         ("arm", ("name: PSM", "name: [PSM]"), "name is ['PSM']; allowed: a string"),
         ("arm", ("name: PSM", "name: PSM\ngravity: 9.81"), "gravity is 9.81; allowed: a list of numbers, e.g. [9.81]"),

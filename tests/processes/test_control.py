@@ -317,8 +317,8 @@ FOREIGN = {
     "negative": (status_bytes(-(2**62), utime=10**15), "1 not newer than the last one"),
     "cut": (status_bytes(102)[:-60], "1 unreadable or of another arm"),
     "other arm": (status_bytes(102, arm_name="PSM"), "1 unreadable or of another arm"),
-    "garbage": (b"garbage", "1 unreadable or of another arm"),
-    "empty": (b"", "1 unreadable or of another arm"),
+    "garbage": (b"garbage", "1 not an lcmt_dvrk_status of version 1.0"),
+    "empty": (b"", "1 not an lcmt_dvrk_status of version 1.0"),
 }
 
 

@@ -135,7 +135,7 @@ def changed(k, **changes):
         (changed(7, arm_name="MTMR"), "messages omitted, of another arm or number of joints: 1"),
         (
             [*statuses()[:7], b"garbage", *statuses()[8:]],
-            "messages omitted, not an lcmt_dvrk_status of this version: 1",
+            "messages omitted, not an lcmt_dvrk_status of version 1.0: 1",
         ),
         (changed(7, utime=START + 2000), "messages omitted, not later than the previous one: 1"),
         (changed(7, position=[float("nan")] * N), "messages omitted, with a measurement that is not finite: 1"),

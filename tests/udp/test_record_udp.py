@@ -228,7 +228,7 @@ def test_missing_status_is_explained(tmp_path, played):
         "psm": "no message within 10 s on channel DVRK_STATUS_PSM of udpm://239.255.76.67:7667?ttl=0. "
         "Channels with messages: DVRK_STATUS_MTML",
         "mtml": "no status of MTML within 10 s on channel DVRK_STATUS_MTML of udpm://239.255.76.67:7667?ttl=0: "
-        "messages omitted, not an lcmt_dvrk_status of this version",
+        "messages omitted, not an lcmt_dvrk_status of version 1.0",
     }
     for arm, process in waiting.items():
         assert process.wait(TIMEOUT) == 2

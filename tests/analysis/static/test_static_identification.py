@@ -243,8 +243,8 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
         (
-            text.replace("model 5", "model 1").replace("\neffects:", "\njoint_effects:"),
-            'model 1"; allowed: "dvrk_drake identified model 5", 4, 3 and 2. Identify the arm again',
+            text.replace("model 5.0", "model 1").replace("\neffects:", "\njoint_effects:"),
+            'model 1"; allowed: "dvrk_drake identified model 5.0" and older, from 2.0 on. Older files cannot be',
         ),
         (
             text.replace("feedforward_scale: 1.0", "feedforward_scale: 2.0"),
