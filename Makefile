@@ -12,7 +12,7 @@ RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/u
 MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-busy test-fast test-udp test-ros test-recordings mutants lint docs package benchmark clean
+.PHONY: demo test test-busy test-fast test-udp test-ros test-recordings mutants lint docs package test-package benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --folder demo_output --overwrite
@@ -57,8 +57,13 @@ docs: $(VENV)/.installed-docs
 	@echo "wrote docs/_build/html/index.html"
 
 # Wheel and source distribution, in dist.
-package: $(VENV)/bin/python
-	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+package: $(VENV)/.installed-package
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist >/dev/null
+
+# Installs both into empty environments, and runs the demo and an identification there.
+test-package: package
+	$(BIN)/python tools/test_package.py dist
 
 benchmark: $(VENV)/.installed-benchmark
 	$(BIN)/python benchmarks/gravity_regressor.py
