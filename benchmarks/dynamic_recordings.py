@@ -28,8 +28,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from timing import print_table
 
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
@@ -86,12 +85,14 @@ def main() -> None:
                 errors = validate_motion(model, recording).actuators
                 rows[f"ours on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
                 rows[f"{other}, refitted friction"] = 100 * cross_validated_errors(model, recording, 2)[1]
-        print_table(f"{arm.name}: relative RMS effort error of the actuators [%]", arm, rows)
+        headings = [*(f"J{j + 1}" for j in range(arm.num_joints)), "mean"]
+        cells = {name: [f"{value:.1f}" for value in (*values, np.mean(values))] for name, values in rows.items()}
+        print_table(f"{arm.name}: relative RMS effort error of the actuators [%]", headings, cells)
         box = (arm.position_lower, arm.position_upper)
         q = np.random.default_rng(0).uniform(*box, (options.poses, arm.num_joints))
         least = float(np.linalg.eigvalsh(DynamicModel(arm, dynamics).mass_matrix(q)).min())
-        print(f"smallest eigenvalue of all pseudo-inertias: {min(e.least_eigenvalue for e in dynamics.links):.1e}")
-        print(f"smallest eigenvalue of M(q) at {len(q)} random poses: {least:.1e}")
+        print(f"smallest eigenvalue of all pseudo-inertias: {min(e.least_eigenvalue for e in dynamics.links):.1e}\n")
+        print(f"smallest eigenvalue of M(q) at {len(q)} random poses: {least:.1e}\n")
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"identification time: {seconds:.1f} s; peak memory of this process: {peak:.0f} MB\n")
 
@@ -109,16 +110,6 @@ def read_public(path: Path, arm: Arm) -> Recording:
             "file. Convert it without --arm."
         )
     return recording
-
-
-def print_table(title: str, arm: Arm, rows: dict) -> None:
-    """Prints one row per model, with one column per joint and the mean."""
-    table = Table(title=title)
-    for heading in ("", *(f"J{j + 1}" for j in range(arm.num_joints)), "mean"):
-        table.add_column(heading, justify="left" if not heading else "right")
-    for name, values in rows.items():
-        table.add_row(name, *(f"{v:.1f}" for v in values), f"{np.mean(values):.1f}")
-    Console(width=110).print(table)
 
 
 if __name__ == "__main__":

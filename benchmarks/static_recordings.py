@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -41,7 +42,7 @@ def main() -> int:
             recordings[path.stem] = recording
         except RecordingError as error:
             print(f"not evaluated: {error}")
-    console = Console(width=130, highlight=False)
+    console = Console(width=200, highlight=False)
     for name, raw in recordings.items():
         ours = identify_static(raw, arm)
         recording = ours.recording  # repeated poses are averaged, for both methods
@@ -49,10 +50,8 @@ def main() -> int:
         excluded = np.zeros(recording.q.shape, dtype=bool)
         for measurement in ours.excluded:
             excluded[measurement.row, list(measurement.joints)] = True
-        table = Table(
-            title=escape(f"identified from {name} ({len(raw)} rows, {len(recording)} poses): RMS torque error [N m]"),
-            title_justify="left",
-        )
+        title = f"identified from {name} ({len(raw)} rows, {len(recording)} poses): RMS torque error [N m]"
+        table = Table(box=box.MARKDOWN)
         for column in ("evaluated on", "method", *(f"J{i + 1}" for i in range(arm.num_joints))):
             table.add_column(column, justify="right")
         tau = recording.measured_effort()
@@ -75,7 +74,7 @@ def main() -> int:
             table.add_row(f"{other_name}, without excluded", "zero", *(f"{j.rms_torque_included:.4f}" for j in by_ours))
             table.add_row("", "paper", *(f"{j.rms_error_included:.4f}" for j in by_paper))
             table.add_row("", "ours", *(f"{j.rms_error_included:.4f}" for j in by_ours))
-        console.print(table)
+        console.print(escape(title), table, sep="\n\n")
         effects = ", ".join(f"{ActuatorEffect.of(e)} {e.coefficient:+.3f}" for e in ours.model.effects)
         scales = ", ".join(f"{j.name} {j.feedforward_scale:.2f}" for j in ours.model.joints if j.feedforward_scale < 1)
         console.print(f"selected effects: {effects or 'none'}; feedforward scales below 1: {scales or 'none'}\n")

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from timing import write_json
@@ -83,13 +84,13 @@ def main() -> None:
     parser.add_argument("--json", help="file for the errors")
     options = parser.parse_args()
     arm = dvrk.load_arm("psm").with_locked_joints(LOCKED)
-    regressor, console, results = DynamicRegressor(arm), Console(highlight=False, width=120), []
+    regressor, console, results = DynamicRegressor(arm), Console(highlight=False, width=200), []
     for name, files in ARMS.items():
         recordings = {file: dvrk.read_recording(options.folder / f"{file}.csv", arm) for file in files}
         columns = {file: least_squares_columns(recording, regressor) for file, recording in recordings.items()}
         efforts = {file: recording.measured_effort() for file, recording in recordings.items()}
         models = {file: dvrk.identify(recording, arm).model for file, recording in recordings.items()}
-        table = Table("fitted to", "evaluated on", "method", *arm.joint_names, "mean", title=f"{name}: error [%]")
+        table = Table("fitted to", "evaluated on", "method", *arm.joint_names, "mean", box=box.MARKDOWN)
         for target, recording in recordings.items():
             others = [file for file in files if file != target]
             for source in others:
@@ -106,7 +107,7 @@ def main() -> None:
         for arm_name, source, target, method, errors in results:
             if arm_name == name:
                 table.add_row(source, target, method, *(f"{e:.1f}" for e in errors), f"{errors.mean():.1f}")
-        console.print(table)
+        console.print(f"{name}: error [%]", table, sep="\n\n")
     for method in ("identify", "least squares"):
         one = [errors for _, source, _, used, errors in results if used == method and source != "all others"]
         console.print(f"mean over all pairs, {method}: {np.mean(one):.1f} %")

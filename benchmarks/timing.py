@@ -49,13 +49,15 @@ def median_ratio(times: Mapping[str, NDArray[np.float64]], name: str, reference:
 
 
 def print_table(title: str, headings: Sequence[str], rows: Mapping[str, Sequence[object]]) -> None:
-    """Prints a title, the headings, and one row per name. The caller formats the numbers."""
+    """Prints a title, the headings, and one row per name as a table in Markdown. The caller formats the numbers."""
     cells = [["", *headings], *([name, *map(str, row)] for name, row in rows.items())]
-    widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
-    print(title)
+    widths = [max(3, *(len(row[column]) for row in cells)) for column in range(len(cells[0]))]
+    cells.insert(1, ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])])
+    print(title, end="\n\n")
     for first, *others in cells:
         aligned = (cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True))
-        print("  " + "  ".join([first.ljust(widths[0]), *aligned]), flush=True)
+        print("| " + " | ".join([first.ljust(widths[0]), *aligned]) + " |", flush=True)
+    print(flush=True)
 
 
 def write_json(path: str | None, result: object) -> None:

@@ -44,9 +44,12 @@ def test_table_columns_are_aligned(capsys):
     )
     assert capsys.readouterr().out.splitlines() == [
         "Title",
-        "               us  ratio",
-        "  ours       1.25   0.10",
-        "  the peer  12.50   1.00",
+        "",
+        "|          |    us | ratio |",
+        "| -------- | ----: | ----: |",
+        "| ours     |  1.25 |  0.10 |",
+        "| the peer | 12.50 |  1.00 |",
+        "",
     ]
 
 

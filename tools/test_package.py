@@ -1,4 +1,4 @@
-"""Installs the wheel and the source distribution into empty environments, and runs the demo and an identification there.
+"""Installs the wheel and the source distribution into empty environments, and runs the demo and an identification.
 
 python tools/test_package.py dist
 
