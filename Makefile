@@ -53,7 +53,7 @@ lint: $(VENV)/.installed-lint
 # The documentation site, in docs/_build/html. The tutorials are executed; unchanged ones are taken from a cache. The
 # build needs no network.
 docs: $(VENV)/.installed-docs
-	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
 	@echo "wrote docs/_build/html/index.html"
 
 # Wheel and source distribution, in dist.

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
+from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem
 from dvrk_drake.analysis.dynamic.estimates import parameter_covariance
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
@@ -84,7 +84,7 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     selection = problem.selection()
     selection.fit(chosen)
     fit = problem.consistent(chosen, selection.weights)
-    residual = residuals(problem, chosen, fit)
+    residual = problem.columns.tau - problem.predict(chosen, fit.x)
     cut_off = grid.settings.effort_cut_off
     covariance = parameter_covariance(problem, fit, residual, grid.rate, cut_off, period)
     p = problem.num_rigid

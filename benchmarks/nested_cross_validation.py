@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
+from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem
 from dvrk_drake.analysis.dynamic.effect_selection import NUM_HELD_OUT_FOLDS, select_effects
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import FOLDS, period_of
@@ -48,7 +48,7 @@ def main() -> None:
         selection = select_effects(problem.subset(~(held_out | before | after)))
         fit = selection.problem.consistent(selection.effects, selection.weights)
         part = replace(problem.subset(held_out), tilt=selection.problem.tilt)
-        errors = np.sum(residuals(part, selection.effects, fit) ** 2, axis=0)
+        errors = np.sum((part.columns.tau - part.predict(selection.effects, fit.x)) ** 2, axis=0)
         squares += errors
         show(f"phases {first}-{first + NUM_HELD_OUT_FOLDS - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))
     show("all phases", squares, np.sum(problem.columns.tau**2, axis=0))

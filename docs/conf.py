@@ -13,6 +13,7 @@ os.environ["PYTHONPATH"] = str(DOCS / "tutorials")
 # Width of the tables that commands print.
 os.environ["COLUMNS"] = "100"
 
+default_role = "literal"
 project = "dvrk_drake"
 author = "the dvrk_drake authors"
 copyright = "2026, the dvrk_drake authors"
@@ -27,7 +28,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx-mathjax-offline",
-    "cyclopts.sphinx_ext",
+    "cyclopts.ext.sphinx",
     "pydrake_system",
 ]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
@@ -46,14 +47,13 @@ nb_ipywidgets_js: dict[str, dict[str, str]] = {}
 autosummary_generate = True
 autodoc_default_options = {"members": True, "show-inheritance": False, "member-order": "bysource"}
 autodoc_typehints_format = "short"
-autodoc_mock_imports: list[str] = []
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
 html_theme = "furo"
 html_title = f"dvrk_drake {release}"
-html_static_path = ["_static"]
+templates_path = ["_templates"]
 html_theme_options = {"source_repository": "", "navigation_with_keys": True}
 copybutton_prompt_text = "$ "
 copybutton_exclude = ".linenos, .gp, .go"

@@ -1,5 +1,7 @@
-"""Tests of the benchmarks: reading of public recordings, timing and tables."""
+"""Tests of the benchmarks: imports, reading of public recordings, timing and tables."""
 
+import ast
+import importlib
 import importlib.util
 
 import numpy as np
@@ -19,6 +21,16 @@ def load_script(name):
 @pytest.fixture(scope="module")
 def benchmark():
     return load_script("dynamic_recordings")
+
+
+@pytest.mark.parametrize("path", [*ROOT.glob("benchmarks/*.py"), *ROOT.glob("tools/*.py")], ids=lambda path: path.name)
+def test_scripts_import_existing_names(path):
+    """Detects a script that nobody adapted to a change of the package, without running it for minutes."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dvrk_drake"):
+            module = importlib.import_module(node.module)
+            missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+            assert not [name for name in missing if importlib.util.find_spec(f"{node.module}.{name}") is None]
 
 
 def test_functions_are_timed_alternately_after_a_warm_up():
