@@ -54,6 +54,8 @@ lint: $(VENV)/.installed-lint
 # build needs no network.
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+	@! grep -rlE '<(script|link|img)[^>]+="https?://' docs/_build/html --include='*.html' || \
+	  { echo "These pages load files from the network."; exit 1; }
 	@echo "wrote docs/_build/html/index.html"
 
 # Wheel and source distribution, in dist.

@@ -103,7 +103,8 @@ class Recording:
     def is_motion(self) -> bool:
         """Returns whether the rows are samples of a motion.
 
-        These are at least `MIN_ROWS` rows at intervals below `MAX_PERIOD`. Times may decrease, see `has_increasing_times`. `motion` determines whether the arm moves.
+        These are at least `MIN_ROWS` rows at intervals below `MAX_PERIOD`. Times may decrease, see
+        `has_increasing_times`. `motion` determines whether the arm moves.
         """
         t = self.t
         return t is not None and len(t) >= MIN_ROWS and float(np.median(np.abs(np.diff(t)))) < MAX_PERIOD
