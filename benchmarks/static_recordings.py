@@ -41,7 +41,7 @@ def main() -> int:
             recording.measured_effort()
             recordings[path.stem] = recording
         except RecordingError as error:
-            print(f"not evaluated: {error}")
+            print(f"not evaluated: {error}", file=sys.stderr)
     console = Console(width=200, highlight=False)
     for name, raw in recordings.items():
         ours = identify_static(raw, arm)

@@ -36,16 +36,28 @@ def processor() -> str:
     return names[0] if names else platform.machine()
 
 
+def commit() -> str:
+    """Returns the commit of the repository, with "-dirty" if a file other than the page was changed."""
+    git = ["git", "-C", str(ROOT)]
+    name = subprocess.check_output([*git, "rev-parse", "--short=8", "HEAD"], text=True).strip()
+    changes = subprocess.check_output([*git, "status", "--porcelain", "-uno", ".", f":!{PAGE}"], text=True)
+    return f"{name}-dirty" if changes else name
+
+
 def conditions(seconds: float) -> str:
     """Returns a line on commit, date, computer, versions and duration."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
-    )
     versions = ", ".join(f"{name} {version(name)}" for name in ("drake", "numpy", "scipy"))
     return (
-        f"*Commit {commit.stdout.strip()}, {datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} cores of {processor()}, "
+        f"*Commit {commit()}, {datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} cores of {processor()}, "
         f"Python {platform.python_version()}, {versions}; {seconds:.0f} s.*"
     )
+
+
+def without_paths(text: str) -> str:
+    """Returns an output without paths of this computer, and without blanks at the ends of lines."""
+    text = text.replace(f"{ROOT}/", "").replace(os.environ.get("DVRK_DRAKE_SHARED") or "?", "$DVRK_DRAKE_SHARED")
+    text = re.sub(r"/tmp/tmp\.\w+", "$T", text)
+    return "\n".join(line.rstrip() for line in text.splitlines()).strip("\n")
 
 
 def measured(command: str) -> str | None:
@@ -58,7 +70,7 @@ def measured(command: str) -> str | None:
     )
     if result.returncode:
         return None
-    output = result.stdout.replace(f"{ROOT}/", "").strip("\n")
+    output = without_paths(result.stdout)
     # Markdown tables are shown as tables, other outputs as text.
     if not re.search(r"^\|( ?:?-+:? ?\|)+$", output, re.MULTILINE):
         output = f"```text\n{output}\n```"
