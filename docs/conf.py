@@ -10,8 +10,8 @@ sys.path.insert(0, str(DOCS))  # for the extension `pydrake_system`
 # The notebooks call `dvrk-drake`, and import the helper `embed`.
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 os.environ["PYTHONPATH"] = str(DOCS / "tutorials")
-# Width of the tables that commands print.
-os.environ["COLUMNS"] = "100"
+# Width of the tables that commands print. Wider lines do not fit into the page.
+os.environ["COLUMNS"] = "88"
 
 default_role = "literal"
 project = "dvrk_drake"
