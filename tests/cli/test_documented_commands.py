@@ -10,11 +10,22 @@ from repository import ROOT
 from dvrk_drake.cli import main
 from dvrk_drake.cli.app import app
 from dvrk_drake.cli.program import COMMANDS  # noqa: F401  (adds the commands)
+from dvrk_drake.models.arm_files import load_arm
 
 NAMES = [name for name in app if not name.startswith("-")]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("*.*")]
-#: Pattern for a command in a line of a code block or of a comment in an example.
-LINE = re.compile(r"^[ #$]*(?:[A-Z_]+=\S+ )*dvrk-drake (?P<words>[a-z].*)$", re.MULTILINE)
+#: Notebooks. The build of the documentation executes them, so the tests only check their commands.
+TUTORIALS = [*(ROOT / "docs/tutorials").glob("*.md")]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(ROOT / "docs").glob("*.md"),
+    *TUTORIALS,
+    *(ROOT / "examples").glob("*.*"),
+]
+#: Pattern for a command in a line of a code block, of a cell of a notebook (!), or of a comment in an example.
+LINE = re.compile(r"^[ #$!]*(?:[A-Z_]+=\S+ )*dvrk-drake (?P<words>[a-z].*)$", re.MULTILINE)
+#: Words that end a command in a shell.
+SHELL = ("|", "&", "&&", ";")
 #: Pattern for a command with an option in running text. The command may be incomplete.
 INLINE = re.compile(rf"`(?:dvrk-drake )?(?P<words>(?:{'|'.join(NAMES)}) [^`]*--[^`]*)`")
 
@@ -28,7 +39,8 @@ def test_documented_commands_are_valid(page):
     text = page.read_text()
     for found in LINE.finditer(text):
         words = shlex.split(found["words"], comments=True)
-        words = words[: words.index("|")] if "|" in words else words
+        end = next((i for i, word in enumerate(words) if word in SHELL or word.startswith(("2>", ">"))), len(words))
+        words = words[:end]
         if "..." in words or any(word.startswith("[") for word in words):
             continue  # the options of a pattern are checked below
         try:
@@ -43,7 +55,9 @@ def test_documented_commands_are_valid(page):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if "dvrk-drake samples" in page.read_text()], ids=lambda p: p.name
+    "page",
+    [page for page in PAGES if page not in TUTORIALS and "dvrk-drake samples" in page.read_text()],
+    ids=lambda p: p.name,
 )
 def test_commands_with_samples_run(page, tmp_path, monkeypatch):
     """The commands of a page run in their order, as a new user enters them."""
@@ -65,3 +79,20 @@ def test_printed_commands_have_valid_options():
 def test_documentation_contains_all_commands():
     text = "".join(page.read_text() for page in PAGES)
     assert {found["words"].split()[0] for found in LINE.finditer(text)} >= set(NAMES) - {"demo"}
+
+
+def test_files_and_commands_for_a_new_arm_work(tmp_path, monkeypatch):
+    """The files in docs/add_an_arm.md, whose first lines are their names, describe arms that the commands accept."""
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs/add_an_arm.md").read_text()
+    for block in re.findall(r"```(?:yaml|xml)\n(.*?)```", page, re.DOTALL):
+        name = re.match(r"(?:#|<!--) (\S+)", block)
+        (tmp_path / name[1]).write_text(block)
+    arms = {path.name for path in tmp_path.glob("*.yaml") if "mechanism:" in path.read_text()}
+    assert arms == {"my_mtml.yaml", "my_arm.yaml", "psm_with_probe.yaml"}
+    assert {load_arm(arm).name for arm in arms} == {"MTML", "MYARM", "PSM"}
+    commands = [shlex.split(found["words"], comments=True) for found in LINE.finditer(page)]
+    assert {word for words in commands for word in words if word in arms} == arms
+    for words in commands:
+        if words[0] in ("model", "simulate"):
+            assert main(words) == 0, f"dvrk-drake {' '.join(words)}"
