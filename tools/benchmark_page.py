@@ -63,7 +63,7 @@ def without_paths(text: str) -> str:
 def measured(command: str) -> str | None:
     """Runs a command in the repository and returns the text for the page, or None if the command fails."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path, "COLUMNS": "160", "PYTHONWARNINGS": "ignore"}
+    environment = {**os.environ, "PATH": path, "COLUMNS": "120", "PYTHONWARNINGS": "ignore"}
     start = time.perf_counter()
     result = subprocess.run(
         ["bash", "-c", command], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=False

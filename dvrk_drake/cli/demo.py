@@ -107,6 +107,7 @@ def reproduce(
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
     from dvrk_drake.reports.reproduction.run import NAMES
     from dvrk_drake.reports.reproduction.run import reproduce as reproduce_paper
+    from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
     recordings = PaperRecordings.find(data)
@@ -115,5 +116,8 @@ def reproduce(
     output = new_folder(folder, overwrite=overwrite)
     names = NAMES if what == "all" else (what,)
     with Steps(*names) as steps:
-        page = reproduce_paper(names, output, recordings, steps, seed=seed, command=command_words)
+        page, sections = reproduce_paper(names, output, recordings, steps, seed=seed, command=command_words)
+    console = make_console()
+    for section in sections:
+        console.print(f"{section.title}: {section.finding}", markup=False)
     print_written(page)

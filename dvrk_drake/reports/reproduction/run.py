@@ -41,7 +41,7 @@ def reproduce(
     sample_sizes: SampleSizes | None = None,
     seed: int = 0,
     command: Sequence[str] = (),
-) -> Path:
+) -> tuple[Path, list[Section]]:
     """Writes figures, tables and index.html. The function writes index.html again after each finished section.
 
     Args:
@@ -56,7 +56,7 @@ def reproduce(
         command: Words of the command line, for the provenance.
 
     Returns:
-        Path of index.html.
+        Path of index.html, and the finished sections.
 
     Raises:
         DvrkDrakeError: A name is not in `NAMES`.
@@ -80,7 +80,7 @@ def reproduce(
             sections.append(_MAKERS[name](session))
             unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
             page = write_page(folder, sections, [*left_out, *unfinished], Provenance.of(recordings.files, command))
-    return page
+    return page, sections
 
 
 def _within(progress: Progress, name: str) -> Progress:
