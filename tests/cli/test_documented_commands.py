@@ -38,7 +38,7 @@ def options_of(command):
 def test_documented_commands_are_valid(page):
     text = page.read_text()
     for found in LINE.finditer(text):
-        words = shlex.split(found["words"], comments=True)
+        words = shlex.split(found["words"].removesuffix("\\"), comments=True)
         end = next((i for i, word in enumerate(words) if word in SHELL or word.startswith(("2>", ">"))), len(words))
         words = words[:end]
         if "..." in words or any(word.startswith("[") for word in words):
