@@ -53,7 +53,7 @@ lint: $(VENV)/.installed-lint
 # The documentation site, in docs/_build/html. The tutorials are executed; unchanged ones are taken from a cache. The
 # build needs no network.
 docs: $(VENV)/.installed-docs
-	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
 	@! grep -rlE '<(script|link|img)[^>]+="https?://' docs/_build/html --include='*.html' || \
 	  { echo "These pages load files from the network."; exit 1; }
 	@echo "wrote docs/_build/html/index.html"
