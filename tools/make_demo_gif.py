@@ -61,7 +61,7 @@ def label(picture: Image.Image, time: float) -> Image.Image:
     font = ImageFont.load_default(TEXT_SIZE)
     started = [text for start, text in PHASES if start <= time]
     phase = started[-1].partition(":")[0]
-    outcomes = (": stays", ": moves away") if phase == "released" else ("", "")
+    outcomes = (": stays", ": falls") if phase == "released" else ("", "")
     lines = [(text + outcome, colour) for (text, colour), outcome in zip((ARM, GHOST), outcomes, strict=True)]
     draw.rectangle((0, 0, picture.width, 2.9 * TEXT_SIZE), fill="#f4f6f8")
     for i, (text, colour) in enumerate(lines):

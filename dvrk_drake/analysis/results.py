@@ -13,7 +13,7 @@ from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.verdict import Requirement, unfit, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary, Verdict
 from dvrk_drake.errors import DvrkDrakeError, ModelError
-from dvrk_drake.models.files import refuse_existing
+from dvrk_drake.models.files import Reportable, refuse_existing
 from dvrk_drake.recordings.recording import Recording
 
 
@@ -48,7 +48,7 @@ class ModelResult:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Identification(ModelResult):
+class Identification(ModelResult, Reportable):
     """Result of `identify`: a `StaticIdentification` or a `DynamicIdentification`.
 
     Attributes:
@@ -64,7 +64,7 @@ class Identification(ModelResult):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Validation(ABC):
+class Validation(Reportable, ABC):
     """Result of `validate`: a `StaticValidation` or a `DynamicValidation`.
 
     Attributes:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.support import check_output, command_words, interrupt_ends_process, print_written
+from dvrk_drake.cli.support import Steps, check_output, command_words, interrupt_ends_process, print_written
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def check_report(path: str | None, *inputs: str, overwrite: bool) -> None:
 
 
 def write_page(path: str | None, make: Callable[[Provenance], Page], *inputs: str) -> None:
-    """Writes the page that `make` returns for a provenance, and prints the path. None: does nothing.
+    """Writes the page that `make` returns for a provenance, shows progress, and prints the path. None: does nothing.
 
     Args:
         path: Path of the report.
@@ -51,5 +51,6 @@ def write_page(path: str | None, make: Callable[[Provenance], Page], *inputs: st
     from dvrk_drake.reports.html.provenance import Provenance
 
     if path is not None:
-        make(Provenance.of(inputs, command_words)).write(path)
+        with Steps("writing the report"):
+            make(Provenance.of(inputs, command_words)).write(path)
         print_written(path, "report")

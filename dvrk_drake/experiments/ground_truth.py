@@ -218,8 +218,20 @@ def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
     return GroundTruth(ground_truth_arm, model, False, origin)
 
 
-def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0) -> list[LinkInertia]:
-    """Returns the links with random changes of the masses (up to `SPREAD`) and centres of mass (up to `shift` [m])."""
+def perturbed_links(
+    arm: Arm,
+    generator: np.random.Generator,
+    shift: float = 0.0,
+    mass_ratios: tuple[float, float] = (1 - SPREAD, 1 + SPREAD),
+) -> list[LinkInertia]:
+    """Returns the links with random masses and centres of mass.
+
+    Args:
+        arm: Arm with the nominal links.
+        generator: Source of the random numbers.
+        shift: Maximum displacement of a centre of mass along each axis [m].
+        mass_ratios: Smallest and largest ratio of the mass of a link to its nominal mass.
+    """
     links = []
     for link in link_inertias(arm):
         parameters = link.parameters
@@ -230,7 +242,7 @@ def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0
             G = M.Shift(M.get_com()).get_unit_inertia().ShiftFromCenterOfMass(-com)
             shifted = SpatialInertia(M.get_mass(), com, UnitInertia(G))
             parameters = LinkInertia.from_spatial_inertia(link.link, shifted).parameters
-        links.append(LinkInertia(link.link, parameters * generator.uniform(1 - SPREAD, 1 + SPREAD)))
+        links.append(LinkInertia(link.link, parameters * generator.uniform(*mass_ratios)))
     return links
 
 

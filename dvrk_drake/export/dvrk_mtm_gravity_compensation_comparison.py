@@ -18,6 +18,7 @@ from dvrk_drake.export.dvrk_mtm_controller import (
 )
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
 from dvrk_drake.models.arm_files import known_arms
+from dvrk_drake.models.files import Reportable
 
 #: Factors (7,) that convert joint positions and torques of an arm to those of its mirror image. The wrists of MTML and
 #: MTMR are mirror images.
@@ -76,7 +77,7 @@ class JointComparison:
 
 
 @dataclass(frozen=True, eq=False)
-class CompensationComparison:
+class CompensationComparison(Reportable):
     """Comparison of the torques of a file and a model at random poses within the joint limits.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Opens input files with clear errors, and writes output files atomically."""
+"""Opens input files with clear errors, writes output files atomically, and base class of results with a report."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
@@ -166,3 +166,25 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+class Reportable:
+    """Base class of results that have an HTML report.
+
+    Packages of results must not import `dvrk_drake.reports`, which imports all of them. Therefore `report` calls the
+    public function `dvrk_drake.write_report`, which is imported when it is used.
+    """
+
+    def report(self, path: str | Path, *, inputs: Iterable[str | Path] = ()) -> None:
+        """Writes the HTML report of this result. The arguments are those of `dvrk_drake.write_report`.
+
+        Args:
+            path: File to write, e.g. "report.html". An existing file is replaced.
+            inputs: Input files. The report states their names and SHA-256.
+
+        Raises:
+            DvrkDrakeError: The file cannot be written.
+        """
+        import dvrk_drake
+
+        dvrk_drake.write_report(self, path, inputs=inputs)

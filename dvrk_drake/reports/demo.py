@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 
-from dvrk_drake.experiments.demo.demo import DemoResult
+from dvrk_drake.experiments.demo.demo import PLANS, DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.identification import print_static_parameters
@@ -26,10 +26,11 @@ With a real arm:
 5. Only if no verdict is "do not use":
    dvrk-drake run --arm {arm} --model model.yaml --mode damped
 """
-#: Note on the start of the release.
-START_OF_RELEASE = (
-    "The simulated arm has the friction, cables, stops and sensors of the arm file. At the start of the release, its "
-    "friction carries no load. After an approach from one side, a joint can move back or slip further than the limit."
+#: Note on the simulated arm and on the start of the release.
+GROUND_TRUTH = (
+    "The simulated arm has the friction, cables, stops and sensors of the arm file. Its links are {:g} to {:g} times "
+    "as heavy as in the SDF, except for its counterweights. At the start of the release, its friction carries no load. "
+    "After an approach from one side, a joint can move back or slip further than the limit."
 )
 
 
@@ -49,7 +50,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
         console,
         f"Verdict: the identified model {'holds' if result.holds('identified') else 'does not hold'} the released "
         f"{arm.name} for {duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the "
-        f"SDF, the same arm drifts by {largest['nominal']}.",
+        f"SDF, the same arm {result.nominal_outcome}. Its largest drift is {largest['nominal']}.",
         f"open {folder}/arm.html in a browser, or drift.png",
         style="green" if result.holds("identified") else "yellow",
     )
@@ -73,7 +74,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
         console.print(f"{purpose}\n  dvrk-drake identify {command}", markup=False, soft_wrap=True)
     if not verbose:
         return
-    print_note(console, START_OF_RELEASE)
+    print_note(console, GROUND_TRUTH.format(*PLANS[arm.source].mass_ratios))
     print_static_parameters(console, result.identification.model)
     console.print(WITH_A_REAL_ARM.format(arm=arm.source), markup=False)
 

@@ -124,6 +124,7 @@ def demonstrated(console, verbose):
         time=t,
         identified=0.005 * q,
         nominal=0.5 * q,
+        descent=0.005,
     )
     demo.print_demo(console, result, Path("demo_output"), verbose=verbose)
 

@@ -22,6 +22,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import Reportable
 from dvrk_drake.models.plant import shared_plant
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
@@ -181,7 +182,7 @@ def estimate_payload(
 
 
 @dataclass(frozen=True, eq=False)
-class PayloadIdentification:
+class PayloadIdentification(Reportable):
     """Result of `payload`.
 
     Attributes:

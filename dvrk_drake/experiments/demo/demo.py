@@ -19,6 +19,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.analysis.static.validation import StaticValidation, validate_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.errors import ArmError
 from dvrk_drake.experiments.ground_truth import APPROACH, collect_static_poses, perturbed_links, with_links
 from dvrk_drake.experiments.reproduction.drift_experiment import BAND
@@ -27,6 +28,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
@@ -58,18 +60,25 @@ COLOURS = "grey arm: identified model     orange arm: model of the SDF, not iden
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """Effects and poses of the demo for one type of arm.
+    """Ground truth and poses of the demo for one type of arm.
+
+    The links of the ground-truth arm are heavier than those of the SDF, as in a real arm with cables and covers.
+    Only the counterweights are not heavier. Therefore the arm falls if its controller uses the model of the SDF.
 
     Attributes:
         effects: Effects of the ground-truth arm that are neither in the nominal model nor in the arm file.
-        omitted: Names of effects of the arm file that the ground-truth arm does not have.
         release: Pose (n,) of the release [rad, m].
         home: Desired pose (n,) at the end of the simulation [rad, m].
+        mass_ratios: Smallest and largest ratio of the mass of a link to its mass in the SDF.
+        counterweights: Links with the inertia in the SDF.
+        omitted: Names of effects of the arm file that the ground-truth arm does not have.
     """
 
     effects: tuple[DriveEffect, ...]
     release: tuple[float, ...]
     home: tuple[float, ...]
+    mass_ratios: tuple[float, float]
+    counterweights: tuple[str, ...]
     omitted: tuple[str, ...] = ()
 
 
@@ -77,10 +86,12 @@ MTM_PLAN = DemoPlan(
     effects=(
         DriveEffect("joint.wrist_platform", "offset", 0.0, 0.02),
         DriveEffect("joint.wrist_platform", "cable sine", 1.0, 0.05),
-        DriveEffect("joint.wrist_pitch", "cable sine", 1.0, -0.03),
+        DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.01),
     ),
     release=(0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5),
     home=(0.0,) * 7,
+    mass_ratios=(1.1, 1.3),
+    counterweights=("crank_link",),
     # The spring balances a heavier wrist than that of the SDF, see `perturbed_ground_truth`.
     omitted=("springs",),
 )
@@ -93,8 +104,10 @@ PLANS = {
             DriveEffect("joint.roll", "cable sine", 1.0, 0.03),
             DriveEffect("joint.wrist_pitch", "offset", 0.0, 0.01),
         ),
-        release=(0.4, 0.3, 0.15, 0.6, 0.5, -0.3, 0.5),
+        release=(0.6, 0.3, 0.1, 0.6, 0.5, -0.3, 0.5),
         home=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0),
+        mass_ratios=(1.3, 1.5),
+        counterweights=("counterweight_link",),
     ),
 }
 
@@ -111,6 +124,7 @@ class DemoResult:
         time: Times (m,) while the arm is released, from the release on [s].
         identified: Positions (m, n) of the released arm with the identified model [rad, m].
         nominal: Positions (m, n) of the released arm with the nominal model [rad, m].
+        descent: Descent of the centre of mass of the released arm with the nominal model [m].
     """
 
     arm: Arm
@@ -120,6 +134,7 @@ class DemoResult:
     time: NDArray[np.float64]
     identified: NDArray[np.float64]
     nominal: NDArray[np.float64]
+    descent: float
 
     @property
     def drifts(self) -> dict[str, NDArray[np.float64]]:
@@ -135,6 +150,13 @@ class DemoResult:
     def holds(self, model: str) -> bool:
         """Tells whether all joints of the released arm stay within `limits` with a model of `drifts`."""
         return bool(np.all(self.drifts[model] <= self.limits))
+
+    @property
+    def nominal_outcome(self) -> str:
+        """Verb for the released arm with the nominal model: "stays", "falls" or "moves away"."""
+        if self.holds("nominal"):
+            return "stays"
+        return "falls" if self.descent > 0 else "moves away"
 
 
 def run_demo(
@@ -165,8 +187,12 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     generator = np.random.default_rng(seed)
     arm, plan = load_arm(arm_name), PLANS[arm_name]
     nominal = IdentifiedModel.from_arm(arm)
-    links = perturbed_links(arm, generator, shift=MAX_SHIFT)
-    ground_truth_arm = with_links(arm, links, true_sdf, "a simulated arm with random link inertias")
+    heavier = perturbed_links(arm, generator, shift=MAX_SHIFT, mass_ratios=plan.mass_ratios)
+    links = [
+        nominal_link if nominal_link.link in plan.counterweights else link
+        for link, nominal_link in zip(heavier, link_inertias(arm), strict=True)
+    ]
+    ground_truth_arm = with_links(arm, links, true_sdf, "a simulated arm with random, heavier links")
     effects = _effects(arm, plan)
 
     def station(meshcat: Meshcat | None = None) -> ArmStation:
@@ -210,7 +236,16 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
         time=t[window] - HELD_UNTIL,
         identified=released[window],
         nominal=with_nominal[window],
+        descent=_height(ground_truth_arm, with_nominal[window.start]) - _height(ground_truth_arm, with_nominal[-1]),
     )
+
+
+def _height(arm: Arm, q: NDArray[np.float64]) -> float:
+    """Returns the height of the centre of mass of an arm at the pose q (n,) [m]."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, q)
+    return float(plant.CalcCenterOfMassPositionInWorld(context)[2])
 
 
 def _effects(arm: Arm, plan: DemoPlan) -> ArmEffects:

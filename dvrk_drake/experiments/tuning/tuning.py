@@ -29,6 +29,7 @@ from dvrk_drake.experiments.tuning.procedure import JointProcedure, tune_joint
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.files import Reportable
 
 #: Duration of a step test, and of its final part in which the joints should be at rest [s].
 DURATION, REST_TIME = 2.0, 0.4
@@ -139,7 +140,7 @@ PROCEDURE_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Tuning:
+class Tuning(Reportable):
     """Result of tuning an arm.
 
     Attributes:

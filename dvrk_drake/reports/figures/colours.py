@@ -18,7 +18,7 @@ COMMANDED = "#780477"
 REFERENCE = "#2caa67"
 #: Limits of the arm, thresholds, and values beyond them.
 LIMIT = "#b42508"
-#: Context without a message of its own, for example zero torque.
+#: Context without a message of its own, for example zero torque or a tolerance band.
 NEUTRAL = "#c4c8cf"
 
 #: Mapping from a role to its colour.

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dvrk_drake.experiments.demo.demo import DemoResult
-from dvrk_drake.reports.figures.colours import FITTED, LIMIT, REFERENCE
+from dvrk_drake.reports.figures.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
 from dvrk_drake.reports.figures.identification import plot_torque_error
 from dvrk_drake.reports.figures.style import add_legend, joint_title, panel_grid, save_figure, set_title
 
@@ -43,7 +43,7 @@ def plot_drift(path: Path, result: DemoResult) -> None:
             "model of the SDF (not identified)": (1e3 * (result.nominal[:, j] - result.nominal[0, j]), REFERENCE, "--"),
             "identified model": (1e3 * (result.identified[:, j] - q0), FITTED, "-"),
         }
-        ax.axhspan(-held, held, color=LIMIT, alpha=0.15, linewidth=0, label=f"limit of a held joint: {limits}")
+        ax.axhspan(-held, held, color=NEUTRAL, alpha=0.5, linewidth=0, label=f"limit of a held joint: {limits}")
         for label, (values, colour, line) in drift.items():
             ax.plot(t, values, line, color=colour, linewidth=1.8, label=label)
         low, high = ax.get_ylim()
@@ -60,11 +60,7 @@ def plot_drift(path: Path, result: DemoResult) -> None:
     set_title(
         figure,
         f"The identified model {verdict} the released {arm.name}. "
-        + (
-            "The model of the SDF also holds it."
-            if result.holds("nominal")
-            else "With the model of the SDF, it moves away."
-        )
-        + "\nDrift from the release position; simulation with friction, cables, joint stops and sensors",
+        f"With the model of the SDF, it {result.nominal_outcome}."
+        "\nDrift from the release position; simulation with friction, cables, joint stops and sensors",
     )
     save_figure(figure, path)

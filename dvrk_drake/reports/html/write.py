@@ -28,9 +28,11 @@ def write_report(
 ) -> None:
     """Writes the HTML report of a result, one self-contained file.
 
+    The results that have a report also have a method for it: `result.report(path, inputs=...)`.
+
     Args:
         result: Result of a function of this package, e.g. `identify`.
-        path: File to write, e.g. "report.html".
+        path: File to write, e.g. "report.html". An existing file is replaced.
         inputs: Input files. The report states their names and SHA-256.
         command: Words of the command line that computed the result, without the name of the program.
 
@@ -45,6 +47,7 @@ def write_report(
         >>> exported = dvrk.export_model(model, "gc-MTML.json", "dvrk-gc", tolerance=1.0)
         >>> comparison = compare_compensation(GravityCompensationFile.load("gc-MTML.json"), model)
         >>> dvrk.write_report(comparison, "report.html", inputs=["gc-MTML.json"])
+        >>> comparison.report("report.html", inputs=["gc-MTML.json"])  # the same report
     """
     name = type(result).__name__
     if name not in _MAKERS:

@@ -1,5 +1,6 @@
 """Runs the demo with fewer poses: it must identify and hold the ground-truth arm."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -50,10 +51,29 @@ def test_demo_writes_everything(result):
     assert outcome.time[0] == 0.0 and outcome.time[-1] == demo.RELEASED_UNTIL - demo.HELD_UNTIL
 
 
-def test_identified_model_holds_but_nominal_does_not(result):
+def test_identified_model_holds_but_nominal_falls(result):
     _, outcome, _ = result
+    assert outcome.nominal_outcome == "falls" and outcome.descent > 0.003
     assert outcome.holds("identified") and np.all(outcome.drifts["identified"] < 0.015)
     assert not outcome.holds("nominal") and outcome.drifts["nominal"].max() > 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("arm", sorted(demo.PLANS))
+def test_demo_of_all_arms(arm, seed, tmp_path):
+    outcome = demo.run_demo(tmp_path, arm, seed)
+    assert outcome.holds("identified"), outcome.drifts["identified"]
+    assert outcome.nominal_outcome == "falls" and outcome.descent > 0.001
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "descent", "verb"), [(0.1, 1, "stays"), (10, 1, "falls"), (10, -1, "moves away")]
+)
+def test_outcome_with_nominal_model(result, amplitude, descent, verb):
+    _, outcome, _ = result
+    q = outcome.nominal[0] + np.outer([0, 1], amplitude * outcome.limits)
+    assert dataclasses.replace(outcome, nominal=q, descent=descent).nominal_outcome == verb
 
 
 def test_demo_error_is_below_nominal_model(result):
@@ -78,7 +98,7 @@ def test_drift_plot_shows_models_and_limit(result, tmp_path, monkeypatch):
         low, high = ax.get_ylim()
         assert low < -15 and high > 15, "the limit is visible"
         assert low <= min(map(np.min, lines.values())) and high >= max(map(np.max, lines.values()))
-    assert "holds" in figure.get_suptitle()
+    assert "holds" in figure.get_suptitle() and "it falls" in figure.get_suptitle()
 
 
 def test_demo_prints_verdict_and_next_commands(result):
@@ -87,6 +107,7 @@ def test_demo_prints_verdict_and_next_commands(result):
     print_demo(console, outcome, folder)
     text = console.export_text()
     assert text.startswith("Verdict: the identified model holds the released MTML for 4 s.")
+    assert "the same arm falls" in text
     assert f"Next: open {folder}/arm.html in a browser" in text
     assert f"dvrk-drake identify {folder}/poses.csv --arm mtml" in text and "--report report.html" in text
 

@@ -4,6 +4,7 @@ import hashlib
 import tempfile
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,14 @@ from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.models.files import Reportable
 from dvrk_drake.reports.html.compensation import compensation_page
 from dvrk_drake.reports.html.page import Command, Plot, Provenance, Table
 from dvrk_drake.reports.html.payload import payload_page
 from dvrk_drake.reports.html.study import study_page
 from dvrk_drake.reports.html.transparency import transparency_page
 from dvrk_drake.reports.html.tuning import tuning_page
+from dvrk_drake.reports.html.write import _MAKERS
 
 ORIGIN = Provenance.of()
 
@@ -102,6 +105,25 @@ def test_write_report_selects_the_page_by_type(tmp_path):
     with pytest.raises(DvrkDrakeError, match=r"there is no report for int; allowed: .*Tuning"):
         dvrk.write_report(1, tmp_path / "other.html")
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_result_writes_its_report(tmp_path):
+    recording = tmp_path / "recording.csv"
+    recording.write_text("q1\n0\n")
+    tuning = tuning_result()
+    tuning.report(tmp_path / "method.html", inputs=[recording])
+    dvrk.write_report(tuning, tmp_path / "function.html", inputs=[recording])
+    assert (tmp_path / "method.html").read_text() == (tmp_path / "function.html").read_text()
+    assert "recording.csv" in (tmp_path / "method.html").read_text()
+
+
+def test_all_results_with_a_page_have_the_method():
+    def names(kind):
+        return {kind.__name__}.union(*map(names, kind.__subclasses__()))
+
+    for module, _ in _MAKERS.values():
+        import_module(f"dvrk_drake.reports.html.{module}")
+    assert names(Reportable) >= _MAKERS.keys()
 
 
 @pytest.mark.slow
