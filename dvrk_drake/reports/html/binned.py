@@ -1,14 +1,18 @@
-"""Residuals over another quantity: dots, and the mean and standard deviation in bins."""
+"""Efforts of a recording, and their residuals over another quantity: dots, mean and standard deviation in bins."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.html.plot_style import COLOURS
 
 #: Largest number of dots in one panel, and number of bins.
@@ -23,6 +27,39 @@ MIN_SPAN = 0.01
 _PANEL, _AROUND = 230, 100
 #: Panel: title, label of the x axis, unit of the residuals, x (r,), residuals (r,).
 Panel = tuple[str, str, str, NDArray[np.float64], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedEfforts:
+    """Measured and predicted efforts in m rows.
+
+    Attributes:
+        model: Model of the predictions.
+        recording: Recording with the measured efforts.
+        measured: Measured efforts (m, n) [N m, N].
+        predicted: Name of the prediction ("fitted", "held out" or "predicted") -> predicted efforts (m, n) [N m, N].
+            The last one is the most independent of the measured efforts.
+    """
+
+    model: IdentifiedModel
+    recording: Recording
+    measured: NDArray[np.float64]
+    predicted: Mapping[str, NDArray[np.float64]]
+
+    @property
+    def arm(self) -> Arm:
+        """Arm of the model."""
+        return self.model.arm
+
+    @property
+    def judged(self) -> str:
+        """Name of the prediction whose residuals are plotted."""
+        return list(self.predicted)[-1]
+
+    @property
+    def residuals(self) -> NDArray[np.float64]:
+        """Measured minus predicted efforts (m, n) for the prediction `judged` [N m, N]."""
+        return self.measured - self.predicted[self.judged]
 
 
 def bin_means(

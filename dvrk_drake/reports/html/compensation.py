@@ -38,10 +38,10 @@ def compensation_page(
         [
             Section("Differences per joint", [*warnings, *printed.blocks]),
             Section("Torque over position", [_torque_plot(comparison), _problem_plot(comparison)]),
-            *printed.next_section,
         ],
         provenance,
         printed.level,
+        closing=printed.next_section,
     )
 
 

@@ -19,6 +19,8 @@ from dvrk_drake.dynamics.physical_consistency import (
     reached_bounds,
 )
 from dvrk_drake.errors import ArmError, ModelError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.reports.figures.colours import SERIES
 from dvrk_drake.reports.html.labels import NO_BREAK
 from dvrk_drake.reports.html.page import Block, Cell, Plot, Table, Text, Verdict
@@ -50,11 +52,24 @@ def consistency_blocks(model: IdentifiedModel) -> list[Block]:
     except ArmError as error:
         return [*blocks, Text(f"No bounding boxes: {error}", "warning"), link_table(links, regressor.links, {})]
     blocks.append(link_table(links, regressor.links, boxes))
+    if names := [name for name in _links_without_shape(model.arm) if name in boxes]:
+        blocks.append(
+            Text(
+                f"No shape in the SDF: {', '.join(names)}. The mechanism file states the bounding box of such a link. "
+                "For a rotor with a gear, the box is larger than the rotor, because the mass is small compared with "
+                "the reflected inertia."
+            )
+        )
     caption = (
         "Centre of mass of each link in its bounding box. 0 is the center of the box, -1 and 1 are its sides. Open "
         "symbols: SDF."
     )
     return [*blocks, Plot(centres_of_mass(links, regressor.links, boxes), caption)]
+
+
+def _links_without_shape(arm: Arm) -> list[str]:
+    links = (link for url in arm.sdf for link in compose_sdf([url]).iterfind("model/link"))
+    return [link.get("name", "") for link in links if link.find("visual") is None and link.find("collision") is None]
 
 
 def link_table(links: Sequence[LinkInertia], nominal: Sequence[LinkInertia], boxes: dict[str, BoundingBox]) -> Table:

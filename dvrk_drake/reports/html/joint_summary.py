@@ -137,9 +137,11 @@ def verdict_table(result: Result) -> Table:
         scale = f"{own.feedforward_scale:.2f}"
         error = f"{joint.error:.3g}" if np.isfinite(joint.error) else ""
         label = Label(joint.verdict, LEVELS[joint.verdict], why)
-        rows.append((joint.name, f"{joint.effort:.3g}", error, effort_unit(arm, k), ratio, scale, label))
+        limits = (f"{limit:.3g}", f"{100 * joint.error / limit:.1f} %" if error else "")
+        rows.append((joint.name, f"{joint.effort:.3g}", error, effort_unit(arm, k), ratio, *limits, scale, label))
+    columns = ("RMS effort", f"RMS {which}", "unit", "ratio", "effort limit", "error / limit", "feedforward scale")
     return Table(
-        ("joint", "RMS effort", f"RMS {which}", "unit", "ratio", "feedforward scale", "verdict"),
+        ("joint", *columns, "verdict"),
         rows,
         caption=f"Verdict on each joint from the {which}",
         note=_capitalized(rule_text(motion)),
@@ -207,9 +209,15 @@ def coverage_table(result: Result, q: NDArray[np.float64], v: NDArray[np.float64
             cells += [f"{np.sqrt(np.mean(v[:, j] ** 2)):.3g}", f"{np.abs(v[:, j]).max():.3g}"]
         rows.append(tuple(cells))
     header = ("joint", "unit", "position limits", "recorded", "covered")
-    speeds = () if v is None else ("RMS speed [unit/s]", "peak speed [unit/s]")
-    note = "" if v is None else "The arm file states no speed limits, so the table lists no relative speeds."
-    return Table((*header, *speeds), rows, caption="Positions and speeds of the joints in the recording", note=note)
+    if v is None:
+        return Table(header, rows, caption="Positions of the joints in the recording")
+    units = "; ".join(sorted({f"{length_unit(arm, j)}/s" for j in range(arm.num_joints)}, reverse=True))
+    return Table(
+        (*header, f"RMS speed [{units}]", f"peak speed [{units}]"),
+        rows,
+        caption="Positions and speeds of the joints in the recording",
+        note="The arm file states no speed limits, so the table lists no relative speeds.",
+    )
 
 
 def coverage_bars(arm: Arm, q: NDArray[np.float64]) -> go.Figure:

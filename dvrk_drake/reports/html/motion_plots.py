@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +12,7 @@ from plotly.subplots import make_subplots
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.html.binned import binned_residuals
+from dvrk_drake.reports.html.binned import ComparedEfforts, binned_residuals
 from dvrk_drake.reports.html.labels import effort_unit, joint_label, length_unit
 from dvrk_drake.reports.html.plot_style import line
 
@@ -27,30 +23,21 @@ _PANEL, _AROUND = 150, 130
 
 
 @dataclass(frozen=True, eq=False)
-class MotionEfforts:
+class MotionEfforts(ComparedEfforts):
     """Efforts of the actuators during a motion, after low-pass filtering.
 
     Attributes:
-        model: Model of the predictions.
-        recording: Recording of the motion.
         grid: Resampled motion.
         t: Times (r,) since the start of the recording [s].
         q, v: Positions [rad, m] and velocities (r, n) of the actuators.
-        measured: Measured efforts (r, n) [N m, N].
-        predicted: Name of the prediction ("fitted", "held out" or "predicted") -> predicted efforts (r, n) [N m, N].
-            The last one is the most independent of the measured efforts.
         period: Period of the motion [s], or None if the motion does not repeat.
         repeatability: RMS differences (n,) of the efforts between periods [N m, N], 0 if the motion does not repeat.
     """
 
-    model: IdentifiedModel
-    recording: Recording
     grid: MotionGrid
     t: NDArray[np.float64]
     q: NDArray[np.float64]
     v: NDArray[np.float64]
-    measured: NDArray[np.float64]
-    predicted: Mapping[str, NDArray[np.float64]]
     period: float | None
     repeatability: NDArray[np.float64]
 
@@ -76,21 +63,6 @@ class MotionEfforts:
             period=result.period,
             repeatability=np.array(repeatability),
         )
-
-    @property
-    def arm(self) -> Arm:
-        """Arm of the model."""
-        return self.model.arm
-
-    @property
-    def judged(self) -> str:
-        """Name of the prediction whose residuals are plotted."""
-        return list(self.predicted)[-1]
-
-    @property
-    def residuals(self) -> NDArray[np.float64]:
-        """Measured minus predicted efforts (r, n) for the prediction `judged` [N m, N]."""
-        return self.measured - self.predicted[self.judged]
 
 
 def efforts_over_time(efforts: MotionEfforts) -> tuple[go.Figure, str]:

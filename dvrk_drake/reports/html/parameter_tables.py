@@ -47,7 +47,9 @@ def parameter_tables(model: IdentifiedModel) -> list[Block]:
 
 
 def _estimate(value: float, standard_error: float) -> tuple[str, str]:
-    return f"{value:.4g}", interval(value, standard_error)
+    """Returns an estimate, rounded to the digits of its 95 % interval, and this interval."""
+    half = INTERVAL * standard_error
+    return (_rounded(value, half) if half > 0 else _number(value)), interval(value, standard_error)
 
 
 def _number(value: float) -> str:
@@ -60,10 +62,16 @@ def interval(value: float, standard_error: float) -> str:
     half = INTERVAL * standard_error
     if half == 0:
         return "none"
-    digits = max(0, 1 - int(np.floor(np.log10(half))))
-    if digits > 6:
-        return f"{value - half:.2e}{NO_BREAK}.. {value + half:.2e}"
-    return f"{value - half:.{digits}f}{NO_BREAK}.. {value + half:.{digits}f}"
+    return f"{_rounded(value - half, half)}{NO_BREAK}.. {_rounded(value + half, half)}"
+
+
+def _rounded(value: float, uncertainty: float) -> str:
+    """Returns a value, rounded to the second significant digit of its uncertainty."""
+    digits = max(0, 1 - int(np.floor(np.log10(uncertainty))))
+    value = round(value, digits) + 0.0  # without the sign of -0.0
+    if digits <= 6:
+        return f"{value:.{digits}f}"
+    return f"{value:.{digits + int(np.floor(np.log10(abs(value))))}e}" if value else "0"
 
 
 def _gravity_parameters(model: IdentifiedModel) -> Table:

@@ -26,18 +26,19 @@ def payload_page(result: PayloadIdentification, provenance: Provenance, model_pa
     printed = printed_by(print_payload, result, model_path=model_path, verbose=True)
     tables = printed.blocks if result.payload.found else [Text("No payload was found on this link."), *printed.blocks]
     warnings = [Text(str(warning), "warning") for warning in result.warnings]
-    count = 1 if result.payload.found else 2
+    estimate, links, *efforts = tables
     sections = [
-        Section("Estimate", [*tables[:count], *warnings]),
-        Section("Links", [_link_plot(result.estimates, result.payload), *tables[count:]]),
-        Section("Efforts", [_effort_plot(result.payload)]),
+        Section("Estimate", [estimate, *warnings]),
+        Section("Links", [_link_plot(result.estimates, result.payload), links]),
+        Section("Efforts", [_effort_plot(result.payload), *efforts]),
     ]
     return Page(
         f"Payload of {result.model.arm.name}",
         printed.answer,
-        [*sections, *printed.next_section],
+        sections,
         provenance,
         printed.level,
+        closing=printed.next_section,
     )
 
 

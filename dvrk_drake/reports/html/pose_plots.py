@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +13,7 @@ from plotly.subplots import make_subplots
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.html.binned import binned_residuals
+from dvrk_drake.reports.html.binned import ComparedEfforts, binned_residuals
 from dvrk_drake.reports.html.labels import effort_unit, joint_label, length_unit
 from dvrk_drake.reports.html.plot_style import COLOURS
 
@@ -31,24 +28,15 @@ _PANEL, _AROUND, _SQUARE = 150, 130, 290
 
 
 @dataclass(frozen=True, eq=False)
-class PoseEfforts:
-    """Holding efforts at m poses.
+class PoseEfforts(ComparedEfforts):
+    """Holding efforts at m poses, in the coordinates of the recording.
 
     Attributes:
-        model: Model of the predictions.
-        recording: Poses in the coordinates of the efforts.
-        measured: Measured efforts (m, n) [N m, N].
-        predicted: Name of the prediction ("fitted", "held out" or "predicted") -> predicted efforts (m, n) [N m, N].
-            The last one is the most independent of the measured efforts.
         drawn: Mask (m, n) of the efforts that are holding torques.
         usable: Mask (m, n) of the efforts that are holding torques and are not excluded.
         excluded: Excluded measurements and the reasons.
     """
 
-    model: IdentifiedModel
-    recording: Recording
-    measured: NDArray[np.float64]
-    predicted: Mapping[str, NDArray[np.float64]]
     drawn: NDArray[np.bool_]
     usable: NDArray[np.bool_]
     excluded: Sequence[ExcludedMeasurement]
@@ -64,21 +52,6 @@ class PoseEfforts:
                 "held out": measured - result.cross_validation_residuals,
             }
         return cls(result.model, result.recording, measured, predicted, result.measured, result.usable, result.excluded)
-
-    @property
-    def arm(self) -> Arm:
-        """Arm of the model."""
-        return self.model.arm
-
-    @property
-    def judged(self) -> str:
-        """Name of the prediction whose residuals are plotted."""
-        return list(self.predicted)[-1]
-
-    @property
-    def residuals(self) -> NDArray[np.float64]:
-        """Measured minus predicted efforts (m, n) for the prediction `judged` [N m, N]."""
-        return self.measured - self.predicted[self.judged]
 
 
 def efforts_of_poses(efforts: PoseEfforts) -> go.Figure:

@@ -41,10 +41,10 @@ def study_page(study: Study, rows: Mapping[int, Row], provenance: Provenance, st
             Section("Results", [block for block in printed.blocks if getattr(block, "level", "") != "warning"]),
             Section("Distributions", plots),
             *failed_runs,
-            *printed.next_section,
         ],
         provenance,
         printed.level,
+        closing=printed.next_section,
     )
 
 

@@ -32,10 +32,10 @@ def transparency_page(arm: Arm, forces: Sequence[OperatorForces], provenance: Pr
         [
             Section("Interaction force and torque", [*printed.blocks, summary_plot(forces)]),
             Section("Over time", [time_plot(forces)]),
-            *printed.next_section,
         ],
         provenance,
         printed.level,
+        closing=printed.next_section,
     )
 
 

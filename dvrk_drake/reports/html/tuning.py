@@ -37,11 +37,11 @@ def tuning_page(tuning: Tuning, provenance: Provenance, gains_path: str | None =
         [
             Section("Comparison of the gains", [first]),
             *([Section("Step responses", plots)] if plots else []),
-            *printed.next_section,
             Section("Tuning methods, joints and poses", details),
         ],
         provenance,
         printed.level,
+        closing=printed.next_section,
     )
 
 

@@ -1,6 +1,7 @@
 """Report of identify and validate: numbers in tables and figures, options of the commands, page in a browser."""
 
 from importlib.resources import files
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,13 +15,13 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import bounding_boxes
 from dvrk_drake.reports.html.binned import bin_means
-from dvrk_drake.reports.html.consistency import centres_of_mass, link_table
+from dvrk_drake.reports.html.consistency import centres_of_mass, consistency_blocks, link_table
 from dvrk_drake.reports.html.error_budget import error_budget, motion_budget, pose_budget
 from dvrk_drake.reports.html.identification import identification_page
-from dvrk_drake.reports.html.joint_summary import verdict_table
+from dvrk_drake.reports.html.joint_summary import coverage_table, verdict_table
 from dvrk_drake.reports.html.motion_plots import MAX_ROWS, MotionEfforts, efforts_over_time, extremes
 from dvrk_drake.reports.html.page import Command, Meshcat, Table, Verdict
-from dvrk_drake.reports.html.parameter_tables import INTERVAL, interval, parameter_tables
+from dvrk_drake.reports.html.parameter_tables import INTERVAL, _estimate, interval, parameter_tables
 from dvrk_drake.reports.html.playback import MAX_FRAMES, MAX_RATE, frame_times
 from dvrk_drake.reports.html.pose_plots import PoseEfforts, predicted_over_measured
 from dvrk_drake.reports.html.provenance import Provenance
@@ -171,6 +172,48 @@ def test_interval_contains_the_estimate():
         assert lower < value < upper
         assert (upper - lower) / 2 == pytest.approx(INTERVAL * error, rel=0.1)
     assert interval(1.0, 0.0) == "none"
+
+
+def test_estimate_has_the_digits_of_its_interval():
+    for value, error, text in (
+        (-8e-15, 0.4, "0.00"),
+        (6.8884, 0.7, "6.9"),
+        (0.0415, 0.0033, "0.0415"),
+        (-3.2e-10, 6.4e-8, "0"),
+        (1.2981e-7, 6.4e-8, "1.3e-07"),
+        (-2e-4, 3e-6, "-2.000e-04"),
+        (1.23456, 0.0, "1.235"),
+        (1e-15, 0.0, "0"),
+    ):
+        assert _estimate(value, error)[0] == text
+
+
+def test_table_of_verdicts_compares_with_the_effort_limit(poses, motion):
+    for result in (poses, motion):
+        table, arm = verdict_table(result), result.model.arm
+        columns = (table.header.index(name) for name in ("effort limit", "error / limit", table.header[2]))
+        limits, ratios, errors = ([row[k] for row in table.rows] for k in columns)
+        assert [float(limit) for limit in limits] == pytest.approx(arm.effort_limits, rel=0.01)
+        expected = [100 * float(e) / limit for e, limit in zip(errors, arm.effort_limits, strict=True)]
+        assert [float(ratio.removesuffix(" %")) for ratio in ratios] == pytest.approx(expected, abs=0.06, rel=0.01)
+
+
+@pytest.mark.parametrize(("arm", "units"), [("mtml", "[rad/s]"), ("psm", "[rad/s; m/s]")])
+def test_speeds_have_the_units_of_the_arm(arm, units):
+    model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm(arm))
+    q = np.zeros((2, 7))
+    header = coverage_table(SimpleNamespace(model=model), q, q).header
+    assert header[-2:] == (f"RMS speed {units}", f"peak speed {units}")
+    assert not any("speed" in name for name in coverage_table(SimpleNamespace(model=model), q, None).header)
+
+
+@pytest.mark.parametrize(("arm", "explained"), [("mtml", True), ("psm", False)])
+def test_bounding_box_of_a_rotor_is_explained(arm, explained):
+    blocks = consistency_blocks(dvrk.IdentifiedModel.from_arm(dvrk.load_arm(arm)))
+    assert (
+        any(block.kind == "text" and "No shape in the SDF: motor_4_link." in block.text for block in blocks)
+        == explained
+    )
 
 
 def test_key_frames_are_limited():

@@ -60,7 +60,7 @@ SLOW = {"payload"}
 
 
 def blocks(page, kind):
-    return [block for section in page.sections for block in section.blocks if isinstance(block, kind)]
+    return [block for section in (*page.sections, *page.closing) for block in section.blocks if isinstance(block, kind)]
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in PAGES])
