@@ -28,11 +28,30 @@ def check_report(open_page, path):
         )
         assert min(sizes, default=12) >= 12, "9 pt are 12 px"
     assert path.stat().st_size < 10e6
+    check_resized(opened)
     text = printed_text(opened, path.parent)
     if text is not None:
         words = " ".join(text.split())
         assert all(" ".join(title.split()) in words for title in opened.page.locator("h1, h2").all_inner_texts())
     return opened
+
+
+def check_resized(opened):
+    """Checks that plots keep their height when the window is resized, also in print and afterwards."""
+    heights = """[...document.querySelectorAll('.canvas')].map(
+      (plot) => [plot.clientHeight, plot.querySelector('.main-svg').clientHeight, plot._fullLayout.height])"""
+    before = opened.page.evaluate(heights)
+    assert all(len(set(plot)) == 1 for plot in before)
+    opened.page.set_viewport_size({"width": 1400, "height": 800})
+    opened.wait_for("[...document.querySelectorAll('.canvas')].every((p) => p._fullLayout.width === p.clientWidth)")
+    assert opened.page.evaluate(heights) == before
+    opened.page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    printed = opened.page.evaluate(heights)
+    assert printed == [[min(height, 920) for height in plot] for plot in before]
+    opened.page.evaluate("dispatchEvent(new Event('afterprint'))")
+    opened.page.set_viewport_size({"width": 1280, "height": 800})
+    opened.wait_for("[...document.querySelectorAll('.canvas')].every((p) => p._fullLayout.width === p.clientWidth)")
+    assert opened.page.evaluate(heights) == before
 
 
 def printed_text(opened, tmp_path):

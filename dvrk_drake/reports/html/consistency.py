@@ -61,7 +61,7 @@ def consistency_blocks(model: IdentifiedModel) -> list[Block]:
             )
         )
     caption = (
-        "Centre of mass of each link in its bounding box. 0 is the center of the box, -1 and 1 are its sides. Open "
+        "Centre of mass of each link in its bounding box. 0 is the centre of the box, -1 and 1 are its sides. Open "
         "symbols: SDF."
     )
     return [*blocks, Plot(centres_of_mass(links, regressor.links, boxes), caption)]

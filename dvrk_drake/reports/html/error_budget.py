@@ -99,7 +99,13 @@ def error_budget(budgets: Sequence[JointBudget]) -> go.Figure:
             x=[100 * (budget.repeatability or 0.0) for budget in known],
             mode="markers",
             name="repeatability",
-            marker={"symbol": "line-ns", "size": 22, "line": {"width": 2.5, "color": COLOURS["measured"]}},
+            # A white edge separates the marker from dark bars.
+            marker={
+                "symbol": "diamond-tall",
+                "size": 17,
+                "color": COLOURS["measured"],
+                "line": {"width": 1.5, "color": "white"},
+            },
             hovertemplate="%{y}: repeatability %{x:.2g} %",
         )
     figure.update_layout(

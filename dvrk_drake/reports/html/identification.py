@@ -197,7 +197,7 @@ def _view(efforts: Efforts, t: NDArray[np.float64], q: NDArray[np.float64], tau:
     try:
         html = playback(efforts.arm, t, q, tau)
     except DvrkDrakeError as error:
-        return [Text(f"No 3D view: {error}", "warning")]
+        return [Text(f"No 3D view: {error}.", "warning")]
     caption = "Recorded poses. Click a plot to show a pose."
     if isinstance(efforts, MotionEfforts):
         caption = "Recorded motion. Click a plot to move the arm to this time."

@@ -25,7 +25,7 @@ def payload_page(result: PayloadIdentification, provenance: Provenance, model_pa
     """
     printed = printed_by(print_payload, result, model_path=model_path, verbose=True)
     tables = printed.blocks if result.payload.found else [Text("No payload was found on this link."), *printed.blocks]
-    warnings = [Text(str(warning), "warning") for warning in result.warnings]
+    warnings = [Text(str(warning).removeprefix("warning: "), "warning") for warning in result.warnings]
     estimate, links, *efforts = tables
     sections = [
         Section("Estimate", [estimate, *warnings]),

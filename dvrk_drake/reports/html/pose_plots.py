@@ -119,7 +119,7 @@ def predicted_over_measured(efforts: PoseEfforts) -> go.Figure:
             line={"color": COLOURS["zero"], "width": 1},
             **at,
         )
-        figure.update_xaxes(title_text=f"measured [{effort_unit(arm, j)}]", nticks=5, **at)
+        figure.update_xaxes(title_text=f"measured [{effort_unit(arm, j)}]", nticks=4, tickangle=0, **at)
         figure.update_yaxes(title_text=f"predicted [{effort_unit(arm, j)}]", nticks=5, **at)
     figure.update_layout(height=60 + _SQUARE * rows)
     figure.update_annotations(font_size=13)

@@ -11,15 +11,21 @@ from dvrk_drake.systems.arm_view.arm_view import DEGREES, EFFORTS, FRAMES, HOME,
 from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
-def test_sliders_keep_the_loop_closed(open_page, name):
+def open_view(open_page, name):
+    """Returns an arm, its view with buttons and sliders, and the page with open controls."""
     arm = load_arm(name)
     view = ArmView(arm, start_meshcat(arm))
     view.add_view_buttons()
     view.add_sliders()
     page = open_page(tracked_url(view.meshcat))
     open_controls(page, 10)
+    return arm, view, page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+def test_sliders_keep_the_loop_closed(open_page, name):
+    arm, view, page = open_view(open_page, name)
     plant = shared_plant(arm)
     for joint, slider in zip(arm.joint_names, view._sliders.names, strict=True):
         link = plant.GetJointByName(joint).child_body().name()
@@ -29,7 +35,9 @@ def test_sliders_keep_the_loop_closed(open_page, name):
             drag(page, slider, share)
             wait_until(lambda b=before, s=slider: view.meshcat.GetSliderValue(s) != b, f"slider {slider} at {share}")
             q = view.follow_controls()
-            expected = plant_link_pose(plant, arm, q, link)
+            context = plant.CreateDefaultContext()
+            set_arm_positions(plant, context, arm, q)
+            expected = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(link)).GetAsMatrix4()
             wait_until(
                 lambda e=expected, li=link: np.allclose(link_poses(page, arm, [li])[0], e, rtol=0, atol=1e-5),
                 f"the browser draws {link}",
@@ -42,21 +50,10 @@ def test_sliders_keep_the_loop_closed(open_page, name):
     assert not page.requests
 
 
-def plant_link_pose(plant, arm, q, link):
-    context = plant.CreateDefaultContext()
-    set_arm_positions(plant, context, arm, q)
-    return plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(link)).GetAsMatrix4()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_buttons_change_the_view(open_page, name):
-    arm = load_arm(name)
-    view = ArmView(arm, start_meshcat(arm))
-    view.add_view_buttons()
-    view.add_sliders()
-    page = open_page(tracked_url(view.meshcat))
-    open_controls(page, 10)
+    arm, view, page = open_view(open_page, name)
     overlay = f"['drake', '{arm.name.lower()}', 'overlay'"
     visible = f"viewer.scene_tree.find({overlay}, '{{}}']).object.visible"
 

@@ -19,6 +19,8 @@
   for (const packed of document.querySelectorAll("script[data-plot]")) {
     const figure = JSON.parse(await unpack(packed));
     const element = document.getElementById(packed.dataset.plot);
+    // When the window is resized, Plotly forgets the height of the layout and uses that of the element.
+    element.style.height = `${figure.layout.height}px`;
     await Plotly.newPlot(element, figure.data, figure.layout, CONFIG);
     plots.push(element);
   }
@@ -169,8 +171,10 @@
   window.addEventListener("beforeprint", () => {
     document.querySelectorAll("details").forEach((details) => { details.open = true; });
     for (const plot of plots) {
-      plot.screenHeight = plot.layout.height;
-      Plotly.relayout(plot, { width: PRINT_WIDTH, height: Math.min(plot.screenHeight, PRINT_HEIGHT) });
+      plot.screenHeight = parseFloat(plot.style.height);
+      const height = Math.min(plot.screenHeight, PRINT_HEIGHT);
+      plot.style.height = `${height}px`;
+      Plotly.relayout(plot, { width: PRINT_WIDTH, height });
     }
     for (const view of views) {
       const viewer = viewerOf(view), printed = view.figure.querySelector(".printed");
@@ -183,7 +187,10 @@
     }
   });
   window.addEventListener("afterprint", () => {
-    for (const plot of plots) Plotly.relayout(plot, { width: null, height: plot.screenHeight, autosize: true });
+    for (const plot of plots) {
+      plot.style.height = `${plot.screenHeight}px`;
+      Plotly.relayout(plot, { width: null, height: null, autosize: true });
+    }
   });
   document.documentElement.dataset.ready = "yes";
 })();
