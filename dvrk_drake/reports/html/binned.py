@@ -13,7 +13,7 @@ from plotly.subplots import make_subplots
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.html.plot_style import COLOURS
+from dvrk_drake.reports.html.plot_style import COLOURS, axis_range
 
 #: Largest number of dots in one panel, and number of bins.
 MAX_DOTS, BINS = 600, 25
@@ -21,8 +21,6 @@ MAX_DOTS, BINS = 600, 25
 MIN_PER_BIN = 8
 #: Smallest width of a bin, as a share of the range.
 MIN_BIN_WIDTH = 0.01
-#: Smallest range of x for which the axis shows only this range [rad, m, rad/s, m/s].
-MIN_SPAN = 0.01
 #: Height of one row of panels, and of the legend [px].
 _PANEL, _AROUND = 230, 100
 #: Panel: title, label of the x axis, unit of the residuals, x (r,), residuals (r,).
@@ -107,9 +105,7 @@ def binned_residuals(panels: Sequence[Panel], columns: int) -> tuple[go.Figure, 
         every = max(every, step)
         _add_panel(figure, k // columns + 1, k % columns + 1, x, residuals, step, first=k == 0)
         figure.update_xaxes(title_text=axis, nticks=5, tickangle=0, row=k // columns + 1, col=k % columns + 1)
-        if np.ptp(x) < MIN_SPAN:  # the joint hardly moves
-            ends = [float(x.mean()) - MIN_SPAN, float(x.mean()) + MIN_SPAN]
-            figure.update_xaxes(range=ends, row=k // columns + 1, col=k % columns + 1)
+        figure.update_xaxes(**axis_range(x), row=k // columns + 1, col=k % columns + 1)
         figure.update_yaxes(title_text=f"[{unit}]", row=k // columns + 1, col=k % columns + 1)
     figure.update_layout(height=height)
     figure.update_annotations(font_size=13)

@@ -16,7 +16,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.html.labels import coordinate_units
 from dvrk_drake.reports.html.motion_plots import MotionEfforts
-from dvrk_drake.reports.html.plot_style import COLOURS
+from dvrk_drake.reports.html.plot_style import COLOURS, axis_range
 
 #: Number of points of a curve, and largest number of dots in a panel.
 _POINTS, _DOTS = 201, 500
@@ -84,6 +84,7 @@ def torque_over_position(
             used = row != 0
             dots = position_curve(own, name, x) + residuals[:, used] @ row[used] / (row @ row)
         _add_curve(figure, k, x, dots, curve, position_curve(own, name, curve))
+        figure.update_xaxes(**axis_range(x), **_at(figure, k))
         effort, length = coordinate_units(arm, name)
         _label_axes(figure, k, f"position [{length}]", f"torque [{effort}]" if effort == "N m" else f"force [{effort}]")
     return figure

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import plotly.graph_objects as go
+from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from dvrk_drake.reports.figures.colours import ROLES, SERIES
@@ -15,6 +18,8 @@ FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans'
 SMALLEST_TEXT = 12
 #: Height of a plot whose figure has no height [px].
 DEFAULT_HEIGHT = 380
+#: Smallest range of positions or speeds for which an axis shows only this range [rad, m, rad/s, m/s].
+MIN_SPAN = 0.01
 _INK, _LINE, _GRID = "#1b2733", "#6b7785", "#e3e7eb"
 _AXIS = {
     "showgrid": True,
@@ -57,6 +62,13 @@ TEMPLATE = go.layout.Template(
 def series_colour(i: int) -> str:
     """Returns the colour of the i-th series of a plot in which the series have no roles."""
     return SERIES[i % len(SERIES)]
+
+
+def axis_range(x: NDArray[np.float64]) -> dict[str, Any]:
+    """Returns the settings of an axis for positions or speeds x (m,). Its range is at least 2 `MIN_SPAN`."""
+    if len(x) and np.ptp(x) < MIN_SPAN:  # The joint hardly moves. Without a range, the ticks show rounding errors.
+        return {"range": [float(x.mean()) - MIN_SPAN, float(x.mean()) + MIN_SPAN]}
+    return {}
 
 
 def transparent(colour: str, opacity: float) -> str:

@@ -23,6 +23,7 @@ from dvrk_drake.reports.html.motion_plots import MAX_ROWS, MotionEfforts, effort
 from dvrk_drake.reports.html.page import Command, Meshcat, Table, Verdict
 from dvrk_drake.reports.html.parameter_tables import INTERVAL, _estimate, interval, parameter_tables
 from dvrk_drake.reports.html.playback import MAX_FRAMES, MAX_RATE, frame_times
+from dvrk_drake.reports.html.plot_style import axis_range
 from dvrk_drake.reports.html.pose_plots import PoseEfforts, predicted_over_measured
 from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.html.write import write_report
@@ -214,6 +215,13 @@ def test_bounding_box_of_a_rotor_is_explained(arm, explained):
         any(block.kind == "text" and "No shape in the SDF: motor_4_link." in block.text for block in blocks)
         == explained
     )
+
+
+def test_axis_of_a_joint_at_rest_does_not_show_rounding_errors():
+    lower, upper = axis_range(np.full(5, -0.0118) + 1e-12 * np.arange(5))["range"]
+    assert lower < -0.0118 < upper
+    assert upper - lower > 1e-3
+    assert axis_range(np.array([0.0, 1.0])) == {}
 
 
 def test_key_frames_are_limited():
