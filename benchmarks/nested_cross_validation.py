@@ -45,9 +45,8 @@ def main() -> None:
         held_out = (problem.fold >= first) & (problem.fold < first + NUM_HELD_OUT_FOLDS)
         before = (problem.fold == (first - 1) % FOLDS) & problem.edge[:, 1]
         after = (problem.fold == (first + NUM_HELD_OUT_FOLDS) % FOLDS) & problem.edge[:, 0]
-        selection = select_effects(problem.subset(~(held_out | before | after)))
-        fit = selection.problem.consistent(selection.effects, selection.weights)
-        part = replace(problem.subset(held_out), tilt=selection.problem.tilt)
+        selection, fit = select_effects(problem.subset(~(held_out | before | after))).consistent()
+        part = replace(problem.subset(held_out), tilt=selection.problem.tilt).with_fit(fit)
         errors = np.sum((part.columns.tau - part.predict(selection.effects, fit.x)) ** 2, axis=0)
         squares += errors
         show(f"phases {first}-{first + NUM_HELD_OUT_FOLDS - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))

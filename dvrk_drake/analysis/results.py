@@ -156,8 +156,11 @@ class Prediction:
 
     Attributes:
         tau: Predicted efforts (m, n), in the coordinates of the recording [N m, N].
+        half_width: Half widths (n,) of the 95 % prediction intervals (`DynamicModel.half_width`), in the coordinates of
+            the recording [N m, N]. None for holding torques.
         warnings: Findings of `check`. `str` of a finding is one line.
     """
 
     tau: NDArray[np.float64]
+    half_width: NDArray[np.float64] | None = None
     warnings: tuple[Finding, ...] = ()

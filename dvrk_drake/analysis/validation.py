@@ -91,8 +91,8 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
 
     Returns:
         Result with efforts `tau` (m, n) [N m, N] in the coordinates of the recording, and `warnings`. For a motion and
-        a model with dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification.
-        Otherwise, `tau` contains holding torques.
+        a model with dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification,
+        and `half_width` the half widths of their 95 % prediction intervals. Otherwise, `tau` contains holding torques.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute
@@ -116,7 +116,10 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     share = step_progress(progress, "predicting")
     share(0.0)
     tau = predict_motion(model, recording)
+    half_width = model.dynamic_model.half_width
     if recording.coordinates == "joint":
         tau = arm.transmission.pull_back_effort(tau)
+        # The errors of the actuators are independent.
+        half_width = np.sqrt(half_width**2 @ arm.transmission.matrix**2)
     share(1.0)
-    return Prediction(tau, report.warnings)
+    return Prediction(tau, half_width if np.all(half_width > 0) else None, report.warnings)

@@ -229,8 +229,11 @@ def predict(
     In all other cases, the command predicts the holding efforts.
 
     Args:
-        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the printed coordinates.
+        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the printed coordinates. For a
+            motion, the columns lower1..lowern and upper1..uppern are the limits of the 95 % prediction interval.
     """
+    import numpy as np
+
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
@@ -238,8 +241,11 @@ def predict(
     with Steps(*_STEPS, "predicting") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
         prediction = dvrk.predict(loaded, read, progress=steps)
-    tau = prediction.tau
-    write_csv(output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
+    columns = {"tau": (tau := prediction.tau)}
+    if prediction.half_width is not None:
+        columns |= {"lower": tau - prediction.half_width, "upper": tau + prediction.half_width}
+    names = [f"{name}{i + 1}" for name in columns for i in range(tau.shape[1])]
+    write_csv(output, names, np.hstack(list(columns.values())))
     print_warnings(make_console(), prediction.warnings)
     print_written(output, f"{len(tau)} rows, {read.coordinates} coordinates")
 

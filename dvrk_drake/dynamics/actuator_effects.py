@@ -36,8 +36,9 @@ class EffectKind:
         dissipative: True if the effect dissipates energy in all motions. The coefficient of such an effect must not be
             negative.
         revolute: True if the kind is allowed for revolute coordinates only.
-        loaded: True if the shape is multiplied by the load, which is the magnitude of the effort along the coordinate
-            [N m, N].
+        loaded: True if the shape is multiplied by the load, which is the magnitude of the effort that the drive
+            transmits along the coordinate [N m, N], see `DynamicModel.transmitted_effort`.
+        position_power: Exponent k of the factor |x|^k by which the shape is multiplied.
         code: Code of the kind in `effect_step`. It is 0 for kinds that depend on position only.
         position_shape: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None.
             Effects of such a kind also act at rest. The argument f provides sin, cos, Min and Max for numbers or
@@ -49,6 +50,7 @@ class EffectKind:
     dissipative: bool = False
     revolute: bool = False
     loaded: bool = False
+    position_power: int = 0
     code: int = 0
     position_shape: Callable[[Any, Any, Any], Any] | None = None
 
@@ -66,6 +68,9 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "presliding forward": EffectKind("N m", "travel before sliding [rad, m]", code=6),
     # Friction of gears and cables, which increases with the load.
     "load coulomb": EffectKind("1", _WIDTH, dissipative=True, loaded=True, code=2),
+    # Friction of cable pulleys, whose angle of wrap changes with the position.
+    "position coulomb": EffectKind("N m/rad", _WIDTH, dissipative=True, position_power=1, code=2),
+    "squared position coulomb": EffectKind("N m/rad^2", _WIDTH, dissipative=True, position_power=2, code=2),
     # The torque is constant outside the range of the recording, because a linear extrapolation would be unbounded.
     "spring": EffectKind(
         "N m/rad",
@@ -172,7 +177,7 @@ class ActuatorEffect:
             return state, float(self._shape(_NUMERIC, x, self.scale))
         kind = EFFECT_KINDS[self.kind]
         state, shape = effect_step(kind.code, state, dx, v, self.scale)
-        return state, shape * load if kind.loaded else shape
+        return state, shape * (load if kind.loaded else 1.0) * abs(x) ** kind.position_power
 
     def column(
         self, x: NDArray[np.float64], v: NDArray[np.float64], load: NDArray[np.float64] | float = 0.0
@@ -187,7 +192,7 @@ class ActuatorEffect:
             return np.array(np.broadcast_to(self._shape(_NUMERIC, x, self.scale), x.shape), dtype=np.float64)
         kind = EFFECT_KINDS[self.kind]
         shape = _run_effect(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
-        return shape * load if kind.loaded else shape
+        return np.asarray(shape * (load if kind.loaded else 1.0) * np.abs(x) ** kind.position_power)
 
 
 @numba.njit(cache=True)

@@ -18,17 +18,18 @@ def depends_on_position(effect: DriveEffect) -> bool:
 
 
 def friction_curve(
-    effects: Sequence[DriveEffect], coordinate: str, v: NDArray[np.float64], load: float = 0.0
+    effects: Sequence[DriveEffect], coordinate: str, v: NDArray[np.float64], load: float = 0.0, x: float = 0.0
 ) -> NDArray[np.float64]:
     """Returns the friction torque (k,) along a coordinate at constant speeds v (k,) [rad/s, m/s].
 
     The result is the torque after the travel of presliding, when the joint slides. At v = 0, it is 0.
 
     Args:
-        effects: Effects of a model. Those of other coordinates, and position-dependent effects, are ignored.
+        effects: Effects of a model. Those of other coordinates, and effects without friction, are ignored.
         coordinate: Key of `Arm.effect_coordinates`.
         v: Speeds of the coordinate.
         load: Magnitude of the effort along the coordinate, for load-dependent friction [N m, N].
+        x: Position of the coordinate, for position-dependent friction [rad, m].
     """
     torque = np.zeros(len(v))
     for e in effects:
@@ -36,7 +37,7 @@ def friction_curve(
             effect = ActuatorEffect.of(e)
             # After an infinite travel, the deflection of a presliding element has its final value.
             travel = [math.copysign(math.inf, speed) if speed else 0.0 for speed in v]
-            shapes = [effect.step(0.0, dx, 0.0, float(s), load)[1] for dx, s in zip(travel, v, strict=True)]
+            shapes = [effect.step(0.0, dx, x, float(s), load)[1] for dx, s in zip(travel, v, strict=True)]
             torque += e.coefficient * np.array(shapes)
     return torque
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     POSITION_KINDS,
     ActuatorEffect,
     effect_fault,
+    position_along,
 )
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
@@ -23,29 +24,66 @@ from dvrk_drake.models.schema_fault import number_fault
 
 
 def effect_shapes(
-    regressor: DynamicRegressor, effects: Sequence[ActuatorEffect], q: ArrayLike, v: ArrayLike
+    regressor: DynamicRegressor,
+    effects: Sequence[ActuatorEffect],
+    q: ArrayLike,
+    v: ArrayLike,
+    transmitted: NDArray[np.float64] | None = None,
 ) -> Iterator[NDArray[np.float64]]:
     """Yields the shape (m,) of each effect, which is its effort along its coordinate for a coefficient of 1.
 
     Effects with a state start from state 0.
 
-    The coordinate is x = h a for actuator positions a. The load of the coordinate is |h tau| / (h h). Here, tau are the
-    actuator efforts that compensate gravity according to the SDF.
+    The coordinate is x = h a for actuator positions a. The load of the coordinate is |h tau| / (h h) for efforts tau
+    that the drives of the actuators transmit.
 
     Args:
         regressor: Regressor of the arm.
         effects: Effects in the drive.
         q, v: Positions [rad, m] and velocities (m, n) of the joints, evenly sampled.
+        transmitted: Efforts (m, n) that the drives transmit [N m, N]. If None, the efforts that compensate gravity
+            according to the SDF.
     """
     arm, q = regressor.arm, np.asarray(q, dtype=np.float64)
     a, a_dot = arm.transmission.position(q), arm.transmission.velocity(v)
     rows = arm.effect_coordinates
-    weight = np.zeros_like(a)
-    if any(EFFECT_KINDS[effect.kind].loaded for effect in effects):
-        weight = nominal_weight(regressor, q)
+    if transmitted is None:
+        transmitted = nominal_weight(regressor, q) if is_loaded(effects) else np.zeros_like(a)
     for effect in effects:
         h = rows[effect.coordinate]
-        yield effect.column(a @ h, a_dot @ h, np.abs(weight @ h) / (h @ h))
+        yield effect.column(a @ h, a_dot @ h, np.abs(transmitted @ h) / (h @ h))
+
+
+def is_loaded(effects: Iterable[ActuatorEffect]) -> bool:
+    """Returns whether an effect depends on the load."""
+    return any(EFFECT_KINDS[effect.kind].loaded for effect in effects)
+
+
+def transmitted_effort(
+    arm: Arm,
+    rigid: NDArray[np.float64],
+    effects: Sequence[ActuatorEffect],
+    coefficients: NDArray[np.float64],
+    q: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Returns the efforts (m, n) that the drives of the actuators transmit [N m, N].
+
+    These are the efforts of the rigid bodies, cables and springs. Friction and offsets are excluded: an offset may be
+    an error of the motor current.
+
+    Args:
+        arm: Arm of the effects.
+        rigid: Efforts (m, n) of the rigid bodies at the actuators [N m, N].
+        effects: Effects in the drive.
+        coefficients: Coefficients (e,) of the effects.
+        q: Positions (m, n) of the joints [rad, m].
+    """
+    tau = rigid
+    for effect, coefficient in zip(effects, coefficients, strict=True):
+        if effect.kind in POSITION_KINDS and effect.kind != "offset" and coefficient:
+            x = position_along(arm, effect.coordinate, q)
+            tau = tau + coefficient * effect.column(x, 0 * x)[:, None] * arm.effect_coordinates[effect.coordinate]
+    return tau
 
 
 def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.float64]:
@@ -54,6 +92,8 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
+#: 97.5 % quantile of the standard normal distribution.
+NORMAL_95 = 1.96
 #: Gravity effort above which an actuator is considered loaded by gravity [N m, N]. Smaller efforts are rounding errors.
 MIN_WEIGHT = 1e-9
 #: Number of random poses at which the gravity efforts are compared with `MIN_WEIGHT`.
@@ -115,17 +155,38 @@ class DynamicModel:
             if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate not in excluded)
         )
 
+    @cached_property
+    def half_width(self) -> NDArray[np.float64]:
+        """Half widths (n,) of the 95 % prediction intervals of the actuator efforts after low-pass filtering [N m, N].
+
+        They are 1.96 times the RMS error on held-out parts of the recording, and apply to similar motions of the same
+        day. They are 0 for a model without this error.
+        """
+        errors = {a.name: a.rms_cross_validation for a in self.section.actuators}
+        return np.array([NORMAL_95 * errors.get(name, 0.0) for name in self.arm.joint_names])
+
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """Returns the actuator efforts (m, n) [N m, N] without effects for a joint motion (m, n)."""
         tau = self.regressor.torque(q, v, vd, self.parameters)
         return self.arm.transmission.inverse.pull_back_effort(tau)
 
-    def effect_effort(self, q: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+    def transmitted_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
+        """Returns the actuator efforts (m, n) [N m, N] that load the drives, see `transmitted_effort`."""
+        rigid = self.rigid_body_effort(q, v, vd)
+        return transmitted_effort(self.arm, rigid, self.effects, self.coefficients, np.asarray(q, dtype=np.float64))
+
+    def effect_shapes(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> Iterator[NDArray[np.float64]]:
+        """Yields the shape (m,) of each of `effects` for an evenly sampled joint motion, see `effect_shapes`."""
+        transmitted = self.transmitted_effort(q, v, vd) if is_loaded(self.effects) else None
+        return effect_shapes(self.regressor, self.effects, q, v, transmitted)
+
+    def effect_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """Returns the actuator efforts (m, n) [N m, N] due to effects for an evenly sampled joint motion."""
         rows = self.arm.effect_coordinates
         tau = np.zeros(np.shape(q))
-        shapes = effect_shapes(self.regressor, self.effects, q, v)
-        for effect, coefficient, shape in zip(self.effects, self.coefficients, shapes, strict=True):
+        for effect, coefficient, shape in zip(
+            self.effects, self.coefficients, self.effect_shapes(q, v, vd), strict=True
+        ):
             tau += coefficient * shape[:, None] * rows[effect.coordinate]
         return tau
 
@@ -135,7 +196,7 @@ class DynamicModel:
         Effects with a state start from state 0 at the first sample. Presliding effects with a small travel require a
         sampling rate of 400 Hz or more.
         """
-        return self.rigid_body_effort(q, v, vd) + self.effect_effort(q, v)
+        return self.rigid_body_effort(q, v, vd) + self.effect_effort(q, v, vd)
 
     def mass_matrix(self, q: ArrayLike) -> NDArray[np.float64]:
         """Returns the mass matrix M (m, n, n) of the joints, including rotors, at poses q (m, n)."""

@@ -46,7 +46,7 @@ class Friction:
 
     @classmethod
     def of(cls, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: ArrayLike) -> Friction:
-        """Selects the friction from the effects of an arm. Load-dependent friction is omitted.
+        """Selects the friction from the effects of an arm. Friction that depends on load or position is omitted.
 
         Args:
             arm: Arm of the effects.
@@ -59,11 +59,11 @@ class Friction:
         values = np.asarray(coefficients, float)
         if values.shape != (len(effects),):
             raise ControllerError(f"friction: coefficients have shape {values.shape}; allowed: ({len(effects)},)")
-        loaded = [name for name, kind in EFFECT_KINDS.items() if kind.loaded]
+        varying = [name for name, kind in EFFECT_KINDS.items() if kind.loaded or kind.position_power]
         kept = [
             k
             for k, effect in enumerate(effects)
-            if effect.kind not in EFFECT_KINDS or (effect.dissipative and effect.kind not in loaded)
+            if effect.kind not in EFFECT_KINDS or (effect.dissipative and effect.kind not in varying)
         ]
         for k in kept:
             if fault := effect_fault(arm, effects[k]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     spring_over,
 )
 from dvrk_drake.dynamics.base_parameters import independent_columns
-from dvrk_drake.dynamics.dynamic_model import effect_shapes
+from dvrk_drake.dynamics.dynamic_model import effect_shapes, is_loaded
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
@@ -30,10 +30,16 @@ COULOMB_WIDTHS = (0.03, 0.1, 0.4)
 #: Width of the smoothed sign function of asymmetric, Stribeck and load-dependent friction, divided by the same standard
 #: deviation [1].
 DIRECTION_WIDTH = 0.1
-ASYMMETRIC = "asymmetric friction"
-#: Name of an effect in an arm file -> number of periods of its sine and cosine per revolution. The number is 0 for an
-#: effect without sine and cosine.
-NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
+#: Name of an effect in an arm file -> number of periods of its sine and cosine per revolution.
+CABLES = {"cable 1": 1.0, "cable 2": 2.0}
+#: Name of a friction effect in an arm file -> kind of the effect.
+NAMED_FRICTION = {
+    "asymmetric friction": "coulomb forward",
+    "load friction": "load coulomb",
+    "position friction": "position coulomb",
+    "squared position friction": "squared position coulomb",
+}
+NAMED_EFFECTS = ("spring", *CABLES, *NAMED_FRICTION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +70,29 @@ class DynamicColumns:
     effects: tuple[ActuatorEffect, ...]
     shapes: tuple[NDArray[np.float64], ...]
     rows: NDArray[np.float64]
+
+    def with_load(
+        self,
+        grid: MotionGrid,
+        regressor: DynamicRegressor,
+        transmitted: NDArray[np.float64],
+        kept: NDArray[np.bool_],
+    ) -> DynamicColumns:
+        """Returns the columns with other loads of the load-dependent effects.
+
+        Args:
+            grid: Resampled motion.
+            regressor: Regressor of the arm.
+            transmitted: Efforts (m, n) that the drives transmit on the grid [N m, N].
+            kept: Mask of the inner rows of the motion that these columns contain.
+        """
+        loaded = [k for k, effect in enumerate(self.effects) if is_loaded([effect])]
+        changed = _effect_columns(grid, regressor, [self.effects[k] for k in loaded], transmitted)
+        shapes = []
+        for shape, own in zip(self.shapes, changed, strict=True):
+            shapes.append(shape.copy())
+            shapes[-1][:, loaded] = own[kept]
+        return replace(self, shapes=tuple(shapes))
 
 
 def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
@@ -103,7 +132,9 @@ def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
     effects = []
     for name, kinds in arm.identification.known_effects.items():
         x = position_along(arm, name, q)
-        effects += [e for kind in kinds if kind != ASYMMETRIC for e in _named(arm, name, kind, x, np.zeros_like(x))]
+        effects += [
+            e for kind in kinds if kind not in NAMED_FRICTION for e in _named(arm, name, kind, x, np.zeros_like(x))
+        ]
     return effects
 
 
@@ -113,15 +144,17 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
             continue
-        kinds = ["stribeck", "load coulomb"] if name.startswith("actuator.") else ["stribeck"]
-        effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
+        effects.append(ActuatorEffect(name, "stribeck", _rounded(DIRECTION_WIDTH * v.std())))
         known = arm.identification.known_effects.get(name, [])
-        for which in NAMED_EFFECTS:
+        candidates = ["spring", *CABLES, "asymmetric friction"]
+        if name.startswith("actuator."):
+            candidates.append("load friction")
+        for which in candidates:
             # If the arm file lists a spring or a cable for a coordinate, this coordinate gets no candidate springs or
             # cables. An additional spring or cable would be redundant within the range of the motion, and would diverge
             # outside this range.
-            by_position = which != ASYMMETRIC
-            if which in known or (by_position and set(known) - {ASYMMETRIC}):
+            by_position = which not in NAMED_FRICTION
+            if which in known or (by_position and set(known) - set(NAMED_FRICTION)):
                 continue
             if which == "spring" or not by_position or not is_prismatic(arm, name):
                 effects += _named(arm, name, which, x, v)
@@ -135,11 +168,11 @@ def _named(
     where = f"{arm.source}: motion.known_effects.{coordinate}"
     if which not in NAMED_EFFECTS:
         raise ArmError(f'{where}: unknown effect "{which}". Allowed: {", ".join(NAMED_EFFECTS)}.')
-    if which == ASYMMETRIC:
-        return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
+    if which in NAMED_FRICTION:
+        return [ActuatorEffect(coordinate, NAMED_FRICTION[which], _rounded(DIRECTION_WIDTH * v.std()))]
     if which == "spring":
         return [spring_over(coordinate, x)]
-    effects = [ActuatorEffect(coordinate, kind, NAMED_EFFECTS[which]) for kind in ("cable sine", "cable cosine")]
+    effects = [ActuatorEffect(coordinate, kind, CABLES[which]) for kind in ("cable sine", "cable cosine")]
     if fault := effect_fault(arm, effects[0]):
         raise ArmError(f"{where}: {fault}")
     return effects
@@ -164,25 +197,36 @@ def dynamic_columns(
     rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), columns)
     zero = np.zeros_like(grid.q)
     tilts = [_filtered(grid, r.regressor(grid.q, zero, zero), columns) for r in tilted]
-    on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
-    rows = np.array([arm.effect_coordinates[effect.coordinate] for effect in effects])
-    delays = np.array(grid.settings.effort_delay)
-    by_delay = {}
-    for i, delay in enumerate(delays):
-        if delay not in by_delay:
-            acting = np.flatnonzero(np.any(rows[:, delays == delay], axis=1))
-            by_delay[delay] = np.zeros((len(rigid), len(effects)))
-            by_delay[delay][:, acting] = grid.filter_efforts(grid.at_rows(on_grid[:, acting], i))
-    shapes = tuple(by_delay[delay] for delay in delays)
+    nominal = arm.transmission.inverse.pull_back_effort(regressor.torque(grid.q, grid.v, grid.vd, regressor.values))
     return DynamicColumns(
         tau=grid.filter_efforts(tau),
         base=columns.base,
         rigid=rigid,
         tilts=np.array(tilts).reshape(-1, *rigid.shape),
         effects=tuple(effects),
-        shapes=shapes,
-        rows=rows,
+        shapes=_effect_columns(grid, regressor, effects, nominal),
+        rows=np.array([arm.effect_coordinates[effect.coordinate] for effect in effects]),
     )
+
+
+def _effect_columns(
+    grid: MotionGrid,
+    regressor: DynamicRegressor,
+    effects: Sequence[ActuatorEffect],
+    transmitted: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], ...]:
+    """Returns the filtered shapes (r, e) of effects, one array per actuator, see `DynamicColumns.shapes`."""
+    on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v, transmitted)))
+    rows = np.array([grid.arm.effect_coordinates[effect.coordinate] for effect in effects])
+    delays = np.array(grid.settings.effort_delay)
+    num_rows = len(range(*grid.inner.indices(len(grid.row_times))))
+    by_delay = {}
+    for i, delay in enumerate(delays):
+        if delay not in by_delay:
+            acting = np.flatnonzero(np.any(rows[:, delays == delay], axis=1))
+            by_delay[delay] = np.zeros((num_rows, len(effects)))
+            by_delay[delay][:, acting] = grid.filter_efforts(grid.at_rows(on_grid[:, acting], i))
+    return tuple(by_delay[delay] for delay in delays)
 
 
 class BaseColumns(NamedTuple):

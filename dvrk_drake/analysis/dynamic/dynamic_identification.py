@@ -91,8 +91,8 @@ def identify_dynamic(
     problem = motion_problem(grid, tau, period)
     progress(0.2)
     selection = select_effects(problem, lambda share: progress(0.2 + 0.3 * share))
+    selection, fit = selection.consistent()
     problem, effects = selection.problem, selection.effects
-    fit = problem.consistent(effects, selection.weights)
     held_out = cross_validate(selection, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
     measured = problem.columns.tau
     squares = np.sum((measured - held_out) ** 2, axis=0)
@@ -161,7 +161,16 @@ def motion_problem(
     # motion do not add independent values.
     duration = len(columns.tau) / grid.rate
     independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
-    return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(mandatory))
+    return DynamicProblem(
+        grid=grid,
+        kept=np.ones(len(columns.tau), dtype=bool),
+        columns=columns,
+        regressor=regressor,
+        fold=fold,
+        edge=edge,
+        independent=min(independent, len(columns.tau)),
+        num_mandatory=len(mandatory),
+    )
 
 
 def _section(

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
-from dvrk_drake.analysis.dynamic.problem import ConsistentProgram, DynamicProblem
+from dvrk_drake.analysis.dynamic.problem import ConsistentFit, ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 
-#: Number of iterations that estimate the base tilt. Each iteration uses the link parameters of the previous iteration.
-#: A third iteration changes the errors by less than 0.01 %.
-NUM_TILT_ITERATIONS = 2
+#: Number of iterations that estimate the base tilt and the loads of the drives. Each iteration uses the parameters of
+#: the previous iteration. A third iteration changes the errors by less than 0.01 %.
+NUM_ITERATIONS = 2
 #: Number of adjacent folds that `cross_validate` holds out together. Long held-out segments are more similar to another
 #: motion than short ones.
 NUM_HELD_OUT_FOLDS = 2
@@ -49,9 +49,21 @@ class EffectSelection:
         """Weights (n,) of the squared errors of the actuators."""
         return self.selection.weights
 
+    def consistent(self) -> tuple[EffectSelection, ConsistentFit]:
+        """Returns the physically consistent fit, and the selection with the loads of the drives that follow from it.
+
+        Raises:
+            IdentificationError: The solver did not converge.
+        """
+        selection, fit = self, self.problem.consistent(self.effects, self.weights)
+        if self.problem.is_loaded:
+            selection = replace(self, problem=self.problem.with_fit(fit))
+            fit = selection.problem.consistent(self.effects, self.weights)
+        return selection, fit
+
 
 def select_effects(problem: DynamicProblem, progress: Callable[[float], object] = lambda _: None) -> EffectSelection:
-    """Estimates the direction of gravity with the mandatory effects, then selects candidate effects.
+    """Estimates gravity direction and drive loads with the mandatory effects, then selects candidate effects.
 
     A candidate is added if it reduces the cross-validated error.
 
@@ -62,13 +74,17 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     tilts = len(problem.columns.tilts)
     mandatory = np.append(np.arange(problem.num_mandatory), problem.num_effects + np.arange(tilts))
     phi = problem.prior
-    # The efforts contain products of the tilt and the link parameters. Each iteration is linear, because it uses the
-    # previous link parameters in these products.
-    for iteration in range(NUM_TILT_ITERATIONS if tilts else 0):
-        progress(0.5 * iteration / NUM_TILT_ITERATIONS)
-        x = problem.selection(phi, folds=False).fit(mandatory)
+    # The efforts contain products of the tilt or a friction coefficient and the link parameters. Each iteration is
+    # linear, because it uses the previous link parameters in these products.
+    for iteration in range(NUM_ITERATIONS if tilts or problem.is_loaded else 0):
+        progress(0.5 * iteration / NUM_ITERATIONS)
+        linear = problem.selection(phi, folds=False)
+        x = linear.fit(mandatory)
         phi = problem.rigid_parameters(x)
-        problem = replace(problem, tilt=x[-tilts:])
+        if tilts:
+            problem = replace(problem, tilt=x[-tilts:])
+        effects = np.arange(problem.num_effects)
+        problem = problem.with_load(phi, effects, x[linear.num_rigid + effects])
     selection = problem.selection(phi)
     selected = selection.select(mandatory, problem.candidates, lambda share: progress(0.5 + 0.5 * share))
     x = selection.fit(selected)

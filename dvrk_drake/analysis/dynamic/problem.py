@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
+from dvrk_drake.analysis.signals.motion_grid import MotionGrid
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
+from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import rotor_links
 from dvrk_drake.dynamics.physical_consistency import (
@@ -50,6 +52,8 @@ class DynamicProblem:
     """Regression problem of one motion, with the regressor columns and the priors of all unknowns.
 
     Attributes:
+        grid: Resampled motion.
+        kept: Mask of the inner rows of the motion (`MotionGrid.inner`) that the problem contains.
         columns: Filtered regressor columns of the rigid-body parameters and of all effects.
         regressor: Regressor of the arm. The parameters of the SDF (`regressor.values`) are the prior means.
         tilt: Change (2,) of the x and y components of gravity [m/s^2]. The change is included in `rigid`, but not in
@@ -61,6 +65,8 @@ class DynamicProblem:
         num_mandatory: Number of mandatory effects, which come first. The remaining effects are candidates.
     """
 
+    grid: MotionGrid
+    kept: NDArray[np.bool_]
     columns: DynamicColumns
     regressor: DynamicRegressor
     fold: NDArray[np.int_]
@@ -228,7 +234,43 @@ class DynamicProblem:
         columns = replace(c, tau=c.tau[rows], rigid=c.rigid[rows], tilts=c.tilts[:, rows], shapes=shapes)
         fold = np.unique(self.fold[rows], return_inverse=True)[1]
         independent = self.independent * float(np.mean(rows))
-        return replace(self, columns=columns, fold=fold, edge=self.edge[rows], independent=independent)
+        kept = self.kept.copy()
+        kept[kept] = rows
+        return replace(self, kept=kept, columns=columns, fold=fold, edge=self.edge[rows], independent=independent)
+
+    @property
+    def is_loaded(self) -> bool:
+        """True if an effect depends on the load of its drive."""
+        return is_loaded(self.columns.effects)
+
+    def with_load(
+        self, phi: NDArray[np.float64], effects: NDArray[np.int_], coefficients: NDArray[np.float64]
+    ) -> DynamicProblem:
+        """Returns the problem with the loads of the drives that follow from given estimates.
+
+        Load-dependent friction is a product of a coefficient and the load, which depends on the other parameters. With
+        given loads, the problem is linear.
+
+        Args:
+            phi: Rigid-body parameters (p,).
+            effects: Indices (e,) of the effects.
+            coefficients: Coefficients (e,) of these effects.
+        """
+        if not self.is_loaded:
+            return self
+        grid, regressor = self.grid, self.regressor
+        tilted = regressor.with_gravity([float(g) for g in regressor.arm.gravity + np.append(self.tilt, 0.0)])
+        of_effects = [self.columns.effects[k] for k in effects]
+        parameters = np.concatenate([phi, np.zeros(len(regressor.values) - len(phi))])
+        tau = tilted.torque(grid.q, grid.v, grid.vd, parameters)
+        rigid = grid.arm.transmission.inverse.pull_back_effort(tau)
+        transmitted = transmitted_effort(grid.arm, rigid, of_effects, coefficients, grid.q)
+        return replace(self, columns=self.columns.with_load(grid, regressor, transmitted, self.kept))
+
+    def with_fit(self, fit: ConsistentFit) -> DynamicProblem:
+        """Returns the problem with the loads of the drives that follow from a fit, see `with_load`."""
+        p = self.num_rigid
+        return self.with_load(fit.x[:p], fit.effects, fit.x[p:])
 
     def consistent(self, effects: NDArray[np.int_], weights: NDArray[np.float64]) -> ConsistentFit:
         """Returns the physically consistent fit for effect indices (e,) and actuator weights (n,).

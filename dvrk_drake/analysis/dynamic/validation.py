@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -75,6 +75,8 @@ class ActuatorError:
         repeatability: Relative RMS difference of the efforts between periods (see `repeatability_floor`) [1], or None
             if the motion does not repeat.
         verdict: Verdict on the actuator, see `judge`.
+        inside: Share of the efforts inside the 95 % prediction interval (`DynamicModel.half_width`) [1], or None if the
+            model has no interval.
     """
 
     name: str
@@ -84,6 +86,7 @@ class ActuatorError:
     shares: ErrorShares
     repeatability: float | None
     verdict: Verdict
+    inside: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -189,7 +192,10 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     for i, name in enumerate(arm.joint_names):
         shares = error_shares(measured[:, i] - predicted[:, i], i, a, v[:, i], vd, t, period)
         limit = float(arm.effort_limits[i])
-        actuators.append(_actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], limit))
+        error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], limit)
+        if width := float(dynamics.half_width[i]):
+            error = replace(error, inside=float(np.mean(np.abs(measured[:, i] - predicted[:, i]) <= width)))
+        actuators.append(error)
     return DynamicValidation(
         model=model,
         recording=recording,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
-from dvrk_drake.dynamics.dynamic_model import DynamicModel, effect_shapes
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
@@ -17,7 +17,9 @@ FrictionPart = Literal["dry", "viscous"]
 #: Part of the friction, dry or viscous, for each kind of friction effect. All kinds of one part change together, for
 #: example with temperature or lubrication.
 FRICTION_PARTS: dict[str, FrictionPart] = {
-    **dict.fromkeys(("coulomb", "load coulomb", "stribeck", "presliding"), "dry"),
+    **dict.fromkeys(
+        ("coulomb", "load coulomb", "position coulomb", "squared position coulomb", "stribeck", "presliding"), "dry"
+    ),
     "viscous": "viscous",
 }
 
@@ -48,7 +50,7 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
     other = model.rigid_body_effort(grid.q, grid.v, grid.vd)
     friction: dict[tuple[str, FrictionPart], NDArray[np.float64]] = {}
     rows = model.arm.effect_coordinates
-    shapes = effect_shapes(model.regressor, model.effects, grid.q, grid.v)
+    shapes = model.effect_shapes(grid.q, grid.v, grid.vd)
     for effect, coefficient, shape in zip(model.effects, model.coefficients, shapes, strict=True):
         if not coefficient:
             continue

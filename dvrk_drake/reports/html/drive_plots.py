@@ -9,9 +9,9 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, joint_row, position_along
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row, position_along
 from dvrk_drake.dynamics.drive_curves import depends_on_position, friction_curve, position_curve
-from dvrk_drake.dynamics.dynamic_model import effect_shapes, nominal_weight
+from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.html.labels import coordinate_units
@@ -36,12 +36,11 @@ def friction_over_speed(efforts: MotionEfforts) -> go.Figure | None:
         return None
     names = list(dict.fromkeys(e.coordinate for e in effects))
     figure = _grid(names)
-    shapes = effect_shapes(model.regressor, [ActuatorEffect.of(e) for e in effects], grid.q, grid.v)
+    transmitted = model.transmitted_effort(grid.q, grid.v, grid.vd)
+    shapes = effect_shapes(model.regressor, [ActuatorEffect.of(e) for e in effects], grid.q, grid.v, transmitted)
     along: dict[str, NDArray[np.float64]] = {name: np.zeros(len(grid.t)) for name in names}
     for e, shape in zip(effects, shapes, strict=True):
         along[e.coordinate] = along[e.coordinate] + e.coefficient * shape
-    loaded = any(EFFECT_KINDS[e.kind].loaded for e in effects)
-    weight = nominal_weight(model.regressor, grid.q) if loaded else np.zeros_like(grid.q)
     for k, name in enumerate(names):
         h = arm.effect_coordinates[name]
         speed = efforts.v @ h
@@ -49,8 +48,9 @@ def friction_over_speed(efforts: MotionEfforts) -> go.Figure | None:
         friction = of_model + efforts.residuals @ h / (h @ h)
         largest = float(np.max(np.abs(speed), initial=0.0))
         v = largest * np.linspace(-1, 1, _POINTS) ** 3  # more points at low speeds
-        load = float(np.mean(np.abs(weight @ h)) / (h @ h))
-        _add_curve(figure, k, speed, friction, v, friction_curve(effects, name, v, load))
+        x = float(np.sqrt(np.mean(position_along(arm, name, grid.q) ** 2)))
+        load = float(np.mean(np.abs(transmitted @ h)) / (h @ h))
+        _add_curve(figure, k, speed, friction, v, friction_curve(effects, name, v, load, x))
         effort, length = coordinate_units(arm, name)
         _label_axes(figure, k, f"speed [{length}/s]", f"friction [{effort}]")
     return figure

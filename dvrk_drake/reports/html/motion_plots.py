@@ -14,7 +14,7 @@ from dvrk_drake.analysis.dynamic.validation import DynamicValidation
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
 from dvrk_drake.reports.html.binned import ComparedEfforts, binned_residuals
 from dvrk_drake.reports.html.labels import effort_unit, joint_label, length_unit
-from dvrk_drake.reports.html.plot_style import line
+from dvrk_drake.reports.html.plot_style import COLOURS, line, transparent
 
 #: Largest number of rows in each trace of a plot over time.
 MAX_ROWS = 3000
@@ -32,6 +32,7 @@ class MotionEfforts(ComparedEfforts):
         q, v: Positions [rad, m] and velocities (r, n) of the actuators.
         period: Period of the motion [s], or None if the motion does not repeat.
         repeatability: RMS differences (n,) of the efforts between periods [N m, N], 0 if the motion does not repeat.
+        half_width: Half widths (n,) of the 95 % prediction intervals, see `DynamicModel.half_width`.
     """
 
     grid: MotionGrid
@@ -40,6 +41,7 @@ class MotionEfforts(ComparedEfforts):
     v: NDArray[np.float64]
     period: float | None
     repeatability: NDArray[np.float64]
+    half_width: NDArray[np.float64]
 
     @classmethod
     def of(cls, result: DynamicIdentification | DynamicValidation) -> MotionEfforts:
@@ -62,13 +64,15 @@ class MotionEfforts(ComparedEfforts):
             predicted=predicted,
             period=result.period,
             repeatability=np.array(repeatability),
+            half_width=result.model.dynamic_model.half_width,
         )
 
 
 def efforts_over_time(efforts: MotionEfforts) -> tuple[go.Figure, str]:
     """Returns a figure with one panel per actuator, and a sentence about the omitted rows.
 
-    Measured efforts are a thick line below the thin lines of the predictions, so that no line hides another one.
+    Measured efforts are a thick line below the thin lines of the predictions, so that no line hides another one. The
+    band is the 95 % prediction interval.
     """
     arm, n = efforts.arm, efforts.arm.num_joints
     figure = _panels([_effort_title(efforts, i) for i in range(n)])
@@ -77,6 +81,24 @@ def efforts_over_time(efforts: MotionEfforts) -> tuple[go.Figure, str]:
         rows = extremes(efforts.measured[:, i], step)
         traces = {"measured": efforts.measured, **efforts.predicted}
         traces[f"measured − {efforts.judged}"] = efforts.residuals
+        band = efforts.predicted[efforts.judged][rows, i]
+        for sign in (-1.0, 1.0) if efforts.half_width[i] > 0 else ():
+            figure.add_trace(
+                go.Scatter(
+                    x=_compact(efforts.t[rows]),
+                    y=_compact(band + sign * efforts.half_width[i]),
+                    name="95 % prediction interval",
+                    legendgroup="interval",
+                    showlegend=i == 0 and sign > 0,
+                    mode="lines",
+                    line={"width": 0},
+                    fill="tonexty" if sign > 0 else "none",
+                    fillcolor=transparent(COLOURS[efforts.judged], 0.2),
+                    hoverinfo="skip",
+                ),
+                row=i + 1,
+                col=1,
+            )
         for name, values in traces.items():
             figure.add_trace(
                 go.Scatter(

@@ -9,9 +9,11 @@ import pytest
 from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic, motion_problem
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
+from dvrk_drake.analysis.validation import predict
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -19,6 +21,7 @@ from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models import plant
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.reports.identification import print_identification
@@ -58,6 +61,22 @@ def test_cross_validated_error_is_at_least_the_noise(case):
         # The error is slightly above the filtered white noise. The fit error is not below the repeatability floor.
         assert 0.9 * a.rms_repeatability <= a.rms_fit * np.sqrt(2) and a.rms_fit < 0.03 * a.rms_effort
         assert a.rms_fit <= a.rms_cross_validation < NOISE * a.rms_effort
+
+
+def test_prediction_intervals_cover_held_out_efforts(case):
+    """95 % intervals cover 93 to 97 % of the efforts that cross-validation predicts."""
+    _, _, _, result = case
+    inside = np.mean(np.abs(result.measured - result.held_out) <= result.model.dynamic_model.half_width, axis=0)
+    assert np.all((inside > 0.9) & (inside < 0.99)) and 0.93 < np.mean(inside) < 0.97
+
+
+def test_limits_of_the_interval_are_printed_in_joint_coordinates(case):
+    arm, _, recording, result = case
+    prediction = predict(result.model, recording.in_joint_coordinates(arm))
+    errors = np.random.default_rng(0).normal(size=(20000, arm.num_joints)) * result.model.dynamic_model.half_width
+    of_joints = np.std(arm.transmission.pull_back_effort(errors), axis=0)
+    np.testing.assert_allclose(prediction.half_width, of_joints, rtol=0.03)
+    assert predict(result.model, Recording(q=recording.q[:3])).half_width is None
 
 
 def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
@@ -100,10 +119,45 @@ def test_every_parameter_is_printed_on_request(case):
 
 def test_true_friction_is_found(case):
     arm, truth, _, result = case
-    _, q, v, _ = fourier_motion(arm, np.random.default_rng(2), 9.0, 9.0, RATE)
-    friction, found = truth.effect_effort(q, v), result.model.dynamic_model.effect_effort(q, v)
+    _, q, v, vd = fourier_motion(arm, np.random.default_rng(2), 9.0, 9.0, RATE)
+    friction, found = (model.effect_effort(q, v, vd) for model in (truth, result.model.dynamic_model))
     share = np.sqrt(np.mean((found - friction) ** 2, axis=0) / np.mean(friction**2, axis=0))
     assert np.all(share < 0.2), "what a spring or weight could also be is identifiable from the other phases only"
+
+
+def test_friction_that_depends_on_load_and_position_is_found():
+    """The load is the effort of the identified rigid bodies and springs, not that of the SDF."""
+    arm, generator = load_arm("mtmr"), np.random.default_rng(3)
+    motion = fourier_motion(arm, generator, 10.0, 20.0, RATE)
+    v = arm.transmission.velocity(motion[2]).std(axis=0)
+    added = [
+        DriveEffect("actuator.wrist_pitch", "load coulomb", float(f"{0.1 * v[4]:.3g}"), 0.3),
+        DriveEffect("actuator.wrist_yaw", "load coulomb", float(f"{0.1 * v[5]:.3g}"), 0.4),
+        DriveEffect("actuator.wrist_roll", "squared position coulomb", float(f"{0.1 * v[6]:.3g}"), 5e-4),
+    ]
+    truth = true_dynamics(arm, generator, [*friction_everywhere(arm, motion), *added], spread=0.1)
+    result = identify_dynamic(recorded(truth, motion, 0.01, generator), arm)
+    found = {(e.coordinate, e.kind): e for e in result.model.dynamics.effects}
+    for effect in added:
+        estimate = found[effect.coordinate, effect.kind]
+        assert abs(estimate.coefficient - effect.coefficient) < 3 * estimate.standard_error + 0.1 * effect.coefficient
+    # The fitted efforts are those of the model, whose loads follow from its own parameters.
+    ours = predict_motion(result.model, recorded(truth, motion, 0.0, generator))
+    assert np.all(np.std(ours[result.grid.inner] - result.predicted, axis=0) < 0.01 * np.std(result.measured, axis=0))
+
+
+def test_loads_of_a_subset_are_those_of_the_motion(case):
+    arm, _, recording, result = case
+    grid = result.grid
+    effects = [ActuatorEffect(f"actuator.{arm.joint_names[1]}", "load coulomb", 0.1)]
+    problem = motion_problem(grid, recording.in_actuator_coordinates(arm).measured_effort(), None, effects)
+    rows = np.arange(problem.num_rows) % 3 == 0
+    loaded = problem.with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
+    subset = problem.subset(rows).with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
+    assert not np.allclose(loaded.columns.shapes[1], problem.columns.shapes[1], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(subset.columns.shapes[1], loaded.columns.shapes[1][rows], rtol=0, atol=1e-12)
+    # The load is proportional to the link parameters.
+    np.testing.assert_allclose(loaded.columns.shapes[1], 1.3 * problem.columns.shapes[1], rtol=0, atol=1e-9)
 
 
 def test_links_are_consistent_and_energy_is_positive(case):

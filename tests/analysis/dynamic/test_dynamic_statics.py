@@ -69,7 +69,7 @@ def test_holding_torque_equals_the_dynamics_at_rest(case):
     dynamics = DynamicModel(arm, dataclasses.replace(dynamics.section, effects=kept))
     q = arm.sample_poses(200, np.random.default_rng(0))
     at_rest = arm.transmission.pull_back_effort(dynamics.effort(q, 0 * q, 0 * q))
-    assert np.ptp(dynamics.effect_effort(q, 0 * q), axis=0).min() > 0.1  # there is something to compare
+    assert np.ptp(dynamics.effect_effort(q, 0 * q, 0 * q), axis=0).min() > 0.1  # there is something to compare
     np.testing.assert_allclose(model.holding_torque(q), at_rest, rtol=0, atol=1e-10)
 
 
