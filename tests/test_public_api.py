@@ -196,7 +196,7 @@ def test_readme_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     dvrk.write_samples("samples")
     exec(compile(readme_example(), "README.md", "exec"), {})
-    assert (tmp_path / "model.yaml").is_file()
+    assert (tmp_path / "model_python.yaml").is_file()
     assert capsys.readouterr().out.startswith("verdict usable")
 
 

@@ -208,7 +208,10 @@ class Recording:
         elif arm.prismatic[joint] and shares[joint] > 4:
             message += " Are the positions in millimetres or centimetres instead of m?"
         else:
-            message += " Is the arm or the choice of coordinates (joint or actuator) wrong?"
+            message += (
+                " Is the arm or the choice of coordinates wrong? --coordinates is joint, actuator, or wpi for actuator "
+                "coordinates with the roll of a PSM in joint coordinates."
+            )
         if pairs := self._exchanges_within_limits(arm):
             message += f" All poses are within the limits if columns are exchanged: {', '.join(pairs)}."
         raise RecordingError(message)

@@ -117,7 +117,10 @@ def _positions(joints: Recording, arm: Arm, joint_signals: tuple[JointSignals, .
         severity: Severity = "warning"
         if i >= arm.num_joints and excess[row, i] > IMPOSSIBLE_EXCESS:
             severity = "refusal"
-            advice = "The arm cannot reach this position. If these are actuator positions, use --coordinates actuator."
+            advice = (
+                "The arm cannot reach this position. If these are actuator positions, use --coordinates actuator or "
+                "wpi."
+            )
         findings.append(Finding(severity, "outside limits", names[i], what, advice, moved, float(excess[row, i])))
     min_range = arm.per_joint(*MIN_RANGE)
     for j, joint in enumerate(joint_signals):

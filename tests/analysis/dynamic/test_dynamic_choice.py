@@ -36,7 +36,7 @@ def test_effects_of_the_arm_file_are_mandatory():
     assert not set(always) & set(candidates)
     assert {("cable sine", 1.0), ("cable cosine", 1.0)} <= of(always, "actuator.pitch")
     # A known position-dependent torque excludes other such candidates, but not friction.
-    assert of(candidates, "actuator.pitch") == {(k, 0.0) for k in ("coulomb forward", "stribeck", "load coulomb")}
+    assert of(candidates, "actuator.pitch") == {(k, 0.0) for k in ("coulomb forward", "stribeck")}
     assert ("coulomb forward", 0.0) in of(always, "actuator.jaw")
     assert {("spring", 0.0), ("cable sine", 2.0)} <= of(candidates, "actuator.jaw")
     # Prismatic coordinates have no cable effects.
