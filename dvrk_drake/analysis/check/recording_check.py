@@ -117,7 +117,10 @@ def _positions(joints: Recording, arm: Arm, joint_signals: tuple[JointSignals, .
         severity: Severity = "warning"
         if i >= arm.num_joints and excess[row, i] > IMPOSSIBLE_EXCESS:
             severity = "refusal"
-            advice = f"The arm cannot reach this position. Is the choice of coordinates wrong? Coordinates: {COORDINATES_HELP}."
+            advice = (
+                "The arm cannot reach this position. Is the choice of coordinates wrong? "
+                f"Coordinates: {COORDINATES_HELP}."
+            )
         findings.append(Finding(severity, "outside limits", names[i], what, advice, moved, float(excess[row, i])))
     min_range = arm.per_joint(*MIN_RANGE)
     for j, joint in enumerate(joint_signals):
