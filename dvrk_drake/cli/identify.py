@@ -207,11 +207,10 @@ def validate(
         print_written(model, "verdicts stored")
     _write_report(validation, report, model, file, recording, model, saved=save)
     if require is not None and (failed := validation.unfit(require)):
-        way_out = "more varied poses" if loaded.dynamics is None else "more varied motions, or recalibrate"
-        raise ModelError(
-            f"{model}: verdicts below {require} on {read.source}: {', '.join(failed)}; identify from a recording with "
-            f"{way_out}"
-        )
+        advice = "identify from a recording with more varied poses"
+        if loaded.dynamics is not None:
+            advice = "identify from a recording with more varied motions, or recalibrate"
+        raise ModelError(f"{model}: verdicts below {require} on {read.source}: {', '.join(failed)}; {advice}")
 
 
 @app.command(group=IDENTIFY)

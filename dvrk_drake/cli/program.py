@@ -58,6 +58,12 @@ RENAMED = {
     "transparency": {"--real-arm": "--simulated-effects"},
 }
 
+#: Mapping from required options to the accepted values, for the message of a missing option.
+REQUIRED = {
+    "--arm": ": mtml, mtmr, psm, or the path of an arm file",
+    "--model": ": the model file that identify wrote",
+}
+
 
 def run(arguments: Sequence[str] | None) -> int:
     """Runs one command and returns the exit code. See `dvrk_drake.cli.main` for `arguments`."""
@@ -128,7 +134,9 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
             message += f", before {' and '.join(long)}"
         if suggestion:
             message += f". {suggestion[0]}"
-        elif error.argument.name == renamed.get(""):
-            message += ": it was a positional argument before"
+        else:
+            message += REQUIRED.get(error.argument.name, "")
+            if error.argument.name == renamed.get(""):
+                message += " (a positional argument before version 0.1)"
     see = " See" if message.endswith("?") else "; see"
     return f"dvrk-drake: error: {message}{see} {f'dvrk-drake {name}'.rstrip()} --help"

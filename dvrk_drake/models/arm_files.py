@@ -62,6 +62,11 @@ def load_arm(name: str | Path) -> Arm:
     if "\0" in name:
         raise ArmError(f"{name!r} is not a valid file name")
     if not name.endswith((".yaml", ".yml")):
+        if name.lower() not in known_arms() and os.path.isfile(name):
+            raise ArmError(
+                f"{name} is not an arm file: its name does not end in .yaml; known arms: {', '.join(known_arms())}, or "
+                "the path of a YAML file"
+            )
         return _load_arm(name.lower())
     path = Path(os.path.realpath(local_path(name)))
     # The name and the path of an arm of this package give the same Arm object.

@@ -13,7 +13,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.file_options import FileCoordinates
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.reading import detect_format, read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording
 
 
@@ -60,11 +60,16 @@ def convert(
         skip_invalid=skip_invalid,
         progress=progress,
     )
+    # A file with "wpi" coordinates was converted when it was read.
+    is_assumed = coordinates is None and recording.coordinates == "joint" and not recording._converted
     if arm is not None:
         recording = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
     write_recording(recording, output, arm)
-    return dataclasses.replace(recording, notes=(*recording.notes, *_properties(recording)))
+    assumed: tuple[str, ...] = ()
+    if is_assumed and "rate" in detect_format(Path(path)).options:  # CSV, MATLAB file or NumPy archive
+        assumed = ("coordinates were not stated, read as joint coordinates (default)",)
+    return dataclasses.replace(recording, notes=(*recording.notes, *assumed, *_properties(recording)))
 
 
 def _properties(recording: Recording) -> list[str]:

@@ -13,16 +13,13 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import Recording, wpi_transmission
 
 #: Coordinates of q, qd and tau in a file. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint
 #: coordinates (motions of WPI; Wang et al. 2019, table of the PSM).
 FileCoordinates = Literal["joint", "actuator", "wpi"]
 #: Number of joints of a file that is read without an arm.
 _DEFAULT_JOINTS = 7
-#: Joints in joint coordinates in a file with "wpi" coordinates.
-_WPI_DIRECT_JOINTS = ("roll",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,12 +69,7 @@ class FileOptions:
         if self.arm is None:
             note = "in the coordinates wpi; pass --coordinates wpi to every command that reads the converted file"
             return dataclasses.replace(recording, notes=(*recording.notes, note))
-        J = self.arm.transmission.matrix.copy()
-        for joint in set(_WPI_DIRECT_JOINTS) & set(self.arm.joint_names):
-            row = self.arm.joint_names.index(joint)
-            J[row] = np.eye(self.arm.num_joints)[row]
-        transmission = LinearMap(J, np.zeros(len(J)))
-        return recording.in_joint_coordinates(dataclasses.replace(self.arm, transmission=transmission))
+        return recording.in_joint_coordinates(dataclasses.replace(self.arm, transmission=wpi_transmission(self.arm)))
 
     def sampled_times(
         self, path: Path, t: NDArray[np.float64] | None, rows: NDArray[np.int_], default_rate: float | None = None

@@ -31,6 +31,10 @@ MIN_ROWS, MAX_PERIOD = 100, 0.05
 REST_SPEED = 0.05, 0.005
 #: Maximum difference of each joint position between samples of the same pose [rad], [m].
 SAME_POSE = 0.01, 0.001
+#: Values of `--coordinates` with their meaning, for messages.
+COORDINATES_HELP = "joint, actuator, or wpi (recordings of WPI: actuator, but joint for the roll of a PSM)"
+#: Joints in joint coordinates in a file with "wpi" coordinates.
+_WPI_DIRECT_JOINTS = ("roll",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,22 +212,35 @@ class Recording:
         elif arm.prismatic[joint] and shares[joint] > 4:
             message += " Are the positions in millimetres or centimetres instead of m?"
         else:
-            message += (
-                " Is the arm or the choice of coordinates wrong? --coordinates is joint, actuator, or wpi for actuator "
-                "coordinates with the roll of a PSM in joint coordinates."
-            )
-        if pairs := self._exchanges_within_limits(arm):
+            message += f" Is the arm or the choice of coordinates wrong? Coordinates: {COORDINATES_HELP}."
+        if others := self._coordinates_within_limits(arm):
+            message += f" All poses are within the limits with --coordinates {' or '.join(others)}."
+        elif pairs := self._exchanges_within_limits(arm):
             message += f" All poses are within the limits if columns are exchanged: {', '.join(pairs)}."
         raise RecordingError(message)
 
+    def _coordinates_within_limits(self, arm: Arm) -> list[str]:
+        """Returns other values of `--coordinates` that move all poses of the file within the limits."""
+        # Bags and logs are always in joint coordinates. A recording with a cached conversion may come from other ones.
+        if self.coordinates != "joint" or self._converted or self.line_label in ("event", "message"):
+            return []
+        transmissions = {"wpi": wpi_transmission(arm), "actuator": arm.transmission}
+        if np.array_equal(transmissions["wpi"].matrix, arm.transmission.matrix):
+            del transmissions["wpi"]
+        return [
+            name
+            for name, transmission in transmissions.items()
+            if _is_within(transmission.inverse.position(self.q), arm)
+        ]
+
     def _exchanges_within_limits(self, arm: Arm) -> list[str]:
         """Returns pairs of columns, such as "q1 and q4", whose exchange moves all poses within the limits."""
-        pairs, tolerance = [], arm.per_joint(*LIMIT_TOLERANCE)
+        pairs = []
         for i, j in combinations(range(arm.num_joints), 2):
             order = np.arange(arm.num_joints)
             order[[i, j]] = j, i
             q = replace(self, q=self.q[:, order], qd=None, tau=None).in_joint_coordinates(arm).q
-            if np.all((q >= arm.position_lower - tolerance) & (q <= arm.position_upper + tolerance)):
+            if _is_within(q, arm):
                 pairs.append(f"q{i + 1} and q{j + 1}")
         return pairs
 
@@ -257,6 +274,21 @@ class Setpoints:
 
     q: NDArray[np.float64] | None = None
     tau: NDArray[np.float64] | None = None
+
+
+def wpi_transmission(arm: Arm) -> LinearMap:
+    """Returns the map from joint coordinates to the coordinates "wpi" (table of the PSM in Wang et al., 2019)."""
+    J = arm.transmission.matrix.copy()
+    for joint in set(_WPI_DIRECT_JOINTS) & set(arm.joint_names):
+        row = arm.joint_names.index(joint)
+        J[row] = np.eye(arm.num_joints)[row]
+    return LinearMap(J, np.zeros(len(J)))
+
+
+def _is_within(q: NDArray[np.float64], arm: Arm) -> bool:
+    """Returns whether all positions (m, n) in joint coordinates are within the limits and their tolerance."""
+    tolerance = arm.per_joint(*LIMIT_TOLERANCE)
+    return bool(np.all((q >= arm.position_lower - tolerance) & (q <= arm.position_upper + tolerance)))
 
 
 def column_names(prefix: str, num_joints: int) -> list[str]:

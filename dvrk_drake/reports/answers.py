@@ -61,7 +61,7 @@ def answer_of(
     which = "" if verdict == "good" or len(names) == len(verdicts) else f" ({', '.join(names)})"
     off = [name for name, v in verdicts.items() if v == "off"]
     disabled = f" Feedforward disabled: {', '.join(off)}." if off else ""
-    return Answer(verdict, f"Verdict: {verdict}{which}. {_error(result, off)}{disabled}", *step)
+    return Answer(verdict, f"Verdict: {verdict}{which}. {_error(result)}".rstrip() + disabled, *step)
 
 
 def _after_identification(
@@ -84,8 +84,8 @@ def _after_validation(validation: Validation, model_path: str, file_options: str
             return command, "Refit the friction and the offsets of the model to this recording."
         return _check(validation.recording, arm, file_options)
     if not saved:
-        replaced = " --overwrite" if validation.model.validation is not None else ""
-        command = f"dvrk-drake validate {source} --model {model_path} --save{replaced}"
+        replaces = " --overwrite" if validation.model.validation is not None else ""
+        command = f"dvrk-drake validate {source} --model {model_path} --save{replaces}"
         return command, "Store the verdicts in the model file, from which the command run reads them."
     if arm.locked_joints:  # run requires all joints
         command = f"dvrk-drake predict {source} --model {model_path} --output FILE.csv"
@@ -128,18 +128,18 @@ def _error(result: Identification | Validation, off: Sequence[str]) -> str:
         return f"Mean relative effort error: {percent(held_out)} in cross-validation, {percent(fit)} in the fit."
     if isinstance(result, StaticValidation):
         errors = np.array([j.rms_error_included for j in result.joints])
-        return _largest_error(arm, errors, np.array([j.rms_torque_included for j in result.joints]), off)
+        torques = np.array([0.0 if j.verdict == "off" else j.rms_torque_included for j in result.joints])
+        return _largest_error(arm, errors, torques)
     joints = result.model.joints
     errors = np.array([j.rms_cross_validation_included for j in joints])
     return _largest_error(arm, errors, np.array([j.rms_zero_torque_included for j in joints]), off, "cross-validation ")
 
 
-def _largest_error(
-    arm: Arm, errors: NDArray[np.float64], torques: NDArray[np.float64], off: Sequence[str], kind: str = ""
-) -> str:
-    """Returns a sentence about the joint with the largest ratio of error to effort limit, without joints in `off`."""
-    judged = (torques > 0) & ~np.isin(arm.joint_names, off)
-    j = int(np.nanargmax(np.where(judged, errors / arm.effort_limits, -1.0)))
+def _largest_error(arm: Arm, errors: NDArray[np.float64], torques: NDArray[np.float64], kind: str = "") -> str:
+    """Returns a sentence about the joint with the largest ratio of error to effort limit, or "" without a torque."""
+    if not np.any(torques > 0):
+        return ""
+    j = int(np.nanargmax(np.where(torques > 0, errors / arm.effort_limits, -1.0)))
     unit, share = "N" if arm.prismatic[j] else "N m", percent(errors[j] / arm.effort_limits[j])
     return f"Largest {kind}error: {share} of the effort limit ({arm.joint_names[j]}, {errors[j]:.3g} {unit})."
 

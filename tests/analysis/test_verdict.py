@@ -222,10 +222,25 @@ def test_run_warns_of_saved_verdicts(files, capsys):
     assert dataclasses.replace(saved, validation=None) == loaded
     warning = model_warning(model, saved)
     assert f"failed validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
+    capsys.readouterr()
+    assert main(["validate", good, "--model", model]) == 0
+    assert f"Next: dvrk-drake validate {good} --model {model} --save --overwrite\n" in capsys.readouterr().out
     assert main(["validate", good, "--model", model, "--save"]) == 2
     assert f"contains verdicts from {bad}" in capsys.readouterr().err
     assert main(["validate", good, "--model", model, "--save", "--overwrite"]) == 0
     assert model_warning(model, IdentifiedModel.load(model)) == ""
+
+
+def test_largest_error_excludes_joints_without_feedforward(files, capsys):
+    model, _, bad = files
+    assert main(["validate", bad, "--model", model]) == 0
+    assert "(shoulder_pitch, " in " ".join(capsys.readouterr().out.split()).partition("Next: ")[0]
+    loaded = IdentifiedModel.load(model)
+    joints = [dataclasses.replace(j, feedforward_scale=0.0) if j.name == "shoulder_pitch" else j for j in loaded.joints]
+    dataclasses.replace(loaded, joints=joints).save(model)
+    assert main(["validate", bad, "--model", model]) == 0
+    answer = " ".join(capsys.readouterr().out.split()).partition("Next: ")[0]
+    assert "Largest error: " in answer and "(shoulder_pitch, " not in answer
 
 
 def test_saved_verdicts_include_all_joints(truth, tmp_path):

@@ -27,6 +27,7 @@ def test_converted_poses_are_exact(tmp_path):
     assert (again.t, again.qd) == (None, None)
     assert list(recording.notes) == [
         "static poses from array saved; its eighth row (gripper) is ignored",
+        "coordinates were not stated, read as joint coordinates (default)",
         "without times, read as static poses; for a motion, give its sampling rate with --rate HZ",
     ]
 
@@ -49,7 +50,8 @@ def test_actuator_coordinates_become_joint_coordinates_of_an_arm(tmp_path):
     q = arm.sample_poses(5, np.random.default_rng(1), margin=0.1)
     given = Recording(q=q, qd=0.1 * q, tau=0.01 * q, t=0.01 * np.arange(5)).in_actuator_coordinates(arm)
     write_recording(given, tmp_path / "motion.csv")
-    convert(tmp_path / "motion.csv", tmp_path / "out.csv", coordinates="actuator", arm=arm)
+    stated = convert(tmp_path / "motion.csv", tmp_path / "out.csv", coordinates="actuator", arm=arm)
+    assert not any("not stated" in note for note in stated.notes)
     np.testing.assert_allclose(read_recording(tmp_path / "out.csv", arm).q, q, rtol=0, atol=1e-12)
 
 

@@ -92,6 +92,21 @@ def test_exchanged_columns_that_exceed_the_limits_are_named(pair):
     assert "exchanged" not in str(degrees.value)
 
 
+def test_coordinates_that_fit_are_named():
+    arm = load_arm("psm")
+    joint = Recording(q=arm.sample_poses(200, np.random.default_rng(0)))
+    stated = replace(joint.in_actuator_coordinates(arm), coordinates="joint")
+    with pytest.raises(RecordingError, match=r"within the limits with --coordinates (wpi or )?actuator\.$"):
+        stated.check_fits(arm)
+    in_file = replace(stated, coordinates="actuator")
+    for read in (in_file.in_joint_coordinates(arm), replace(stated, line_label="message")):
+        wrong = read.q.copy()
+        wrong[0, 1] = 3.0
+        with pytest.raises(RecordingError) as error:
+            replace(read, q=wrong).check_fits(arm)
+        assert "--coordinates" not in str(error.value)
+
+
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
 def test_wrong_number_of_joints_is_refused(coordinates):
     recording = Recording(q=np.zeros((2, 6)), source="psm.csv", coordinates=coordinates)

@@ -20,7 +20,7 @@ from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import COORDINATES_HELP, REST_SPEED, Recording
 
 #: Smallest range of the positions of a joint that moves [rad], [m].
 MIN_RANGE = 0.02, 0.002
@@ -118,8 +118,8 @@ def _positions(joints: Recording, arm: Arm, joint_signals: tuple[JointSignals, .
         if i >= arm.num_joints and excess[row, i] > IMPOSSIBLE_EXCESS:
             severity = "refusal"
             advice = (
-                "The arm cannot reach this position. If these are actuator positions, use --coordinates actuator or "
-                "wpi."
+                "The arm cannot reach this position. Is the choice of coordinates wrong? "
+                f"Coordinates: {COORDINATES_HELP}."
             )
         findings.append(Finding(severity, "outside limits", names[i], what, advice, moved, float(excess[row, i])))
     min_range = arm.per_joint(*MIN_RANGE)

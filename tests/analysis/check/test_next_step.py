@@ -30,7 +30,10 @@ def check(capsys, folder, wrist, arm, *options):
 def test_next_step_is_the_check_for_the_other_arm(tmp_path, capsys):
     # This position is within the limits of an MTML, and 1.8 rad outside those of an MTMR.
     step, error = check(capsys, tmp_path, -3.5, "mtmr", "--coordinates", "joint")
-    assert "Is the arm or the choice of coordinates wrong? --coordinates is joint, actuator, or wpi" in error
+    assert (
+        "Is the arm or the choice of coordinates wrong? Coordinates: joint, actuator, or wpi (recordings of WPI"
+        in error
+    )
     assert step == "r.csv --arm mtml --coordinates joint"
 
 
