@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,7 +114,7 @@ def source_argument(recording: Recording, file_options: str) -> str:
     return f"{recording.source or 'RECORDING.csv'}{file_options}"
 
 
-def _error(result: Identification | Validation, off: Sequence[str]) -> str:
+def _error(result: Identification | Validation) -> str:
     """Returns a sentence about the error: the mean for a motion, the largest of all joints for poses."""
     arm = result.model.arm
     if isinstance(result, DynamicValidation):
@@ -132,7 +132,7 @@ def _error(result: Identification | Validation, off: Sequence[str]) -> str:
         return _largest_error(arm, errors, torques)
     joints = result.model.joints
     errors = np.array([j.rms_cross_validation_included for j in joints])
-    return _largest_error(arm, errors, np.array([j.rms_zero_torque_included for j in joints]), off, "cross-validation ")
+    return _largest_error(arm, errors, np.array([j.rms_zero_torque_included for j in joints]), "cross-validation ")
 
 
 def _largest_error(arm: Arm, errors: NDArray[np.float64], torques: NDArray[np.float64], kind: str = "") -> str:

@@ -382,7 +382,7 @@ def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -
 def _print_motion_validation(console: Console, validation: DynamicValidation, verbose: bool) -> None:
     name = Path(validation.recording.source).name or "recording"
     title = f"{validation.model.arm.name}, motion of {name}: RMS effort and error [N m; N]"
-    table = make_table(title, "", "measured", "error", "ratio", "repeatability", "verdict")
+    table = make_table(title, "", "measured", "error", "ratio", "repeatability", "inside", "verdict")
     table.columns[-1].justify = "left"
     for a in validation.actuators:
         shares = ("" if x is None else percent(x) for x in (a.relative_error, a.repeatability, a.inside))
