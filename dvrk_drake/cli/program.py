@@ -137,6 +137,6 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
         else:
             message += REQUIRED.get(error.argument.name, "")
             if error.argument.name == renamed.get(""):
-                message += " (a positional argument before version 0.1)"
+                message += " (a positional argument before version 0.2)"
     see = " See" if message.endswith("?") else "; see"
     return f"dvrk-drake: error: {message}{see} {f'dvrk-drake {name}'.rstrip()} --help"

@@ -106,7 +106,7 @@ def test_error_for_a_renamed_option_has_the_new_name(command, old, capsys):
         at = required.index(new)
         error = refused(capsys, command, *required[:at], *required[at + 2 :])
         assert error.startswith(f"{new} is required")
-        assert error.endswith(f" (a positional argument before version 0.1); see dvrk-drake {command} --help")
+        assert error.endswith(f" (a positional argument before version 0.2); see dvrk-drake {command} --help")
 
 
 IMPORTS = """
