@@ -92,7 +92,9 @@ def test_commands_accept_a_real_motion(case, tmp_path):
     found = json.loads(errors.read_text())
     assert found["coordinates"] == "actuator" and found["mean_relative_error"] < TARGET[name] / 100
     assert main(["predict", str(path), "--model", str(model), "--output", str(tau)]) == 0
-    predicted = arm.transmission.inverse.pull_back_effort(np.loadtxt(tau, delimiter=",", skiprows=1))
+    joints, lower, upper = np.split(np.loadtxt(tau, delimiter=",", skiprows=1), 3, axis=1)
+    np.testing.assert_allclose(upper - joints, joints - lower, rtol=0, atol=1e-9)
+    predicted = arm.transmission.inverse.pull_back_effort(joints)
     measured = recording.in_actuator_coordinates(arm).tau
     ratio = np.linalg.norm((predicted - measured)[200:-200], axis=0) / np.linalg.norm(measured[200:-200], axis=0)
     assert np.all(ratio < 1)
