@@ -70,7 +70,7 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "load coulomb": EffectKind("1", _WIDTH, dissipative=True, loaded=True, code=2),
     # Friction of cable pulleys, whose angle of wrap changes with the position.
     "position coulomb": EffectKind("N m/rad", _WIDTH, dissipative=True, position_power=1, code=2),
-    "squared position coulomb": EffectKind("N m/rad^2", _WIDTH, dissipative=True, position_power=2, code=2),
+    "position^2 coulomb": EffectKind("N m/rad^2", _WIDTH, dissipative=True, position_power=2, code=2),
     # The torque is constant outside the range of the recording, because a linear extrapolation would be unbounded.
     "spring": EffectKind(
         "N m/rad",

@@ -8,7 +8,8 @@ Link 3 is the back crank, link 4 is the bottom bar and link 5 is the end link. T
 of the parallelograms and for the counterweight. The first moments of links 1, 3, 4 and 5 therefore include these parts.
 The mass of link 7 is the mass that moves with the insertion joint, minus the mass that the counterweight balances.
 Link 6 moves at half of the insertion speed, and t7 does not include its weight. It has a mass only if the feedforward
-of insertion is disabled. Link 7 then has none, so the torque of insertion is 0.
+of insertion is disabled. Link 7 then has none, so the torque of insertion is 0. Both have none if the net mass is
+negative, because the controller requires masses of at least 0.
 """
 
 from __future__ import annotations
@@ -110,8 +111,8 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
             `gravity_compensation_loss.accepted_differences`.
 
     Raises:
-        ModelError: The model is not of a PSM, the net mass on the insertion joint is not positive, or a torque
-            difference exceeds `tolerance`.
+        ModelError: The model is not of a PSM, the net mass on the insertion joint is negative and its weight exceeds
+            `tolerance`, or a torque difference exceeds `tolerance`.
     """
     arm = model.arm
     plant = shared_plant(arm)
@@ -134,12 +135,12 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     mass_column = Y[:, 2, _LAST, 0]
     is_off = model.feedforward_scale[2] == 0
     net = float(mass_column @ (gravity if is_off else tau)[:, 2] / (mass_column @ mass_column))
-    if not net > 0 and not is_off:
+    if not is_off and -net * np.abs(mass_column).max() > accepted[2]:
         raise ModelError(
             f"{arm.name}: the net mass on the insertion joint is {net:.3g} kg because of the counterweight. The "
             "controller's file requires a positive mass; check the base parameters of the model"
         )
-    if is_off:
+    if is_off or net <= 0:
         # Link 6 moves at half of the insertion speed, and its weight does not act on the insertion joint of the file.
         mass[_LAST], mass[_LAST - 1], moment[_LAST] = 0.0, 2 * max(net, 0.0), 0.0
     else:
@@ -151,7 +152,8 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     known[_FITTED, 1:] += step.reshape(-1, 3)
     tau_model = model.holding_torque(straight)[:, :3]
     tau_file = np.einsum("mjlk,lk->mj", Y, known)
-    causes = {"feedforward scale other than 1": tau_file - tau, **_omitted_effects(model, straight)}
+    cause = "feedforward scale other than 1" if net > 0 else "negative net mass on the insertion joint"
+    causes = {cause: tau_file - tau, **_omitted_effects(model, straight)}
     loss = make_loss(arm, straight, tau_file - tau_model, causes)
     loss.check(accepted)
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)

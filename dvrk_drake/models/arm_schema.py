@@ -76,7 +76,7 @@ class MotionSettings:
         known_effects: Mapping from a coordinate of the drive (`Arm.effect_coordinates`) to its known effects besides
             friction: "spring", "cable 1" (sine and cosine with one period per revolution), "cable 2" (two periods),
             "asymmetric friction", "load friction" (in proportion to the effort that the drive transmits), "position
-            friction" and "squared position friction" (in proportion to |x| and x^2).
+            friction" and "position^2 friction" (in proportion to |x| and x^2).
         presliding_travels: Travels before sliding of the presliding friction elements, as multiples of the standard
             deviation of the position along the coordinate. Used only in a mechanism file.
     """

@@ -75,8 +75,8 @@ def test_rigid_bodies_and_holding_torques_are_unchanged():
     q = arm.sample_poses(3, np.random.default_rng(0))
     offsets = np.array([a.offset for a in result.actuators])
     np.testing.assert_allclose(new.holding_torque(q), model.holding_torque(q), atol=1e-12)
-    rest = np.zeros_like(q)
-    moved = new.dynamic_model.effect_effort(q[:1], rest[:1]) - model.dynamic_model.effect_effort(q[:1], rest[:1])
+    q, rest = q[:1], np.zeros_like(q[:1])
+    moved = new.dynamic_model.effect_effort(q, rest, rest) - model.dynamic_model.effect_effort(q, rest, rest)
     np.testing.assert_allclose(moved[0], offsets, atol=1e-12)
 
 

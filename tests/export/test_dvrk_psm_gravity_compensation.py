@@ -109,6 +109,10 @@ def test_rejects_a_model_that_the_file_cannot_represent():
     net.value = -0.2
     with pytest.raises(ModelError, match=r"net mass on the insertion joint is -0\.2 kg"):
         kinematic_compensation(heavy)
+    net.value = -0.01  # Its weight is less than the dry friction.
+    light = kinematic_compensation(heavy)
+    assert not light.mass[5:].any() and light.loss.causes[2] == "negative net mass on the insertion joint"
+    assert light.loss.difference[2] == pytest.approx(0.01 * 9.81, rel=1e-2)
     with pytest.raises(ModelError, match="is not a PSM"):
         kinematic_compensation(IdentifiedModel.from_arm(load_arm("mtml")))
 

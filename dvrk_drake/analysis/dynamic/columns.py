@@ -38,7 +38,7 @@ NAMED_FRICTION = {
     ASYMMETRIC: "coulomb forward",
     "load friction": "load coulomb",
     "position friction": "position coulomb",
-    "squared position friction": "squared position coulomb",
+    "position^2 friction": "position^2 coulomb",
 }
 NAMED_EFFECTS = ("spring", *CABLES, *NAMED_FRICTION)
 

@@ -18,7 +18,7 @@ FrictionPart = Literal["dry", "viscous"]
 #: example with temperature or lubrication.
 FRICTION_PARTS: dict[str, FrictionPart] = {
     **dict.fromkeys(
-        ("coulomb", "load coulomb", "position coulomb", "squared position coulomb", "stribeck", "presliding"), "dry"
+        ("coulomb", "load coulomb", "position coulomb", "position^2 coulomb", "stribeck", "presliding"), "dry"
     ),
     "viscous": "viscous",
 }

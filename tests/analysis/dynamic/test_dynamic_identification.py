@@ -133,7 +133,7 @@ def test_friction_that_depends_on_load_and_position_is_found():
     added = [
         DriveEffect("actuator.wrist_pitch", "load coulomb", float(f"{0.1 * v[4]:.3g}"), 0.3),
         DriveEffect("actuator.wrist_yaw", "load coulomb", float(f"{0.1 * v[5]:.3g}"), 0.4),
-        DriveEffect("actuator.wrist_roll", "squared position coulomb", float(f"{0.1 * v[6]:.3g}"), 5e-4),
+        DriveEffect("actuator.wrist_roll", "position^2 coulomb", float(f"{0.1 * v[6]:.3g}"), 5e-4),
     ]
     truth = true_dynamics(arm, generator, [*friction_everywhere(arm, motion), *added], spread=0.1)
     result = identify_dynamic(recorded(truth, motion, 0.01, generator), arm)
