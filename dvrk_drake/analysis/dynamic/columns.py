@@ -196,9 +196,9 @@ def dynamic_columns(
     # the efforts at rest for a unit gravity vector along this component.
     tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
     columns = base_columns([regressor, *tilted])
-    rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), columns)
-    zero = np.zeros_like(grid.q)
-    tilts = [_filtered(grid, r.regressor(grid.q, zero, zero), columns) for r in tilted]
+    rigid = _filtered(grid, regressor, columns)
+    at_rest = replace(grid, v=np.zeros_like(grid.v), vd=np.zeros_like(grid.vd))
+    tilts = [_filtered(at_rest, r, columns) for r in tilted]
     nominal = arm.transmission.inverse.pull_back_effort(regressor.torque(grid.q, grid.v, grid.vd, regressor.values))
     return DynamicColumns(
         tau=grid.filter_efforts(tau),
@@ -218,16 +218,14 @@ def _effect_columns(
     transmitted: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], ...]:
     """Returns the filtered shapes (r, e) of effects, one array per actuator, see `DynamicColumns.shapes`."""
-    on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v, transmitted)))
-    rows = np.array([grid.arm.effect_coordinates[effect.coordinate] for effect in effects])
     delays = np.array(grid.settings.effort_delay)
-    num_rows = len(range(*grid.inner.indices(len(grid.row_times))))
-    by_delay = {}
-    for i, delay in enumerate(delays):
-        if delay not in by_delay:
-            acting = np.flatnonzero(np.any(rows[:, delays == delay], axis=1))
-            by_delay[delay] = np.zeros((num_rows, len(effects)))
-            by_delay[delay][:, acting] = grid.filter_efforts(grid.at_rows(on_grid[:, acting], i))
+    by_delay = {delay: np.zeros((len(grid.inner_rows), len(effects))) for delay in dict.fromkeys(delays)}
+    shapes = effect_shapes(regressor, effects, grid.q, grid.v, transmitted)
+    for k, (effect, shape) in enumerate(zip(effects, shapes, strict=True)):
+        acts = grid.arm.effect_coordinates[effect.coordinate] != 0
+        for delay in dict.fromkeys(delays[acts]):
+            actuator = int(np.flatnonzero(delays == delay)[0])
+            by_delay[delay][:, k] = grid.filter_efforts(grid.at_rows(shape, actuator))
     return tuple(by_delay[delay] for delay in delays)
 
 
@@ -273,13 +271,16 @@ def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
     return BaseColumns(independent, base, np.any(Y[..., independent], axis=0))
 
 
-def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) -> NDArray[np.float64]:
-    """Returns the filtered independent columns (r, n, b) of the actuators for a regressor (m, n, p) of the joints."""
-    out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(columns.independent)))
-    for i, drives in enumerate(grid.arm.transmission.inverse.matrix.T):
-        own, of_actuator = columns.of_actuator(Y, drives)
-        out[:, i, own] = grid.filter_efforts(grid.at_rows(of_actuator, i))
-    return out
+def _filtered(grid: MotionGrid, regressor: DynamicRegressor, columns: BaseColumns) -> NDArray[np.float64]:
+    """Returns the filtered independent columns (r, n, b) of the regressor of the actuators."""
+    arm, filtered = grid.arm, []
+    for part, rows in grid.parts():
+        Y = regressor.regressor(part.q, part.v, part.vd)
+        filtered.append(np.zeros((len(rows), arm.num_joints, len(columns.independent))))
+        for i, drives in enumerate(arm.transmission.inverse.matrix.T):
+            own, of_actuator = columns.of_actuator(Y, drives)
+            filtered[-1][:, i, own] = part.filter_rows(part.at_rows(of_actuator, i), rows)
+    return np.concatenate(filtered)
 
 
 def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:

@@ -32,6 +32,8 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 #: Smallest absolute coefficient of an effect that the model contains, in units of the prior standard deviation of this
 #: coefficient.
 MIN_EFFECT = 1e-4
+#: Largest number of rows in a fit. A motion with more rows is thinned out after low-pass filtering.
+MAX_ROWS = 40_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -84,7 +86,7 @@ def identify_dynamic(
         IdentificationError: The solver for consistent parameters did not converge, or the cross-validated RMS error of
             a moving actuator exceeds the RMS effort of this actuator.
     """
-    grid = motion_grid(recording, arm, default_settings(arm))
+    grid = motion_grid(recording, arm, default_settings(arm), max_rows=MAX_ROWS)
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     progress(0.05)
     period = period_of(grid)
@@ -99,7 +101,7 @@ def identify_dynamic(
     _refuse_worse_than_zero(recording, grid, np.sqrt(squares / np.maximum(problem.efforts, np.finfo(float).tiny)))
     predicted = problem.predict(effects, fit.x)
     error = measured - predicted
-    covariance = parameter_covariance(problem, fit, error, grid.rate, grid.settings.effort_cut_off, period)
+    covariance = parameter_covariance(problem, fit, error, grid.rate / grid.step, grid.settings.effort_cut_off, period)
     estimates = DynamicEstimates(problem, fit, covariance)
     section = _section(problem, effects, fit, covariance, squares, grid, tau, period)
     section.links = estimates.links()
@@ -159,7 +161,7 @@ def motion_problem(
     fold, edge = phase_folds(grid, period)
     # A low-pass filtered effort has two independent values per period of the cut-off frequency. Repetitions of the
     # motion do not add independent values.
-    duration = len(columns.tau) / grid.rate
+    duration = len(columns.tau) * grid.step / grid.rate
     independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
     return DynamicProblem(
         grid=grid,

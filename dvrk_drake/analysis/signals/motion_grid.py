@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,11 @@ GRID_RATE = 400.0
 ENDS = 1.0
 #: Smallest accepted duration [s] and rate of the rows [Hz].
 MIN_DURATION, MIN_RATE = 5.0, 50.0
+#: Number of rows in one part of `MotionGrid.parts`.
+PART_ROWS = 10_000
+#: Additional rows at both ends of a part, in periods of the effort filter's cut-off. A filter transient decays by a
+#: factor of 1e13 in this time.
+PART_OVERLAP = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +109,7 @@ class MotionGrid:
         row_times: True times (r,) of all rows of the recording, see `true_time` [s].
         rate: Mean rate of the rows [Hz].
         clock: True times of the rows that do not repeat the previous row.
+        step: Filtered efforts and regressor columns are computed for every `step`-th row.
     """
 
     arm: Arm
@@ -114,12 +121,36 @@ class MotionGrid:
     row_times: NDArray[np.float64]
     rate: float
     clock: TrueTime
+    step: int = 1
 
     @property
     def inner(self) -> slice:
-        """Slice of the rows without the first and the last `ENDS` seconds."""
+        """Slice of every `step`-th row, without the first and the last `ENDS` seconds."""
         ends = round(ENDS * self.rate)
-        return slice(ends, len(self.row_times) - ends)
+        return slice(ends, len(self.row_times) - ends, self.step)
+
+    @property
+    def inner_rows(self) -> NDArray[np.int_]:
+        """Indices (k,) of the rows in `inner`."""
+        return np.arange(len(self.row_times))[self.inner]
+
+    def parts(self) -> Iterator[tuple[MotionGrid, NDArray[np.int_]]]:
+        """Yields short parts of the motion, and the indices of the inner rows that each part provides.
+
+        The indices count from the first row of the part. The parts overlap, so that filter transients at their ends do
+        not affect the provided rows. Regressors of a long motion are computed part by part, because they do not fit
+        into the memory.
+        """
+        inner, count = self.inner_rows, len(self.row_times)
+        overlap = round(max(ENDS, PART_OVERLAP / self.settings.effort_cut_off) * self.rate)
+        delays = self.settings.effort_delay
+        for rows in np.array_split(inner, max(1, round(count / PART_ROWS))):
+            start, end = max(rows[0] - overlap, 0), min(rows[-1] + overlap + 1, count)
+            times = self.row_times[start:end]
+            first, last = np.searchsorted(self.t, [times[0] - max(delays), times[-1] - min(delays)])
+            on_grid = slice(max(first - 2, 0), last + 2)
+            t, q, v, vd = (x[on_grid] for x in (self.t, self.q, self.v, self.vd))
+            yield replace(self, t=t, q=q, v=v, vd=vd, row_times=times), rows - start
 
     def at_rows(self, x: NDArray[np.float64], actuator: int) -> NDArray[np.float64]:
         """Interpolates x (m, ...) from the grid to the rows (r, ...), with the delay of the actuator's effort."""
@@ -130,8 +161,12 @@ class MotionGrid:
 
     def filter_efforts(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Applies the low-pass filter of the efforts to x (r, ...) and removes `ENDS` seconds at both ends."""
+        return self.filter_rows(x, self.inner)
+
+    def filter_rows(self, x: NDArray[np.float64], rows: slice | NDArray[np.int_]) -> NDArray[np.float64]:
+        """Applies the low-pass filter of the efforts to x (r, ...) and returns some of the rows."""
         flat = low_pass(x.reshape(len(x), -1), self.rate, self.settings.effort_cut_off)
-        return flat.reshape(x.shape)[self.inner]
+        return flat.reshape(x.shape)[rows]
 
     def efforts_at_rows(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolates efforts (m, n) of the actuators from the grid to the rows (r, n), with the effort delays."""
@@ -154,7 +189,14 @@ def default_settings(arm: Arm) -> SignalSettings:
     )
 
 
-def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock: TrueTime | None = None) -> MotionGrid:
+def motion_grid(
+    recording: Recording,
+    arm: Arm,
+    settings: SignalSettings,
+    clock: TrueTime | None = None,
+    *,
+    max_rows: int | None = None,
+) -> MotionGrid:
     """Resamples a motion to the grid.
 
     Positions are filtered and differentiated in actuator coordinates, because each actuator has its own encoder and
@@ -165,6 +207,7 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
         arm: Arm that was recorded.
         settings: Cut-offs of the filters and delays of the efforts.
         clock: Result of `true_time` for the recording in actuator coordinates. None: computed by this function.
+        max_rows: Largest number of filtered rows (`MotionGrid.step`). None: all rows.
 
     Raises:
         RecordingError: The recording does not match the arm, has no times, is too short, or its rate is too low.
@@ -199,4 +242,5 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
         row_times=clock.t[np.maximum(last, 0)],
         rate=rate,
         clock=clock,
+        step=1 if max_rows is None else -(-len(recording) // max_rows),
     )
