@@ -87,7 +87,7 @@ def undamaged(folder: Path, name: str) -> tuple[Recording, Arm, set[tuple[str, s
 def errors_of_undamaged(folder: Path, name: str) -> np.ndarray:
     """Returns the relative errors (n,) of a model identified from the undamaged recording, on the same recording."""
     recording, arm, *_ = undamaged(folder, name)
-    return relative_errors(identify_dynamic(recording, arm).model, recording)
+    return relative_errors(identify_dynamic([recording], arm).model, recording)
 
 
 def relative_errors(model: IdentifiedModel, recording: Recording) -> np.ndarray:
@@ -106,7 +106,7 @@ def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
             where = "recording" if found[0].where == recording.source else found[0].where
             return kind, channels, what, f"{where}: {found[0].kind}"
     try:
-        model = identify_dynamic(damaged, arm).model
+        model = identify_dynamic([damaged], arm).model
     except IdentificationError as error:
         return kind, channels, "refused", f"identify: {error}"
     assert model.dynamics is not None

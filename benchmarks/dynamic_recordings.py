@@ -64,7 +64,7 @@ def main() -> None:
         arm = load_arm(name)
 
         begin = time.perf_counter()
-        model = identify_dynamic(read_public(options.folder / file, arm), arm).model
+        model = identify_dynamic([read_public(options.folder / file, arm)], arm).model
         seconds = time.perf_counter() - begin
         dynamics = model.dynamics
         assert dynamics is not None

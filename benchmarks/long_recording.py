@@ -36,7 +36,9 @@ def long_motion(model: dvrk.IdentifiedModel, minutes: float) -> dvrk.Recording:
         tau[rows] = dynamics.effort(q[rows], qd[rows], vd[rows])
     tau += NOISE * np.std(tau, axis=0) * generator.normal(size=tau.shape)
     transmission = arm.transmission
-    return dvrk.Recording(t=t, q=transmission.position(q), qd=transmission.velocity(qd), tau=tau, coordinates="actuator")
+    return dvrk.Recording(
+        t=t, q=transmission.position(q), qd=transmission.velocity(qd), tau=tau, coordinates="actuator"
+    )
 
 
 def memory() -> float:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem
-from dvrk_drake.analysis.dynamic.estimates import parameter_covariance
+from dvrk_drake.analysis.dynamic.estimates import ResidualSeries, parameter_covariance
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
@@ -78,15 +78,16 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     truth = true_dynamics(arm, generator, friction_everywhere(arm, motion), spread)
     recording = recorded(truth, motion, noise, generator)
     grid = motion_grid(recording, arm, default_settings(arm))
-    period = period_of(grid)
-    problem = motion_problem(grid, recording.in_actuator_coordinates(arm).measured_effort(), period, truth.effects)
+    tau, period = recording.in_actuator_coordinates(arm).measured_effort(), period_of(grid)
+    problem = motion_problem([grid], [tau], [period], truth.effects)
     chosen = np.arange(len(truth.effects))
     selection = problem.selection()
     selection.fit(chosen)
     fit = problem.consistent(chosen, selection.weights)
     residual = problem.columns.tau - problem.predict(chosen, fit.x)
     cut_off = grid.settings.effort_cut_off
-    covariance = parameter_covariance(problem, fit, residual, grid.rate, cut_off, period)
+    series = [ResidualSeries(slice(0, len(residual)), grid.rate, period)]
+    covariance = parameter_covariance(problem, fit, residual, cut_off, series)
     p = problem.num_rigid
     B = derive_base_parameters(problem.regressor).combination[:, :p]
     B = B[np.any(B, axis=1)]

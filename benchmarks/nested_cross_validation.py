@@ -38,7 +38,7 @@ def main() -> None:
     recording = read_recording(options.motion, arm, options.coordinates)
     grid = motion_grid(recording, arm, default_settings(arm))
     tau = recording.in_actuator_coordinates(arm).measured_effort()
-    problem = motion_problem(grid, tau, period_of(grid))
+    problem = motion_problem([grid], [tau], [period_of(grid)])
     squares = np.zeros(arm.num_joints)
     print("relative RMS effort error of each actuator and mean [%], 6-fold cross-validation over the phase")
     for first in range(0, FOLDS, NUM_HELD_OUT_FOLDS):

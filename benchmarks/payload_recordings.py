@@ -50,7 +50,7 @@ def main() -> int:
     def read(name: str) -> Recording:
         return read_recording(options.folder / f"{name}.csv", arm, "wpi")
 
-    models = {name: identify_dynamic(read(name), arm).model for name in ("psm_one_no_weight", "psm_one")}
+    models = {name: identify_dynamic([read(name)], arm).model for name in ("psm_one_no_weight", "psm_one")}
     for reference, model in models.items():
         for name, link, mass, position in WEIGHTS:
             (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])

@@ -1,7 +1,8 @@
-"""Identifies a model of an arm from a recording of poses or of a motion."""
+"""Identifies a model of an arm from a recording of poses, or from one or more motions."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +14,14 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentifica
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
-from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 
 
 def identify(
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     arm: Arm,
     *,
     method: Method = "robust",
@@ -33,8 +34,13 @@ def identify(
     offsets. Any other motion gives a dynamic model with physically consistent inertial parameters, rotor inertias and
     friction. If `low_speed_segments` is True, such a motion gives a static model instead.
 
+    Several motions, for example of different days, give one dynamic model. The links, cables and springs are those of
+    all motions. Offsets and friction may differ between the motions, and the model contains their means. The
+    cross-validated errors are those of each motion with a model of the other motions.
+
     Args:
-        recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.
+        recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates. Or
+            several motions.
         arm: Arm that was recorded, with the gravity direction of its mounting, see `Arm.with_gravity`.
         method: Method for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
         low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
@@ -65,12 +71,16 @@ def identify(
         ...     print(warning)
         >>> result.save("model.yaml")
     """
+    if not isinstance(recording, Recording):
+        if len(recording) != 1:
+            return _identify_several(recording, arm, progress)
+        (recording,) = recording
     poses = find_poses(recording, arm, low_speed_segments)
     report = require_usable(poses.recording, arm, progress, channels=True)
     share = step_progress(progress, "identifying")
     try:
         if poses.moves:
-            motion = identify_dynamic(poses.recording, arm, share)
+            motion = identify_dynamic([poses.recording], arm, share)
             return replace(motion, warnings=(*report.warnings, *_unexplained(motion)))
         static = identify_static(poses.recording, arm, method, share, poses.measured)
     except DvrkDrakeError as error:
@@ -78,6 +88,28 @@ def identify(
         raise
     warnings = (*report.warnings, *_friction_in_segments(static, poses.measured))
     return replace(static, warnings=warnings, note=poses.note, num_rows=len(poses.recording))
+
+
+def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progress | None) -> DynamicIdentification:
+    if not recordings:
+        raise RecordingError("no recordings were given; a model requires at least one")
+    warnings: list[Finding] = []
+    for i, recording in enumerate(recordings):
+        name = recording.source or f"recording {i + 1}"
+        if not find_poses(recording, arm).moves:
+            raise RecordingError(
+                f"{name}: contains static poses; several recordings can be combined only if all of them are motions"
+            )
+        if any(recording.sha256 and recording.sha256 == other.sha256 for other in recordings[:i]):
+            raise RecordingError(f"{name}: was given twice; each recording must be another one")
+        report = require_usable(recording, arm, progress, channels=True)
+        warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in report.warnings]
+    try:
+        result = identify_dynamic(recordings, arm, step_progress(progress, "identifying"))
+    except DvrkDrakeError as error:
+        error.findings = tuple(warnings)
+        raise
+    return replace(result, warnings=(*warnings, *_unexplained(result)))
 
 
 def _unexplained(result: DynamicIdentification) -> tuple[Finding, ...]:

@@ -112,7 +112,7 @@ class Validation(Reportable, ABC):
     @property
     def of_same_recording(self) -> bool:
         """True if the model was identified from this recording. The errors are then errors of the fit."""
-        return bool(self.recording.sha256) and self.recording.sha256 == self.model.provenance.sha256
+        return self.model.provenance.includes(self.recording.sha256)
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Writes the model with the verdicts. `dvrk-drake run` prints a warning for a model without verdicts.

@@ -54,7 +54,7 @@ _SOURCE = one_of("Source of the model (one is required)")
 def identify(
     recording: Recording,
     /,
-    *,
+    *others: str,
     arm: Arm,
     output: NewModel,
     file: FileOptions = _FILE,
@@ -67,23 +67,28 @@ def identify(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Identify a model from a recording.
+    """Identify a model from a recording, or from several motions.
 
     A motion determines the full dynamics, including friction. Static poses determine only the holding torque.
+    Several motions give one model. Offsets and friction may differ between them, for example from day to day.
 
     Args:
+        others: More motions of the same arm.
         method: Method for static poses: robust regression, or the least squares of the paper (Rutfield et al., 2015).
     """
     from dvrk_drake.reports.identification import print_identification
     from dvrk_drake.reports.terminal_tables import make_console
 
-    check_output(output, recording, overwrite=overwrite)
-    check_report(report, recording, overwrite=overwrite)
+    paths = (recording, *others)
+    check_output(output, *paths, overwrite=overwrite)
+    check_report(report, *paths, overwrite=overwrite)
     recorded_arm = mounted(dvrk.load_arm(arm), gravity, locked)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
-        read = file.read(recording, recorded_arm, steps)
-        print_notes(recording, read.notes)
+        read = []
+        for path in paths:
+            read.append(file.read(path, recorded_arm, steps))
+            print_notes(path, read[-1].notes)
         result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     result.save(output, overwrite=True)
@@ -99,7 +104,7 @@ def identify(
     print_written(output)
     if folder is not None:
         print_written(folder)
-    _write_report(result, report, output, file, recording)
+    _write_report(result, report, output, file, *paths)
 
 
 def _write_report(
@@ -174,7 +179,7 @@ def validate(
     with Steps(*_STEPS, "validating") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
         folder = plots_folder(plots, overwrite=overwrite)
-        if (save or require) and read.sha256 and read.sha256 == loaded.provenance.sha256:
+        if (save or require) and loaded.provenance.includes(read.sha256):
             option = "--save" if save else "--require"
             raise ModelError(
                 f"{read.source}: the model was identified from this recording; {option} requires another recording"

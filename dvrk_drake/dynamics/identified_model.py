@@ -112,8 +112,9 @@ class JointStatistics:
 class Provenance:
     """Origin of a model.
 
-    `sha256` is the hash of the recording's bytes. `poses` is the number of rows of the recording. `condition_number` is
-    inf if the regressor does not have full rank.
+    `recording` is the name of the recording, or the names separated by commas. `sha256` is the hash of the recording's
+    bytes, or the hashes separated by spaces. `poses` is the number of rows of all recordings. `condition_number` is inf
+    if the regressor does not have full rank.
     """
 
     recording: str = ""
@@ -123,6 +124,10 @@ class Provenance:
     rank: int = field(default=0, metadata=within(0, 10**6))
     condition_number: float = field(default=0.0, metadata=within(0.0, 1e100, also=(math.inf,)))
     version: str = ""
+
+    def includes(self, sha256: str) -> bool:
+        """Returns whether the model was identified from the recording with this hash, which is "" if unknown."""
+        return bool(sha256) and sha256 in self.sha256.split()
 
 
 #: Verdicts on a joint of a model, from most to least favourable. For `off`, the feedforward scale is 0.

@@ -167,7 +167,8 @@ def _print_answer(console: Console, answer: Answer) -> None:
 
 def _print_motion_errors(console: Console, result: DynamicIdentification, verdicts: Mapping[str, Verdict]) -> None:
     section = result.model.dynamic_model.section
-    title = f"{result.model.arm.name}, {len(result.recording)} rows of motion: effort and relative error (RMS)"
+    several = f"{len(result.motions)} recordings, " if len(result.motions) > 1 else ""
+    title = f"{result.model.arm.name}, {several}{result.num_rows} rows of motion: effort and relative error (RMS)"
     columns = ("", "effort [N m; N]", "fit error", "cross-validation error", "repeatability", "verdict")
     table = make_table(title, *columns)
     table.columns[-1].justify = "left"
@@ -184,6 +185,8 @@ def _print_motion_errors(console: Console, result: DynamicIdentification, verdic
     means = np.mean(moved, axis=0) if moved else np.zeros(3)
     table.add_row("mean", "", *(percent(mean) if mean > 0 else "" for mean in means), "")
     console.print(table)
+    if several:
+        _print_error_of_each_recording(console, result)
     tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:
         gravity = ", ".join(f"{x:.3f}" for x in section.gravity)
@@ -193,16 +196,28 @@ def _print_motion_errors(console: Console, result: DynamicIdentification, verdic
     console.print()
 
 
+def _print_error_of_each_recording(console: Console, result: DynamicIdentification) -> None:
+    names = [Path(motion.recording.source).name or "recording" for motion in result.motions]
+    table = make_table("Relative error of each recording, predicted by a model of the others", "", *names)
+    errors = np.column_stack([motion.held_out_errors for motion in result.motions])
+    for name, row in zip(result.model.arm.joint_names, errors, strict=True):
+        table.add_row(name, *(percent(error) if np.isfinite(error) else "" for error in row))
+    table.add_row("mean", *map(percent, np.nanmean(errors, axis=0)))
+    console.print(table)
+
+
 def _print_motion_details(console: Console, result: DynamicIdentification) -> None:
     """Prints each parameter with its standard error."""
     section = result.model.dynamic_model.section
+    how = "6 folds over the phase of the motion; effects, base tilt and parameters are estimated anew in each fold"
+    if len(result.motions) > 1:
+        how = "each recording is predicted by a model of the others, with the mean of their offsets and friction"
     print_note(
         console,
-        f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: 6 folds over the "
-        "phase of the motion; effects, base tilt and parameters are estimated anew in each fold. On another recording "
-        "the error can be larger, because friction changes from day to day. Repeatability: difference between periods "
-        "of the motion. The fit error can be smaller than the repeatability if the periods of the executed motion "
-        "differ.",
+        f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: {how}. On another "
+        "recording the error can be larger, because friction changes from day to day. Repeatability: difference "
+        "between periods of the motion. The fit error can be smaller than the repeatability if the periods of the "
+        "executed motion differ.",
     )
     _print_links(console, section, result.nominal_mass)
     _print_base_parameters(console, section)

@@ -42,8 +42,8 @@ MIN_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
 #: The offset of a joint is checked only if an offset of this size [rad], [m] would be significant.
 MAX_UNDETECTED_OFFSET = 0.1, 0.01
 #: Largest duration of a segment [s]. A longer motion is divided into equal segments, because the memory of a fit is
-#: proportional to the duration.
-MAX_SEGMENT_DURATION = 120.0
+#: proportional to the duration. Of more than `MAX_SEGMENTS` segments, evenly distributed ones are checked.
+MAX_SEGMENT_DURATION, MAX_SEGMENTS = 120.0, 4
 #: Largest accepted increase of the excess beyond a joint limit if channels are exchanged or inverted [rad], [m]. A
 #: hypothesis with a larger increase is rejected.
 LIMIT_MARGIN = 0.02, 0.002
@@ -62,8 +62,8 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
 
     Each hypothesis is tested by a maximum-a-posteriori fit (`ChannelFit`), and the fits are compared by their
     log-likelihood. In a motion, a wrong scale is detected from the dissipated friction power. Offsets and inverted
-    positions are not detected in poses at rest. A long motion is fitted in segments, and the log-likelihoods of all
-    segments are added. A warning is reported if it occurs in at least half of the segments.
+    positions are not detected in poses at rest. A long motion is fitted in at most `MAX_SEGMENTS` segments, and the
+    log-likelihoods of these segments are added. A warning is reported if it occurs in at least half of the segments.
 
     Args:
         recording: Motion or poses at rest, with efforts, in joint or actuator coordinates.
@@ -95,17 +95,19 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
 
 
 def _segments(recording: Recording) -> list[Recording]:
-    """Returns equal segments of a motion, each at most `MAX_SEGMENT_DURATION` long."""
+    """Returns at most `MAX_SEGMENTS` equal segments of a motion, each at most `MAX_SEGMENT_DURATION` long."""
     t, qd = recording.t, recording.qd
     if t is None or t[-1] - t[0] <= MAX_SEGMENT_DURATION:
         return [recording]
     edges = np.linspace(t[0], t[-1], int(np.ceil((t[-1] - t[0]) / MAX_SEGMENT_DURATION)) + 1)
     tau = recording.measured_effort()
+    segments = np.split(np.arange(len(t)), np.searchsorted(t, edges[1:-1]))
+    chosen = np.unique(np.linspace(0, len(segments) - 1, min(len(segments), MAX_SEGMENTS)).round().astype(int))
     return [
         replace(
             recording, q=recording.q[rows], tau=tau[rows], qd=None if qd is None else qd[rows], t=t[rows], lines=None
         )
-        for rows in np.split(np.arange(len(t)), np.searchsorted(t, edges[1:-1]))
+        for rows in (segments[k] for k in chosen)
     ]
 
 

@@ -43,9 +43,32 @@ NAMED_FRICTION = {
 NAMED_EFFECTS = ("spring", *CABLES, *NAMED_FRICTION)
 
 
+#: Kinds of the effects that differ between recordings.
+RECORDING_KINDS = ("offset", "viscous", "coulomb")
+
+
+@dataclass(frozen=True)
+class RecordingEffect(ActuatorEffect):
+    """Difference of an effect in one recording from the mean over all recordings.
+
+    The model file does not contain these differences. They explain why offsets and friction differ between recordings,
+    so that the links and the other effects are those of all recordings.
+
+    Attributes:
+        recording: Index of the recording.
+    """
+
+    recording: int = 0
+
+    @property
+    def dissipative(self) -> bool:
+        """False, because the friction in one recording can be less than the mean."""
+        return False
+
+
 @dataclass(frozen=True, eq=False)
 class DynamicColumns:
-    """Low-pass filtered regressor columns and efforts of a motion at r rows.
+    """Low-pass filtered regressor columns and efforts of one or more motions at r rows.
 
     For actuator i, tau[:, i] = rigid[:, i] (base phi) + E_i c. Here phi are the rigid-body parameters, and c are the
     coefficients of the effects. The effect columns are E_i = shapes[i] * rows[:, i].
@@ -72,36 +95,62 @@ class DynamicColumns:
     shapes: tuple[NDArray[np.float64], ...]
     rows: NDArray[np.float64]
 
+    @classmethod
+    def of_recordings(cls, columns: Sequence[DynamicColumns]) -> DynamicColumns:
+        """Returns the columns of all recordings. A `RecordingEffect` is 0 in the rows of the other recordings.
+
+        Args:
+            columns: Columns of each recording, with the same effects.
+        """
+        if len(columns) == 1:
+            return columns[0]
+        first = columns[0]
+        for k, effect in enumerate(first.effects):
+            if isinstance(effect, RecordingEffect):
+                for i, own in enumerate(columns):
+                    if i != effect.recording:
+                        for shape in own.shapes:
+                            shape[:, k] = 0.0
+        return replace(
+            first,
+            tau=np.concatenate([own.tau for own in columns]),
+            rigid=np.concatenate([own.rigid for own in columns]),
+            tilts=np.concatenate([own.tilts for own in columns], axis=1),
+            shapes=tuple(map(np.concatenate, zip(*(own.shapes for own in columns), strict=True))),
+        )
+
     def with_load(
         self,
-        grid: MotionGrid,
+        grids: Sequence[MotionGrid],
         regressor: DynamicRegressor,
-        transmitted: NDArray[np.float64],
+        transmitted: Sequence[NDArray[np.float64]],
         kept: NDArray[np.bool_],
     ) -> DynamicColumns:
         """Returns the columns with other loads of the load-dependent effects.
 
         Args:
-            grid: Resampled motion.
+            grids: Resampled motions.
             regressor: Regressor of the arm.
-            transmitted: Efforts (m, n) that the drives transmit on the grid [N m, N].
-            kept: Mask of the inner rows of the motion that these columns contain.
+            transmitted: Efforts (m, n) that the drives transmit on each grid [N m, N].
+            kept: Mask of the inner rows of the motions that these columns contain.
         """
         loaded = [k for k, effect in enumerate(self.effects) if is_loaded([effect])]
-        changed = _effect_columns(grid, regressor, [self.effects[k] for k in loaded], transmitted)
+        effects = [self.effects[k] for k in loaded]
+        changed = [_effect_columns(grid, regressor, effects, tau) for grid, tau in zip(grids, transmitted, strict=True)]
         shapes = []
-        for shape, own in zip(self.shapes, changed, strict=True):
+        for shape, *own in zip(self.shapes, *changed, strict=True):
             shapes.append(shape.copy())
-            shapes[-1][:, loaded] = own[kept]
+            shapes[-1][:, loaded] = np.concatenate(own)[kept]
         return replace(self, shapes=tuple(shapes))
 
 
-def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """Returns the mandatory effects of the model.
+def drive_effects(arm: Arm, grids: Sequence[MotionGrid]) -> list[ActuatorEffect]:
+    """Returns the mandatory effects of the model for motions of the arm.
 
     These are the offset of every actuator and the viscous friction along every coordinate. For every coordinate that
     moves, they also include the Coulomb friction, the presliding friction, and the effects that the arm file lists
-    (`motion.known_effects`).
+    (`motion.known_effects`). If there is more than one motion, the offset and the friction of each actuator may differ
+    between the motions (`RecordingEffect`).
 
     Raises:
         ArmError: The arm file contains an unknown coordinate, an unknown effect, or a cable effect of a prismatic
@@ -113,8 +162,9 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
             f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}. "
             f"Allowed: {', '.join(distinct_coordinates(arm))}."
         )
-    effects, travels = [], arm.identification.presliding_travels
-    for name, x, v in _coordinates(arm, grid):
+    effects: list[ActuatorEffect] = []
+    travels = arm.identification.presliding_travels
+    for name, x, v in _coordinates(arm, grids):
         if name.startswith("actuator."):
             effects.append(ActuatorEffect(name, "offset"))
         effects.append(ActuatorEffect(name, "viscous"))
@@ -122,6 +172,13 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
             effects += [ActuatorEffect(name, "coulomb", _rounded(w * v.std())) for w in COULOMB_WIDTHS]
             effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in travels]
             effects += [effect for which in known.get(name, []) for effect in _named(arm, name, which, x, v)]
+    for name, _, v in _coordinates(arm, grids) if len(grids) > 1 else []:
+        scales = {"coulomb": _rounded(DIRECTION_WIDTH * v.std())}
+        kinds = RECORDING_KINDS if v.std() > 0 else ("offset",)
+        if name.startswith("actuator."):
+            effects += [
+                RecordingEffect(name, kind, scales.get(kind, 0.0), i) for i in range(len(grids)) for kind in kinds
+            ]
     return effects
 
 
@@ -139,14 +196,14 @@ def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
     return effects
 
 
-def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
+def optional_effects(arm: Arm, grids: Sequence[MotionGrid]) -> list[ActuatorEffect]:
     """Returns the candidate effects: springs, cables, and asymmetric and Stribeck friction.
 
     Load-dependent friction is not a candidate. On the public motions, it reduced the cross-validated error of one PSM's
     insertion, and doubled the error on other motions of this PSM.
     """
     effects = []
-    for name, x, v in _coordinates(arm, grid):
+    for name, x, v in _coordinates(arm, grids):
         if v.std() == 0:
             continue
         effects.append(ActuatorEffect(name, "stribeck", _rounded(DIRECTION_WIDTH * v.std())))
@@ -283,11 +340,12 @@ def _filtered(grid: MotionGrid, regressor: DynamicRegressor, columns: BaseColumn
     return np.concatenate(filtered)
 
 
-def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+def _coordinates(arm: Arm, grids: Sequence[MotionGrid]) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
     """Returns name, position (m,) and velocity (m,) of each coordinate in `distinct_coordinates`."""
-    rows, a_dot = arm.effect_coordinates, arm.transmission.velocity(grid.v)
-    names = distinct_coordinates(arm)
-    return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]
+    rows = arm.effect_coordinates
+    a = np.concatenate([arm.transmission.position(grid.q) for grid in grids])
+    a_dot = np.concatenate([arm.transmission.velocity(grid.v) for grid in grids])
+    return [(name, a @ rows[name], a_dot @ rows[name]) for name in distinct_coordinates(arm)]
 
 
 def _rounded(x: float) -> float:

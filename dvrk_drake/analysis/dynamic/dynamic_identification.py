@@ -1,21 +1,32 @@
-"""Identifies the full dynamics of an arm from one motion: physically consistent link parameters, rotors and effects."""
+"""Identifies the full dynamics of an arm from motions: physically consistent link parameters, rotors and effects."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, optional_effects
+from dvrk_drake.analysis.dynamic.columns import (
+    DynamicColumns,
+    RecordingEffect,
+    drive_effects,
+    dynamic_columns,
+    optional_effects,
+)
 from dvrk_drake.analysis.dynamic.effect_selection import cross_validate, select_effects
-from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates, base_parameter_estimates, parameter_covariance
+from dvrk_drake.analysis.dynamic.estimates import (
+    DynamicEstimates,
+    ResidualSeries,
+    base_parameter_estimates,
+    parameter_covariance,
+)
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import period_of, phase_folds, repeatability_floor
+from dvrk_drake.analysis.signals.repetition import FOLDS, period_of, phase_folds, repeatability_floor
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
@@ -32,107 +43,140 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 #: Smallest absolute coefficient of an effect that the model contains, in units of the prior standard deviation of this
 #: coefficient.
 MIN_EFFECT = 1e-4
+#: Smallest number of folds of one motion.
+MIN_FOLDS = 3
 #: Largest number of rows in a fit. A motion with more rows is thinned out after low-pass filtering.
 MAX_ROWS = 40_000
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class DynamicIdentification(Identification):
-    """Model identified from a motion.
-
-    The model contains `dynamics`. The base parameters of gravity are computed from the identified link parameters.
+@dataclass(frozen=True, eq=False)
+class FittedMotion:
+    """Efforts of one recording in an identification, at r rows. One second at each end is omitted.
 
     Attributes:
+        recording: Motion as recorded.
         grid: Resampled motion.
         period: Period of the motion [s], or None if the motion does not repeat.
-        measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N]. One second at each end of
-            the motion is omitted.
-        predicted: Predicted efforts (r, n) of the actuators at the same rows, after the same low-pass filter [N m, N].
-        held_out: Efforts (r, n) that cross-validation predicts for the rows of each held-out fold [N m, N].
-        dry_friction: Coordinate -> sum of its Coulomb and presliding friction, and standard error of this sum [N m, N].
-        nominal_mass: Total mass of the links in the SDF [kg].
+        measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
+        predicted: Predicted efforts (r, n) of the actuators, after the same low-pass filter [N m, N].
+        held_out: Efforts (r, n) that cross-validation predicts for the rows of each held-out fold [N m, N]. If there is
+            more than one recording, the fold is the whole recording.
     """
 
+    recording: Recording
     grid: MotionGrid
     period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
     held_out: NDArray[np.float64]
+
+    @property
+    def held_out_errors(self) -> NDArray[np.float64]:
+        """Relative RMS errors (n,) of `held_out` [1], nan if the measured effort is 0."""
+        squares = np.sum((self.measured - self.held_out) ** 2, axis=0), np.sum(self.measured**2, axis=0)
+        return np.sqrt(np.divide(*squares, out=np.full(len(squares[0]), np.nan), where=squares[1] > 0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class DynamicIdentification(Identification):
+    """Model identified from one or more motions.
+
+    The model contains `dynamics`. The base parameters of gravity are computed from the identified link parameters.
+    `recording` is the first recording.
+
+    Attributes:
+        motions: Efforts of each recording.
+        dry_friction: Coordinate -> sum of its Coulomb and presliding friction, and standard error of this sum [N m, N].
+        nominal_mass: Total mass of the links in the SDF [kg].
+    """
+
+    motions: tuple[FittedMotion, ...]
     dry_friction: dict[str, tuple[float, float]]
     nominal_mass: float
 
 
 def identify_dynamic(
-    recording: Recording, arm: Arm, progress: Callable[[float], object] = lambda _: None
+    recordings: Sequence[Recording], arm: Arm, progress: Callable[[float], object] = lambda _: None
 ) -> DynamicIdentification:
-    """Identifies the dynamics of `arm` from a motion.
+    """Identifies the dynamics of `arm` from one or more motions.
 
     Measured efforts and regressor columns are filtered with the same low-pass filter. The model includes the mandatory
     effects of `drive_effects`. These are an offset of every actuator, friction along every drive coordinate, and the
     springs, cables and asymmetric friction that the arm file lists. The friction model consists of viscous, smoothed
     Coulomb and presliding friction. Additional effects are selected by cross-validation over the phase of the motion.
 
-    The link parameters are physically consistent. For parameters that the recording does not identify, the estimates
+    The link parameters are physically consistent. For parameters that the recordings do not identify, the estimates
     are the values of the SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a
     base tilt. The cross-validated errors are prediction errors on held-out folds (`cross_validate`).
 
+    All recordings have the same links, rotors and effects. Offsets and friction of the actuators differ between the
+    recordings (`RecordingEffect`), and the model contains their means.
+
     Args:
-        recording: Motion with t and tau, in joint or actuator coordinates.
+        recordings: Motions with t and tau, in joint or actuator coordinates.
         arm: Arm that was recorded.
         progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
-        RecordingError: The recording does not match the arm, has no efforts, or is not a motion.
+        RecordingError: A recording does not match the arm, has no efforts, or is not a motion.
         IdentificationError: The solver for consistent parameters did not converge, or the cross-validated RMS error of
             a moving actuator exceeds the RMS effort of this actuator.
     """
-    grid = motion_grid(recording, arm, default_settings(arm), max_rows=MAX_ROWS)
-    tau = recording.in_actuator_coordinates(arm).measured_effort()
+    settings = default_settings(arm)
+    grids = thinned([motion_grid(recording, arm, settings) for recording in recordings])
+    tau = [recording.in_actuator_coordinates(arm).measured_effort() for recording in recordings]
     progress(0.05)
-    period = period_of(grid)
-    problem = motion_problem(grid, tau, period)
+    periods = [period_of(grid) for grid in grids]
+    problem = motion_problem(grids, tau, periods)
     progress(0.2)
     selection = select_effects(problem, lambda share: progress(0.2 + 0.3 * share))
     selection, fit = selection.consistent()
     problem, effects = selection.problem, selection.effects
     held_out = cross_validate(selection, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
     measured = problem.columns.tau
-    squares = np.sum((measured - held_out) ** 2, axis=0)
-    _refuse_worse_than_zero(recording, grid, np.sqrt(squares / np.maximum(problem.efforts, np.finfo(float).tiny)))
     predicted = problem.predict(effects, fit.x)
-    error = measured - predicted
-    covariance = parameter_covariance(problem, fit, error, grid.rate / grid.step, grid.settings.effort_cut_off, period)
+    parts = [np.flatnonzero(problem.recording == i) for i in range(len(recordings))]
+    rows = [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
+    motions = tuple(
+        FittedMotion(recording, grid, period, measured[own], predicted[own], held_out[own])
+        for recording, grid, period, own in zip(recordings, grids, periods, rows, strict=True)
+    )
+    for motion in motions:
+        _refuse_worse_than_zero(motion)
+    series = [
+        ResidualSeries(own, grid.rate / grid.step, period)
+        for own, grid, period in zip(rows, grids, periods, strict=True)
+    ]
+    covariance = parameter_covariance(problem, fit, measured - predicted, settings.effort_cut_off, series)
     estimates = DynamicEstimates(problem, fit, covariance)
-    section = _section(problem, effects, fit, covariance, squares, grid, tau, period)
+    floors = [_repeatability(own, motion) for own, motion in zip(tau, motions, strict=True)]
+    section = _section(problem, effects, fit, covariance, np.sum((measured - held_out) ** 2, axis=0), floors)
     section.links = estimates.links()
     section.base_parameters, section.correlations = estimates.base_parameters()
-    model = _model(recording, arm, section, covariance)
+    model = _model(recordings, arm, section, covariance)
     progress(1.0)
     nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
     return DynamicIdentification(
         model=model,
-        recording=recording,
-        num_rows=len(recording),
-        grid=grid,
-        period=period,
-        measured=measured,
-        predicted=predicted,
-        held_out=held_out,
+        recording=recordings[0],
+        num_rows=sum(map(len, recordings)),
+        motions=motions,
         dry_friction=estimates.dry_friction(),
         nominal_mass=nominal,
     )
 
 
-def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDArray[np.float64]) -> None:
-    """Raises IdentificationError if the cross-validated relative error of a moving actuator exceeds 1.
+def thinned(grids: Sequence[MotionGrid]) -> tuple[MotionGrid, ...]:
+    """Returns the motions with similar rates of their rows, and with at most about `MAX_ROWS` rows in total."""
+    seconds = sum(len(grid.row_times) / grid.rate for grid in grids)
+    rate = min(MAX_ROWS / seconds, *(grid.rate for grid in grids))
+    return tuple(replace(grid, step=max(1, round(grid.rate / rate))) for grid in grids)
 
-    Args:
-        recording: Recording that the error message names.
-        grid: Resampled motion.
-        errors: Cross-validated relative errors (n,) of the actuators [1].
-    """
-    arm = grid.arm
-    moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
+
+def _refuse_worse_than_zero(motion: FittedMotion) -> None:
+    """Raises IdentificationError if the cross-validated relative error of a moving actuator exceeds 1."""
+    arm, recording, errors = motion.grid.arm, motion.recording, motion.held_out_errors
+    moves = np.sqrt(np.mean(arm.transmission.velocity(motion.grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
     if len(bad := np.flatnonzero(moves & (errors > 1))):
         joints = ", ".join(f"{arm.joint_names[i]} ({100 * errors[i]:.0f} %)" for i in bad)
         raise IdentificationError(
@@ -143,36 +187,57 @@ def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDAr
 
 
 def motion_problem(
-    grid: MotionGrid, tau: NDArray[np.float64], period: float | None, effects: Sequence[ActuatorEffect] | None = None
+    grids: Sequence[MotionGrid],
+    tau: Sequence[NDArray[np.float64]],
+    periods: Sequence[float | None],
+    effects: Sequence[ActuatorEffect] | None = None,
 ) -> DynamicProblem:
-    """Returns the least-squares problem of a motion.
+    """Returns the least-squares problem of one or more motions of an arm.
 
     Args:
-        grid: Resampled motion.
-        tau: Measured efforts (m, n) of the actuators at the rows of the recording [N m, N].
-        period: Period of the motion [s], or None if the motion does not repeat.
+        grids: Resampled motions.
+        tau: Measured efforts (m, n) of the actuators at the rows of each recording [N m, N].
+        periods: Periods of the motions [s], None for a motion that does not repeat.
         effects: Effects of the model, all of which are mandatory. If None, the effects of `drive_effects` are mandatory
             and those of `optional_effects` are candidates.
     """
-    mandatory = effects if effects is not None else drive_effects(grid.arm, grid)
-    candidates = [] if effects is not None else optional_effects(grid.arm, grid)
-    regressor = DynamicRegressor(grid.arm)
-    columns = dynamic_columns(grid, tau, regressor, [*mandatory, *candidates])
-    fold, edge = phase_folds(grid, period)
+    arm = grids[0].arm
+    mandatory = effects if effects is not None else drive_effects(arm, grids)
+    candidates = [] if effects is not None else optional_effects(arm, grids)
+    regressor = DynamicRegressor(arm)
+    columns = [
+        dynamic_columns(grid, own, regressor, [*mandatory, *candidates]) for grid, own in zip(grids, tau, strict=True)
+    ]
+    num_folds = max(FOLDS // len(grids), MIN_FOLDS)
+    folds, edges = zip(
+        *(phase_folds(grid, period, num_folds) for grid, period in zip(grids, periods, strict=True)), strict=True
+    )
     # A low-pass filtered effort has two independent values per period of the cut-off frequency. Repetitions of the
     # motion do not add independent values.
-    duration = len(columns.tau) * grid.step / grid.rate
-    independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
+    independent = 0.0
+    for grid, own, period in zip(grids, columns, periods, strict=True):
+        duration = len(own.tau) * grid.step / grid.rate
+        independent += 2 * grid.settings.effort_cut_off * min(duration, period or duration)
+    num_rows = [len(own.tau) for own in columns]
     return DynamicProblem(
-        grid=grid,
-        kept=np.ones(len(columns.tau), dtype=bool),
-        columns=columns,
+        grids=tuple(grids),
+        kept=np.ones(sum(num_rows), dtype=bool),
+        recording=np.repeat(np.arange(len(grids)), num_rows),
+        columns=DynamicColumns.of_recordings(columns),
         regressor=regressor,
-        fold=fold,
-        edge=edge,
-        independent=min(independent, len(columns.tau)),
+        fold=np.concatenate([fold + num_folds * i for i, fold in enumerate(folds)]),
+        edge=np.concatenate(edges),
+        independent=min(independent, sum(num_rows)),
         num_mandatory=len(mandatory),
     )
+
+
+def _repeatability(tau: NDArray[np.float64], motion: FittedMotion) -> NDArray[np.float64]:
+    """Returns the RMS difference (n,) of the efforts tau (m, n) between periods [N m, N], nan without a period."""
+    if motion.period is None:
+        return np.full(tau.shape[1], np.nan)
+    grid, size = motion.grid, np.sqrt(np.mean(motion.measured**2, axis=0))
+    return np.nan_to_num(repeatability_floor(tau, grid.rate, motion.period, grid.settings.effort_cut_off)) * size
 
 
 def _section(
@@ -181,11 +246,9 @@ def _section(
     fit: ConsistentFit,
     covariance: NDArray[np.float64],
     held_out: NDArray[np.float64],
-    grid: MotionGrid,
-    tau: NDArray[np.float64],
-    period: float | None,
+    floors: Sequence[NDArray[np.float64]],
 ) -> DynamicSection:
-    arm, p = grid.arm, problem.num_rigid
+    arm, p = problem.regressor.arm, problem.num_rigid
     sd = np.sqrt(np.diag(covariance))
     rotors = [
         RotorEstimate(name, float(fit.x[i]), float(sd[i]))
@@ -194,15 +257,16 @@ def _section(
     effects = []
     for k, effect in enumerate(problem.columns.effects[c] for c in selected):
         value = float(fit.x[p + k])
+        if isinstance(effect, RecordingEffect):
+            continue
         if value**2 * problem.effect_precision[selected[k]] > MIN_EFFECT**2:
             effects.append(
                 DriveEffect(effect.coordinate, effect.kind, effect.scale, value, standard_error=float(sd[p + k]))
             )
     rows = problem.num_rows
     size = np.sqrt(problem.efforts / rows)
-    floor = np.zeros(arm.num_joints)
-    if period is not None:
-        floor = np.nan_to_num(repeatability_floor(tau, grid.rate, period, grid.settings.effort_cut_off)) * size
+    repeating = [floor for floor in floors if np.all(np.isfinite(floor))]
+    floor = np.sqrt(np.mean(np.square(repeating), axis=0)) if repeating else np.zeros(arm.num_joints)
     actuators = [
         ActuatorStatistics(name, *map(float, numbers))
         for name, *numbers in zip(
@@ -212,24 +276,28 @@ def _section(
     gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
     gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)
     expected = [float(g) for g in arm.gravity]
-    return DynamicSection([float(g) for g in gravity], [], rotors, effects, actuators, grid.settings, expected)
+    return DynamicSection(
+        [float(g) for g in gravity], [], rotors, effects, actuators, problem.grids[0].settings, expected
+    )
 
 
-def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]) -> IdentifiedModel:
-    in_joints = recording.in_joint_coordinates(arm)
+def _model(
+    recordings: Sequence[Recording], arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]
+) -> IdentifiedModel:
+    q = np.concatenate([recording.in_joint_coordinates(arm).q for recording in recordings])
     as_mounted = arm.with_gravity(section.gravity)
     joints = []
     for j, name in enumerate(arm.joint_names):
-        lower, upper = float(in_joints.q[:, j].min()), float(in_joints.q[:, j].max())
+        lower, upper = float(q[:, j].min()), float(q[:, j].max())
         coverage = (upper - lower) / float(arm.position_upper[j] - arm.position_lower[j])
         joints.append(JointStatistics(name=name, position_lower=lower, position_upper=upper, coverage=coverage))
     model = IdentifiedModel(
         arm=as_mounted,
         joints=joints,
         provenance=Provenance(
-            recording=recording.source,
-            sha256=recording.sha256,
-            poses=len(recording),
+            recording=", ".join(recording.source for recording in recordings),
+            sha256=" ".join(recording.sha256 for recording in recordings),
+            poses=len(q),
             method="dynamic",
             version=version("dvrk-drake"),
         ),

@@ -15,8 +15,8 @@ from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 #: Number of iterations that estimate the base tilt and the loads of the drives. Each iteration uses the parameters of
 #: the previous iteration. A third iteration changes the errors by less than 0.01 %.
 NUM_ITERATIONS = 2
-#: Number of adjacent folds that `cross_validate` holds out together. Long held-out segments are more similar to another
-#: motion than short ones.
+#: Number of adjacent folds of one motion that `cross_validate` holds out together. Long held-out segments are more
+#: similar to another motion than short ones.
 NUM_HELD_OUT_FOLDS = 2
 
 
@@ -96,8 +96,10 @@ def cross_validate(
 ) -> NDArray[np.float64]:
     """Returns the predicted efforts (r, n) of the actuators, each from a fit without the fold of its row [N m, N].
 
-    One group of `NUM_HELD_OUT_FOLDS` adjacent folds is held out at a time. The effects are selected again without the
-    held-out folds. The direction of gravity and the physically consistent parameters are also estimated again.
+    One group of `NUM_HELD_OUT_FOLDS` adjacent folds is held out at a time, or one motion of several motions. The
+    effects are selected again without the held-out folds. The direction of gravity and the physically consistent
+    parameters are also estimated again. The offsets and the friction of a held-out motion are the means over the other
+    motions (`RecordingEffect`).
 
     Args:
         selection: Selection that uses all folds.
@@ -108,18 +110,18 @@ def cross_validate(
         IdentificationError: The solver did not converge.
     """
     problem, tilts = selection.problem, len(selection.problem.columns.tilts)
-    firsts = range(0, selection.selection.equations.folds, NUM_HELD_OUT_FOLDS)
+    groups = _held_out_groups(problem)
     results = []
-    for first in firsts:
-        results.append(_select_without(selection, first))
-        progress(0.3 * len(results) / len(firsts))
+    for group in groups:
+        results.append(_select_without(selection, *group))
+        progress(0.3 * len(results) / len(groups))
     used = np.unique(np.concatenate([effects for effects, _, _ in results]))
     tilt_efforts = problem.columns.tilts @ (problem.columns.base @ phi)
     columns = (problem.actuator_columns(i, used, tilt_efforts) for i in range(len(problem.efforts)))
     size, b = problem.rigid.shape[2] + len(used) + tilts, problem.rigid.shape[2]
     equations = NormalEquations.of(columns, size, problem.columns.tau, problem.fold, problem.edge)
     predicted = np.empty_like(problem.columns.tau)
-    for first, (effects, weights, tilt) in zip(firsts, results, strict=True):
+    for (first, count), (effects, weights, tilt) in zip(groups, results, strict=True):
         progress(0.4 + 0.6 * first / equations.folds)
         # Correct the efforts for the difference between the tilt estimated from all folds and the tilt estimated
         # without the held-out folds.
@@ -127,20 +129,29 @@ def cross_validate(
         T[:b, : problem.num_rigid] = problem.columns.base
         T[b + np.searchsorted(used, effects), problem.num_rigid + np.arange(len(effects))] = 1.0
         T[-1 - tilts :, -1] = np.append(problem.tilt[:tilts] - tilt, 1.0)
-        training = equations.without_fold(first, NUM_HELD_OUT_FOLDS).weighted(weights)
+        training = equations.without_fold(first, count).weighted(weights)
         y = ConsistentProgram(problem, effects).solve(T.T @ training @ T)
-        rows = np.isin(problem.fold, np.arange(first, first + NUM_HELD_OUT_FOLDS) % equations.folds)
+        rows = np.isin(problem.fold, np.arange(first, first + count) % equations.folds)
         predicted[rows] = problem.predict(effects, y, rows)
         predicted[rows] += np.tensordot(tilt - problem.tilt[:tilts], tilt_efforts[:, rows], axes=(0, 0))
     return predicted
 
 
+def _held_out_groups(problem: DynamicProblem) -> list[tuple[int, int]]:
+    """Returns the first fold and the number of folds of each group that `cross_validate` holds out."""
+    num_motions = len(problem.grids)
+    if num_motions == 1:
+        return [(first, NUM_HELD_OUT_FOLDS) for first in range(0, int(problem.fold.max()) + 1, NUM_HELD_OUT_FOLDS)]
+    folds = [np.unique(problem.fold[problem.recording == i]) for i in range(num_motions)]
+    return [(int(own[0]), len(own)) for own in folds]
+
+
 def _select_without(
-    whole: EffectSelection, first: int
+    whole: EffectSelection, first: int, count: int
 ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
-    """Returns effect indices, actuator weights and tilt, estimated without the held-out folds that start at `first`."""
+    """Returns effect indices, actuator weights and tilt, estimated without `count` folds that start at `first`."""
     problem = whole.problem
-    selection = whole.selection.without(first, NUM_HELD_OUT_FOLDS)
+    selection = whole.selection.without(first, count)
     selected = selection.select(whole.mandatory, problem.candidates)
     x = selection.fit(selected)
     return selected[selected < problem.num_effects], selection.weights, x[len(x) - len(problem.columns.tilts) :]

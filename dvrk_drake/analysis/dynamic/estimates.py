@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import matmul_toeplitz
 
+from dvrk_drake.analysis.dynamic.columns import RecordingEffect
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.signals.low_pass import correlation
@@ -81,13 +83,26 @@ _OVERSAMPLING = 2.0
 _MIN_OVERLAP = 0.2
 
 
+class ResidualSeries(NamedTuple):
+    """Residuals of one motion, at a constant rate.
+
+    Attributes:
+        rows: Slice of the rows of the motion.
+        rate: Rate of the rows [Hz].
+        period: Period of the motion [s], or None if the motion does not repeat.
+    """
+
+    rows: slice
+    rate: float
+    period: float | None
+
+
 def parameter_covariance(
     problem: DynamicProblem,
     fit: ConsistentFit,
     residuals: NDArray[np.float64],
-    rate: float,
     cut_off: float,
-    period: float | None,
+    series: Sequence[ResidualSeries],
 ) -> NDArray[np.float64]:
     """Returns the covariance (p + e, p + e) of `fit.x`, for a fixed set of effects and without inequality constraints.
 
@@ -110,20 +125,20 @@ def parameter_covariance(
         problem: Problem that was solved.
         fit: Solution of the problem.
         residuals: Effort residuals (r, n) of the fit [N m, N].
-        rate: Rate of the rows [Hz].
         cut_off: Cut-off of the low-pass filter of the efforts [Hz].
-        period: Period of the motion [s], or None if the motion does not repeat.
+        series: Rows of each motion. Errors of different motions are assumed to be independent.
     """
-    step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
-    rows = slice(None, None, step)
     A = _inverse(fit.information + fit.prior_precision)
     to_base = problem.to_base(len(fit.effects))
     middle = np.zeros((len(to_base),) * 2)
     columns = [problem.actuator_columns(i, fit.effects) for i in range(len(fit.weights))]
     held_out = _held_out_residuals(problem, fit, residuals, columns, to_base)
-    for i, (weight, (own, X)) in enumerate(zip(fit.weights, columns, strict=True)):
-        covariance = error_covariance(residuals[rows, i], held_out[rows, i], rate / step, period)
-        middle[own[:, None], own] += (weight * step) ** 2 * (X[rows].T @ matmul_toeplitz(covariance, X[rows]))
+    for motion in series:
+        step = max(1, int(motion.rate / (2 * cut_off * _OVERSAMPLING)))
+        rows = slice(motion.rows.start, motion.rows.stop, step)
+        for i, (weight, (own, X)) in enumerate(zip(fit.weights, columns, strict=True)):
+            covariance = error_covariance(residuals[rows, i], held_out[rows, i], motion.rate / step, motion.period)
+            middle[own[:, None], own] += (weight * step) ** 2 * (X[rows].T @ matmul_toeplitz(covariance, X[rows]))
     return np.asarray(A @ (to_base.T @ middle @ to_base + fit.prior_precision) @ A, dtype=np.float64)
 
 
@@ -246,7 +261,8 @@ class DynamicEstimates:
         values = B @ self._fit.x[:p]
         prior_variances = np.einsum("bp,pq,bq->b", B, self._prior[:p, :p], B)
         # Effects with coefficient 0, which is their lower bound, are omitted.
-        nonzero = p + np.flatnonzero(self._fit.x[p:] != 0)
+        shared = np.array([not isinstance(effect, RecordingEffect) for effect in self._effects], dtype=bool)
+        nonzero = p + np.flatnonzero((self._fit.x[p:] != 0) & shared)
         to_all = np.zeros((len(B) + len(nonzero), len(self._fit.x)))
         to_all[: len(B), :p] = B
         to_all[len(B) + np.arange(len(nonzero)), nonzero] = 1.0
@@ -274,7 +290,7 @@ class DynamicEstimates:
             dry = [
                 p + k
                 for k, effect in enumerate(self._effects)
-                if effect.coordinate == name and effect.kind in DRY_KINDS
+                if effect.coordinate == name and effect.kind in DRY_KINDS and not isinstance(effect, RecordingEffect)
             ]
             if dry:
                 variance = float(np.sum(self._covariance[np.ix_(dry, dry)]))

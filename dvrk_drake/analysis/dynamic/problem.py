@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DynamicColumns
+from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
@@ -35,6 +35,8 @@ MIN_ROTOR_DEVIATION, MIN_ROTOR_SHARE = 3e-6, 0.1
 #: applies to friction, which is a sum of several effects. The second applies to springs and cables that the arm file
 #: lists, because they may balance gravity. The third applies to all other effects.
 FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
+#: Prior standard deviation of the torque of a `RecordingEffect`, as a share of the RMS effort.
+RECORDING_DEVIATION = 0.02
 #: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
 TILT_DEVIATION = 0.05
 #: Smallest information about a direction in parameter space, relative to the prior. Along directions with less
@@ -49,24 +51,26 @@ _INITIAL_ERROR = 0.1
 
 @dataclass(frozen=True, eq=False)
 class DynamicProblem:
-    """Regression problem of one motion, with the regressor columns and the priors of all unknowns.
+    """Regression problem of one or more motions, with the regressor columns and the priors of all unknowns.
 
     Attributes:
-        grid: Resampled motion.
-        kept: Mask of the inner rows of the motion (`MotionGrid.inner`) that the problem contains.
+        grids: Resampled motions.
+        kept: Mask of the inner rows of the motions (`MotionGrid.inner`) that the problem contains.
+        recording: Index (r,) of the motion of each row.
         columns: Filtered regressor columns of the rigid-body parameters and of all effects.
         regressor: Regressor of the arm. The parameters of the SDF (`regressor.values`) are the prior means.
         tilt: Change (2,) of the x and y components of gravity [m/s^2]. The change is included in `rigid`, but not in
             `columns`.
-        fold: Fold (r,) of each row, see `phase_folds`.
+        fold: Fold (r,) of each row, see `phase_folds`. Each fold belongs to one motion.
         edge: Masks (r, 2) of the rows at the edges of the folds, see `phase_folds`.
         independent: Effective number of independent rows. It can be less than r, because filtered and repeated efforts
             are correlated.
         num_mandatory: Number of mandatory effects, which come first. The remaining effects are candidates.
     """
 
-    grid: MotionGrid
+    grids: tuple[MotionGrid, ...]
     kept: NDArray[np.bool_]
+    recording: NDArray[np.int_]
     columns: DynamicColumns
     regressor: DynamicRegressor
     fold: NDArray[np.int_]
@@ -131,7 +135,10 @@ class DynamicProblem:
         )
         deviation = np.full(self.num_effects, EFFECT_DEVIATION)
         for k, effect in enumerate(self.columns.effects):
-            if effect.dissipative:
+            if isinstance(effect, RecordingEffect):
+                rows = float(np.mean(self.recording == effect.recording))
+                deviation[k] = RECORDING_DEVIATION * np.sqrt(max(rows, 1 / self.num_rows))
+            elif effect.dissipative:
                 deviation[k] = FRICTION_DEVIATION
             elif k < self.num_mandatory and effect.kind in POSITION_KINDS and effect.kind != "offset":
                 deviation[k] = KNOWN_DEVIATION
@@ -236,7 +243,15 @@ class DynamicProblem:
         independent = self.independent * float(np.mean(rows))
         kept = self.kept.copy()
         kept[kept] = rows
-        return replace(self, kept=kept, columns=columns, fold=fold, edge=self.edge[rows], independent=independent)
+        return replace(
+            self,
+            kept=kept,
+            recording=self.recording[rows],
+            columns=columns,
+            fold=fold,
+            edge=self.edge[rows],
+            independent=independent,
+        )
 
     @property
     def is_loaded(self) -> bool:
@@ -258,14 +273,16 @@ class DynamicProblem:
         """
         if not self.is_loaded:
             return self
-        grid, regressor = self.grid, self.regressor
+        regressor = self.regressor
         tilted = regressor.with_gravity([float(g) for g in regressor.arm.gravity + np.append(self.tilt, 0.0)])
         of_effects = [self.columns.effects[k] for k in effects]
         parameters = np.concatenate([phi, np.zeros(len(regressor.values) - len(phi))])
-        tau = tilted.torque(grid.q, grid.v, grid.vd, parameters)
-        rigid = grid.arm.transmission.inverse.pull_back_effort(tau)
-        transmitted = transmitted_effort(grid.arm, rigid, of_effects, coefficients, grid.q)
-        return replace(self, columns=self.columns.with_load(grid, regressor, transmitted, self.kept))
+        transmitted = []
+        for grid in self.grids:
+            tau = tilted.torque(grid.q, grid.v, grid.vd, parameters)
+            rigid = grid.arm.transmission.inverse.pull_back_effort(tau)
+            transmitted.append(transmitted_effort(grid.arm, rigid, of_effects, coefficients, grid.q))
+        return replace(self, columns=self.columns.with_load(self.grids, regressor, transmitted, self.kept))
 
     def with_fit(self, fit: ConsistentFit) -> DynamicProblem:
         """Returns the problem with the loads of the drives that follow from a fit, see `with_load`."""

@@ -258,7 +258,7 @@ def payload(
         report = require_usable(recording, arm, progress)
         warnings += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
     if isinstance(model, Arm):
-        model = identify_dynamic(reference, arm, step_progress(progress, "identifying")).model
+        model = identify_dynamic([reference], arm, step_progress(progress, "identifying")).model
     estimates = estimate_payload(reference, loaded, model.dynamic_model, progress=step_progress(progress, "estimating"))
     result = estimates[0] if link is None else next(p for p in estimates if p.link == link)
     warnings = (*better_link_warnings(result, estimates), *warnings)

@@ -16,6 +16,8 @@ CUT_OFF = 20.0
 MAX_LAG, LAG_STEP = 0.04, 0.0025
 #: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
+#: Largest number of samples in a fit. A longer motion is thinned out after low-pass filtering.
+MAX_ROWS = 50_000
 #: Width of the smoothed sign function for Coulomb friction, as a share of the RMS velocity.
 SMOOTHING = 0.1
 #: Number of segments of the motion from which the standard errors are estimated.
@@ -60,7 +62,7 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
     """
     rate = signals.rate
     start = max(int(ENDS * rate), int(MAX_LAG * rate))
-    inner = slice(start, len(signals.t) - start)
+    inner = slice(start, len(signals.t) - start, -(-len(signals.t) // MAX_ROWS))
     tau = low_pass(signals.tau, rate, CUT_OFF)
     angles = signals.q[:, moving]
     shared = np.hstack([signals.vd[:, moving], np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
@@ -90,7 +92,7 @@ def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: f
     step = max(round(LAG_STEP * rate), 1)
     shifts = np.arange(-(inner.start // step), inner.start // step + 1) * step
     shifts = shifts[np.abs(shifts) <= MAX_LAG * rate]
-    shifted = np.column_stack([tau[inner.start + s : inner.stop + s] for s in shifts])
+    shifted = np.column_stack([tau[inner.start + s : inner.stop + s : inner.step] for s in shifts])
     squares = (shifted - Q @ (Q.T @ shifted)) ** 2
     totals = np.sum(squares, axis=0)
     lags = [_minimiser(shifts, np.sum(segment, axis=0)) for segment in np.array_split(squares, NUM_SEGMENTS)]

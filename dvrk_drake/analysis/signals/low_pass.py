@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 #: Order of the Butterworth low-pass filter. The filter runs forwards and backwards, which halves the amplitude at the
 #: cut-off frequency.
 ORDER = 6
+#: Largest number of columns that are filtered together. It limits the memory for a long motion.
+MAX_COLUMNS = 16
 
 
 def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int = ORDER) -> NDArray[np.float64]:
@@ -31,8 +33,9 @@ def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int
     filtered = np.empty(columns.shape)
     cut_offs = np.broadcast_to(cut_off, columns.shape[1])
     for value in np.unique(cut_offs):
-        selected = cut_offs == value
-        filtered[:, selected] = _forwards_and_backwards(columns[:, selected], value / rate, order)
+        selected = np.flatnonzero(cut_offs == value)
+        for block in np.array_split(selected, -(-len(selected) // MAX_COLUMNS)):
+            filtered[:, block] = _forwards_and_backwards(columns[:, block], value / rate, order)
     return filtered.reshape(x.shape)
 
 

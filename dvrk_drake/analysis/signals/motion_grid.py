@@ -189,14 +189,7 @@ def default_settings(arm: Arm) -> SignalSettings:
     )
 
 
-def motion_grid(
-    recording: Recording,
-    arm: Arm,
-    settings: SignalSettings,
-    clock: TrueTime | None = None,
-    *,
-    max_rows: int | None = None,
-) -> MotionGrid:
+def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock: TrueTime | None = None) -> MotionGrid:
     """Resamples a motion to the grid.
 
     Positions are filtered and differentiated in actuator coordinates, because each actuator has its own encoder and
@@ -207,7 +200,6 @@ def motion_grid(
         arm: Arm that was recorded.
         settings: Cut-offs of the filters and delays of the efforts.
         clock: Result of `true_time` for the recording in actuator coordinates. None: computed by this function.
-        max_rows: Largest number of filtered rows (`MotionGrid.step`). None: all rows.
 
     Raises:
         RecordingError: The recording does not match the arm, has no times, is too short, or its rate is too low.
@@ -242,5 +234,4 @@ def motion_grid(
         row_times=clock.t[np.maximum(last, 0)],
         rate=rate,
         clock=clock,
-        step=1 if max_rows is None else -(-len(recording) // max_rows),
     )

@@ -45,8 +45,11 @@ _QUANTILE, _MARGIN = 0.02, 0.25
 def plot_identification(folder: Path, result: Identification) -> None:
     """Plots measured and predicted efforts. See `plot_motion` and `plot_static_identification` for the files."""
     if isinstance(result, DynamicIdentification):
-        fit = validate_motion(result.model, result.recording)
-        plot_motion(folder, fit, held_out=result.held_out)
+        for k, motion in enumerate(result.motions):
+            # Each recording after the first one has its own folder.
+            own = folder if k == 0 else folder / str(k + 1)
+            own.mkdir(exist_ok=True)
+            plot_motion(own, validate_motion(result.model, motion.recording), held_out=motion.held_out)
     elif isinstance(result, StaticIdentification):
         plot_static_identification(folder, result)
 
@@ -96,7 +99,7 @@ def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
     recording = validation.recording.in_joint_coordinates(arm)
     tau, predicted = recording.measured_effort(), model.holding_torque(recording.q)
     usable = usable_measurements(tau.shape, validation.excluded) & validation.measured
-    is_held_out = validation.recording.sha256 != model.provenance.sha256 or not validation.recording.sha256
+    is_held_out = not validation.of_same_recording
     role = "held out (the recording was not used to fit)" if is_held_out else "fitted (the recording was used to fit)"
     label = f"model, {role}"
     rms, intervals = _errors_and_intervals({"zero torque": tau, label: tau - predicted}, usable)

@@ -41,9 +41,7 @@ def plot_motion(folder: Path, validation: DynamicValidation, held_out: NDArray[n
     """
     recording = validation.recording
     name = f"{validation.model.arm.name}, {Path(recording.source).name}"
-    is_fitted = held_out is not None or bool(
-        recording.sha256 and recording.sha256 == validation.model.provenance.sha256
-    )
+    is_fitted = held_out is not None or validation.of_same_recording
     curves = {"fitted": (FITTED, validation.predicted)} if is_fitted else {}
     if held_out is not None:
         curves["held out (cross-validation)"] = (HELD_OUT, held_out)

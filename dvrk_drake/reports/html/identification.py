@@ -16,7 +16,8 @@ from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.locked_joints import locked_text
-from dvrk_drake.reports.answers import answer_of
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.answers import answer_of, percent
 from dvrk_drake.reports.html.consistency import consistency_blocks
 from dvrk_drake.reports.html.drive_plots import friction_over_speed, torque_over_position
 from dvrk_drake.reports.html.error_budget import error_budget, motion_budget, pose_budget
@@ -62,19 +63,24 @@ def identification_page(
         saved: Whether the verdicts of a validation are stored in the model file.
     """
     efforts: Efforts
+    others: list[MotionEfforts] = []
     if isinstance(result, DynamicIdentification | DynamicValidation):
         efforts = MotionEfforts.of(result)
+        if isinstance(result, DynamicIdentification):
+            others = [MotionEfforts.of(result, k) for k in range(1, len(result.motions))]
     else:
         assert isinstance(result, StaticIdentification | StaticValidation)
         efforts = PoseEfforts.of(result)
     answer = answer_of(result, model_path=model_path, file_options=file_options, saved=saved)
     recording = result.recording
-    name = Path(recording.source).name or "recording"
+    name = _name(recording) + "".join(f", {_name(other.recording)}" for other in others)
     if not provenance.inputs:
         provenance = replace(provenance, inputs=((recording.source or "recording", recording.sha256),))
     of_what = f"{len(recording)} static poses"
     if isinstance(efforts, MotionEfforts):
-        of_what = f"motion of {efforts.grid.t[-1] - efforts.grid.t[0]:.0f} s"
+        motions = [efforts, *others]
+        seconds = sum(motion.grid.t[-1] - motion.grid.t[0] for motion in motions)
+        of_what = f"motion of {seconds:.0f} s" if not others else f"{len(motions)} motions, {seconds:.0f} s"
     task = "validation" if isinstance(result, Validation) else "identification"
     return Page(
         title=f"{result.model.arm.name}: {task} with {name}, {of_what}",
@@ -87,6 +93,7 @@ def identification_page(
             _efforts(efforts),
             _residuals(efforts),
             _error_budget(efforts),
+            *(section for other in others for section in _other_motion(other)),
             _cross_validation(result, efforts),
             Section("Physical consistency", consistency_blocks(result.model)),
             _drives(result, efforts),
@@ -94,6 +101,16 @@ def identification_page(
         provenance=provenance,
         closing=[Section("Next step", [Command(answer.next_command, answer.next_purpose)])],
     )
+
+
+def _name(recording: Recording) -> str:
+    return Path(recording.source).name or "recording"
+
+
+def _other_motion(efforts: MotionEfforts) -> list[Section]:
+    """Returns the sections of a recording after the first one."""
+    sections = _efforts(efforts, with_view=False), _residuals(efforts), _error_budget(efforts)
+    return [replace(section, title=f"{section.title}: {_name(efforts.recording)}") for section in sections]
 
 
 def _locked(result: Identification | Validation) -> list[Block]:
@@ -159,7 +176,7 @@ def _parameter_note(result: Identification | Validation) -> str:
     return "Estimates with 95 % intervals, beside the values of the arm's SDF."
 
 
-def _efforts(efforts: Efforts) -> Section:
+def _efforts(efforts: Efforts, *, with_view: bool = True) -> Section:
     arm = efforts.arm
     title = "Measured, fitted and held-out efforts" if len(efforts.predicted) > 1 else "Measured and predicted efforts"
     if isinstance(efforts, MotionEfforts):
@@ -168,8 +185,8 @@ def _efforts(efforts: Efforts) -> Section:
         caption = f"Efforts of the actuators after low-pass filtering at {cut_off:.3g} Hz"
         grid, tau = efforts.grid, efforts.recording.in_joint_coordinates(arm).measured_effort()
         on_grid = np.column_stack([np.interp(grid.t, grid.row_times, x) for x in tau.T])
-        view = _view(efforts, grid.t - grid.row_times[0], grid.q, on_grid)
-        blocks: list[Block] = [*view, Plot(figure, caption, time=True)]
+        view = _view(efforts, grid.t - grid.row_times[0], grid.q, on_grid) if with_view else []
+        blocks: list[Block] = [*view, Plot(figure, caption, time=with_view)]
     else:
         poses = efforts.recording.in_joint_coordinates(arm)
         view = _view(efforts, np.arange(len(poses), dtype=float), poses.q, poses.measured_effort())
@@ -249,10 +266,26 @@ def _cross_validation(result: Identification | Validation, efforts: Efforts) -> 
         "Repeatability: difference between periods of this motion.",
     }
     note = notes[type(result)]
+    if isinstance(result, DynamicIdentification) and len(result.motions) > 1:
+        note = (
+            "Cross-validation: each recording is predicted by a model of the other recordings. Effects, base tilt and "
+            "parameters are estimated anew for each. Repeatability: difference between periods of a motion."
+        )
     if isinstance(efforts, MotionEfforts) and not np.any(efforts.repeatability > 0):
         note = note.partition(" Repeatability")[0] + " Repeatability: unknown, because the motion does not repeat."
     blocks: list[Block] = [error_table(result), Plot(error_dots(result), "Relative RMS errors of each joint")]
+    if isinstance(result, DynamicIdentification) and len(result.motions) > 1:
+        blocks.append(_error_of_each_recording(result))
     return Section("Cross-validation and repeatability", blocks, note=note)
+
+
+def _error_of_each_recording(result: DynamicIdentification) -> Table:
+    rows = [
+        (_name(motion.recording), *(percent(error) if np.isfinite(error) else "" for error in motion.held_out_errors))
+        for motion in result.motions
+    ]
+    caption = "Relative RMS error of each recording, predicted by a model of the other recordings"
+    return Table(("recording", *result.model.arm.joint_names), rows, caption=caption)
 
 
 def _drives(result: Identification | Validation, efforts: Efforts) -> Section:

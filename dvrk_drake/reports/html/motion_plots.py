@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
+from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, FittedMotion
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
 from dvrk_drake.reports.html.binned import ComparedEfforts, binned_residuals
@@ -44,25 +44,27 @@ class MotionEfforts(ComparedEfforts):
     half_width: NDArray[np.float64]
 
     @classmethod
-    def of(cls, result: DynamicIdentification | DynamicValidation) -> MotionEfforts:
-        """Returns the efforts of an identification or a validation."""
-        t, q, v = result.grid.actuator_motion()
-        predicted = {"predicted": result.predicted}
+    def of(cls, result: DynamicIdentification | DynamicValidation, number: int = 0) -> MotionEfforts:
+        """Returns the efforts of a validation, or of one recording (index `number`) of an identification."""
+        motion: FittedMotion | DynamicValidation
         if isinstance(result, DynamicIdentification):
-            predicted = {"fitted": result.predicted, "held out": result.held_out}
+            motion = result.motions[number]
+            predicted = {"fitted": motion.predicted, "held out": motion.held_out}
             repeatability = [a.rms_repeatability for a in result.model.dynamic_model.section.actuators]
         else:
+            motion, predicted = result, {"predicted": result.predicted}
             repeatability = [(a.repeatability or 0.0) * a.rms_effort for a in result.actuators]
+        t, q, v = motion.grid.actuator_motion()
         return cls(
             model=result.model,
-            recording=result.recording,
-            grid=result.grid,
-            t=t - result.grid.row_times[0],
+            recording=motion.recording,
+            grid=motion.grid,
+            t=t - motion.grid.row_times[0],
             q=q,
             v=v,
-            measured=result.measured,
+            measured=motion.measured,
             predicted=predicted,
-            period=result.period,
+            period=motion.period,
             repeatability=np.array(repeatability),
             half_width=result.model.dynamic_model.half_width,
         )

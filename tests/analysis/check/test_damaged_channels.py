@@ -199,7 +199,7 @@ def test_rejects_a_model_worse_than_zero_torque():
     recording = motion("mtmr")
     noise = np.random.default_rng(1).normal(size=recording.q.shape) * np.sqrt(np.mean(recording.tau**2, axis=0))
     with pytest.raises(IdentificationError, match="cross-validated relative error exceeds 100 %"):
-        identify_dynamic(replace(recording, tau=noise), load_arm("mtmr"))
+        identify_dynamic([replace(recording, tau=noise)], load_arm("mtmr"))
 
 
 @pytest.mark.parametrize(

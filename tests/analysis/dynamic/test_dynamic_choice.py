@@ -32,7 +32,7 @@ def of(effects, coordinate):
 
 def test_effects_of_the_arm_file_are_mandatory():
     arm = arm_with_known_effects(pitch=["cable 1"], jaw=["asymmetric friction"])
-    always, candidates = drive_effects(arm, moving(arm)), optional_effects(arm, moving(arm))
+    always, candidates = drive_effects(arm, [moving(arm)]), optional_effects(arm, [moving(arm)])
     assert not set(always) & set(candidates)
     assert {("cable sine", 1.0), ("cable cosine", 1.0)} <= of(always, "actuator.pitch")
     # A known position-dependent torque excludes other such candidates, but not friction.
@@ -57,7 +57,7 @@ def test_effects_of_the_arm_file_are_mandatory():
 def test_invalid_known_effects_are_rejected(known, message):
     arm = arm_with_known_effects(**known)
     with pytest.raises(ArmError, match=message):
-        drive_effects(arm, moving(arm))
+        drive_effects(arm, [moving(arm)])
 
 
 def equations(generator, true):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.dynamic.estimates import (
+    ResidualSeries,
     error_covariance,
     parameter_covariance,
 )
@@ -15,6 +16,10 @@ from dvrk_drake.analysis.signals.low_pass import low_pass
 
 RATE, CUT_OFF, PERIOD, SECONDS = 100.0, 5.0, 8.0, 32.0
 T = np.arange(round(SECONDS * RATE)) / RATE
+
+
+def series(period):
+    return ResidualSeries(slice(0, len(T)), RATE, period)
 
 
 def noise(generator, count=1):
@@ -71,7 +76,7 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
         fit.x = np.linalg.solve(information + prior, sums)
         left = error - np.column_stack([x @ fit.x for x in X])
         estimates.append(fit.x)
-        predicted.append(np.diag(parameter_covariance(problem, fit, left, RATE, CUT_OFF, PERIOD)))
+        predicted.append(np.diag(parameter_covariance(problem, fit, left, CUT_OFF, [series(PERIOD)])))
     spread, mean = np.std(estimates, axis=0), np.sqrt(np.mean(predicted, axis=0))
     # The standard error of the spread of 100 fits is 7 %.
     np.testing.assert_allclose(mean, spread, rtol=0.2, atol=0)
@@ -94,6 +99,6 @@ def test_uninformed_parameters_keep_the_prior_variance():
     problem = SimpleNamespace(
         actuator_columns=lambda i, _: (np.arange(2), X), to_base=lambda _: np.eye(2), fold=(T // 4).astype(int)
     )
-    covariance = parameter_covariance(problem, fit, tau, RATE, CUT_OFF, None)
+    covariance = parameter_covariance(problem, fit, tau, CUT_OFF, [series(None)])
     assert covariance[1, 1] == pytest.approx(1 / 4.0)
     assert covariance[0, 0] < 0.01

@@ -42,7 +42,7 @@ def simulated(name, seed):
 @pytest.fixture(scope="module", params=["mtmr", "psm"])
 def case(request):
     arm, truth, recording = simulated(request.param, 0)
-    return arm, truth, recording, identify_dynamic(recording, arm)
+    return arm, truth, recording, identify_dynamic([recording], arm)
 
 
 def test_another_motion_is_predicted_below_the_noise(case):
@@ -66,7 +66,8 @@ def test_cross_validated_error_is_at_least_the_noise(case):
 def test_prediction_intervals_cover_held_out_efforts(case):
     """95 % intervals cover 93 to 97 % of the efforts that cross-validation predicts."""
     _, _, _, result = case
-    inside = np.mean(np.abs(result.measured - result.held_out) <= result.model.dynamic_model.half_width, axis=0)
+    (motion,) = result.motions
+    inside = np.mean(np.abs(motion.measured - motion.held_out) <= result.model.dynamic_model.half_width, axis=0)
     assert np.all((inside > 0.9) & (inside < 0.99)) and 0.93 < np.mean(inside) < 0.97
 
 
@@ -136,21 +137,22 @@ def test_friction_that_depends_on_load_and_position_is_found():
         DriveEffect("actuator.wrist_roll", "position^2 coulomb", float(f"{0.1 * v[6]:.3g}"), 5e-4),
     ]
     truth = true_dynamics(arm, generator, [*friction_everywhere(arm, motion), *added], spread=0.1)
-    result = identify_dynamic(recorded(truth, motion, 0.01, generator), arm)
+    result = identify_dynamic([recorded(truth, motion, 0.01, generator)], arm)
     found = {(e.coordinate, e.kind): e for e in result.model.dynamics.effects}
     for effect in added:
         estimate = found[effect.coordinate, effect.kind]
         assert abs(estimate.coefficient - effect.coefficient) < 3 * estimate.standard_error + 0.1 * effect.coefficient
     # The fitted efforts are those of the model, whose loads follow from its own parameters.
     ours = predict_motion(result.model, recorded(truth, motion, 0.0, generator))
-    assert np.all(np.std(ours[result.grid.inner] - result.predicted, axis=0) < 0.01 * np.std(result.measured, axis=0))
+    (fitted,) = result.motions
+    assert np.all(np.std(ours[fitted.grid.inner] - fitted.predicted, axis=0) < 0.01 * np.std(fitted.measured, axis=0))
 
 
 def test_loads_of_a_subset_are_those_of_the_motion(case):
     arm, _, recording, result = case
-    grid = result.grid
+    grid = result.motions[0].grid
     effects = [ActuatorEffect(f"actuator.{arm.joint_names[1]}", "load coulomb", 0.1)]
-    problem = motion_problem(grid, recording.in_actuator_coordinates(arm).measured_effort(), None, effects)
+    problem = motion_problem([grid], [recording.in_actuator_coordinates(arm).measured_effort()], [None], effects)
     rows = np.arange(problem.num_rows) % 3 == 0
     loaded = problem.with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
     subset = problem.subset(rows).with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
@@ -261,7 +263,7 @@ def test_plants_and_conversions_are_computed_once(case, monkeypatch):
     monkeypatch.setattr(plant, "make_arm_plant", counted("plants", plant.make_arm_plant))
     monkeypatch.setattr(LinearMap.inverse, "func", counted("inverses", LinearMap.inverse.func))
     monkeypatch.setattr(Arm.effect_coordinates, "func", counted("coordinates", Arm.effect_coordinates.func))
-    identify_dynamic(dataclasses.replace(recording), new)
+    identify_dynamic([dataclasses.replace(recording)], new)
     assert made["inverses"] == 1
     assert 1 <= made["plants"] <= 2 and 1 <= made["coordinates"] <= 2
     assert recording.in_actuator_coordinates(arm) is recording.in_actuator_coordinates(arm)
@@ -272,15 +274,16 @@ def test_recordings_that_are_not_motions_are_rejected():
     arm = load_arm("mtmr")
     q = np.tile(arm.sample_poses(1, np.random.default_rng(0)), (400, 1))
     with pytest.raises(RecordingError, match="the recording has no times"):
-        identify_dynamic(Recording(q=q, tau=0 * q), arm)
+        identify_dynamic([Recording(q=q, tau=0 * q)], arm)
     with pytest.raises(RecordingError, match=r"2\.0 s at 200 Hz. A dynamic model requires"):
-        identify_dynamic(Recording(q=q + np.arange(400)[:, None] * 1e-6, tau=0 * q, t=np.arange(400) / 200), arm)
+        identify_dynamic([Recording(q=q + np.arange(400)[:, None] * 1e-6, tau=0 * q, t=np.arange(400) / 200)], arm)
 
 
 def test_held_out_efforts_have_the_cross_validated_error(case):
     _, _, _, result = case
-    error = np.sqrt(np.mean((result.measured - result.held_out) ** 2, axis=0))
+    (motion,) = result.motions
+    error = np.sqrt(np.mean((motion.measured - motion.held_out) ** 2, axis=0))
     stated = [a.rms_cross_validation for a in result.model.dynamics.actuators]
     np.testing.assert_allclose(error, stated, rtol=1e-9, atol=1e-12)
     # Each row is predicted without its fold, so the held-out efforts are not those of the fit.
-    assert np.all(np.max(np.abs(result.held_out - result.predicted), axis=0) > 0)
+    assert np.all(np.max(np.abs(motion.held_out - motion.predicted), axis=0) > 0)

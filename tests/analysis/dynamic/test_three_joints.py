@@ -49,7 +49,7 @@ def recorded(seed, noise=NOISE):
 
 @pytest.fixture(scope="module")
 def result():
-    return identify_dynamic(recorded(1), ARM)
+    return identify_dynamic([recorded(1)], ARM)
 
 
 @pytest.fixture(scope="module")
@@ -133,5 +133,5 @@ def test_real_recordings_of_two_arms(shared_data):
         pytest.skip(f"needs the recordings {data}")
     arm = load_arm("psm").with_locked_joints(dict.fromkeys(WRIST, 0.0))
     for fitted, other, worst in (("psm1_2", "psm1_3", 0.15), ("psm2_1", "psm2_2", 0.15)):
-        model = identify_dynamic(read_recording(data / f"{fitted}.csv", arm), arm).model
+        model = identify_dynamic([read_recording(data / f"{fitted}.csv", arm)], arm).model
         assert validate_motion(model, read_recording(data / f"{other}.csv", arm)).mean_relative_error < worst

@@ -246,7 +246,7 @@ def unloaded(shared_data):
         pytest.skip(f"needs {folder}")
     arm = load_arm("psm")
     reference = read_recording(folder / "psm_one_no_weight.csv", arm, "actuator")
-    return folder, reference, identify_dynamic(reference, arm).model.dynamic_model
+    return folder, reference, identify_dynamic([reference], arm).model.dynamic_model
 
 
 @pytest.mark.parametrize(("file", "link", "mass", "height"), WEIGHTS)

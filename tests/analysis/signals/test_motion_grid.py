@@ -46,7 +46,7 @@ def test_grid_reproduces_the_motion(grid):
     assert grid.rate == pytest.approx(200.0)
     np.testing.assert_allclose(np.diff(grid.t), 1 / GRID_RATE, atol=1e-9)
     np.testing.assert_allclose(grid.row_times, 5.0 + np.arange(2401) / 200, atol=1e-9)
-    assert grid.inner == slice(200, 2201)  # a second is left out at each end
+    assert grid.inner == slice(200, 2201, 1)  # a second is left out at each end
 
 
 def test_actuator_coordinates_give_the_same_grid(grid):
