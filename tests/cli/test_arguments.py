@@ -54,7 +54,7 @@ def refused(capsys, *arguments):
         (["validate", "a.csv"], "--model is required: the model file that identify wrote (a positional argument"),
         (["model", "--arm", __file__], f"{__file__} is not an arm file: its name does not end in .yaml; known arms"),
         (["identify", "a.csv", "--arm", "psm"], "--output is required; see dvrk-drake identify --help"),
-        (["identify", "a.csv", "b.csv", "--arm", "psm", "--output", "m.yaml"], "Unexpected argument: b.csv; see"),
+        (["validate", "a.csv", "b.csv", "--model", "m.yaml"], "Unexpected argument: b.csv; see"),
         (["tune", "--arm", "psm", "--method", "guess"], 'Invalid value "guess" for --method. Choose from: "paper"'),
         (["demo", "--seed", "-1"], 'Invalid value "-1" for --seed: must be a whole number, 0 or larger; see'),
         (["demo", "--seed", "1.5"], 'Invalid value for --seed: must be a whole number, not "1.5"; see'),

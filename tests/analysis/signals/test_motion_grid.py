@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from motions import friction_everywhere, true_dynamics
 
+import dvrk_drake.analysis.signals.motion_grid as motion_grid_module
 from dvrk_drake.analysis.signals.drive_efforts import drive_efforts
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import FOLDS, GAP, period_of, phase_folds
@@ -47,6 +48,22 @@ def test_grid_reproduces_the_motion(grid):
     np.testing.assert_allclose(np.diff(grid.t), 1 / GRID_RATE, atol=1e-9)
     np.testing.assert_allclose(grid.row_times, 5.0 + np.arange(2401) / 200, atol=1e-9)
     assert grid.inner == slice(200, 2201, 1)  # a second is left out at each end
+
+
+def test_parts_give_the_filtered_values_of_the_whole_motion(grid, monkeypatch):
+    thinned = replace(motion_grid(recorded(40.0), ARM, default_settings(ARM)), step=3)
+    monkeypatch.setattr(motion_grid_module, "PART_ROWS", 1500)
+    parts = list(thinned.parts())
+    assert len(parts) == 5
+    # The square wave has all frequencies, so errors at the ends of the parts would be visible.
+    square = np.sign(np.sin(3 * thinned.t))
+    expected = thinned.filter_efforts(thinned.at_rows(square, 0))
+    found = []
+    for part, rows in parts:
+        of_part = np.sign(np.sin(3 * part.t))
+        found.append(part.filter_rows(part.at_rows(of_part, 0), rows))
+    np.testing.assert_allclose(np.concatenate(found), expected, rtol=0, atol=1e-9)
+    assert len(expected) == len(thinned.inner_rows) and np.all(np.diff(thinned.inner_rows) == 3)
 
 
 def test_actuator_coordinates_give_the_same_grid(grid):

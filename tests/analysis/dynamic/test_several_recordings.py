@@ -1,0 +1,148 @@
+"""Identification of one model from several motions of a simulated arm whose friction and offsets change."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from command_output import refusal
+from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
+
+import dvrk_drake as dvrk
+from dvrk_drake.analysis.dynamic.dynamic_identification import thinned
+from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.recordings.recording import write_recording
+
+ARM = dvrk.load_arm("psm")
+NOISE, RATE = 0.05, 1000.0
+#: Factors of the friction on each day, and offsets as shares of the RMS effort. Their means are 1 and 0.1.
+FACTORS, OFFSETS = (0.7, 1.0, 1.3), (0.25, 0.1, -0.05)
+
+
+def day(truth, effort, factor, offset):
+    """Returns the true model on a day with other friction and offsets."""
+    effects = [dataclasses.replace(e, coefficient=factor * e.coefficient) for e in truth.section.effects]
+    effects += [
+        DriveEffect(f"actuator.{name}", "offset", 0.0, float(offset * size))
+        for name, size in zip(ARM.joint_names, effort, strict=True)
+    ]
+    return DynamicModel(ARM, dataclasses.replace(truth.section, effects=effects))
+
+
+@pytest.fixture(scope="module")
+def days():
+    """Returns the true model, the RMS efforts, and one recording per day."""
+    generator = np.random.default_rng(3)
+    motions = [fourier_motion(ARM, generator, 10.0, 15.0, RATE) for _ in FACTORS]
+    truth = true_dynamics(ARM, generator, friction_everywhere(ARM, motions[0], 0.1))
+    effort = np.sqrt(np.mean(truth.effort(*motions[0][1:]) ** 2, axis=0))
+    recordings = [
+        dataclasses.replace(recorded(day(truth, effort, *values), motion, NOISE, generator), source=f"day{i + 1}.csv")
+        for i, (motion, *values) in enumerate(zip(motions, FACTORS, OFFSETS, strict=True))
+    ]
+    return truth, effort, recordings
+
+
+@pytest.fixture(scope="module")
+def result(days):
+    return dvrk.identify(days[2], ARM)
+
+
+def test_links_are_those_of_all_days(days, result):
+    """95 % intervals of base parameters that the prior alone does not determine cover the true values."""
+    truth, _, _ = days
+    B = derive_base_parameters(truth.regressor, coupled_rotors=False).combination
+    values = B @ truth.parameters[: B.shape[1]]
+    z = [
+        (e.value - value) / e.standard_error
+        for e, value in zip(result.model.dynamics.base_parameters, values, strict=True)
+        if e.identifiability > 0.5
+    ]
+    assert len(z) > 10 and np.mean(np.abs(z) < 1.96) > 0.85
+
+
+def test_model_contains_mean_offsets_and_friction(days, result):
+    truth, effort, _ = days
+    found = {e.coordinate: e.coefficient for e in result.model.dynamics.effects if e.kind == "offset"}
+    for name, size in zip(ARM.joint_names, effort, strict=True):
+        assert found[f"actuator.{name}"] / size == pytest.approx(np.mean(OFFSETS), abs=0.07)
+    assert len(found) == ARM.num_joints  # the offsets of single days are not in the model
+    # A day with the mean friction and offset is predicted better than the others.
+    motion = fourier_motion(ARM, np.random.default_rng(8), 9.0, 15.0, RATE)
+    generator = np.random.default_rng(9)
+    errors = [
+        validate_motion(
+            result.model, recorded(day(truth, effort, factor, offset), motion, 0.0, generator)
+        ).mean_relative_error
+        for factor, offset in zip(FACTORS, OFFSETS, strict=True)
+    ]
+    assert errors[1] < 0.5 * min(errors[0], errors[2]) and errors[1] < NOISE
+
+
+def test_held_out_errors_are_errors_on_another_day(days, result):
+    truth, effort, recordings = days
+    assert [motion.recording.source for motion in result.motions] == ["day1.csv", "day2.csv", "day3.csv"]
+    for left_out, motion in enumerate(result.motions):
+        others = [recording for i, recording in enumerate(recordings) if i != left_out]
+        expected = validate_motion(dvrk.identify(others, ARM).model, recordings[left_out])
+        relative = [a.relative_error for a in expected.actuators]
+        np.testing.assert_allclose(motion.held_out_errors, relative, rtol=0.25, atol=0.01)
+    # The prediction intervals contain the change between days, so they cover the efforts of another such day.
+    measured, held_out = (np.concatenate([getattr(m, w) for m in result.motions]) for w in ("measured", "held_out"))
+    inside = np.abs(measured - held_out) <= result.model.dynamic_model.half_width
+    assert 0.9 < np.mean(inside) < 0.99
+    # The held-out errors of one recording alone do not contain this change.
+    one = dvrk.identify(recordings[0], ARM).model.dynamic_model.half_width
+    assert np.all(result.model.dynamic_model.half_width > 1.5 * one)
+
+
+def test_provenance_names_all_recordings(days, tmp_path):
+    paths = [tmp_path / f"day{i + 1}.csv" for i in range(3)]
+    for path, recording in zip(paths, days[2], strict=True):
+        write_recording(recording, path, ARM)
+    recordings = [dvrk.read_recording(path, ARM) for path in paths]
+    model = dvrk.identify(recordings[:2], ARM).model
+    assert model.provenance.recording == f"{paths[0]}, {paths[1]}"
+    assert dvrk.validate(model, recordings[1]).of_same_recording
+    assert not dvrk.validate(model, recordings[2]).of_same_recording
+
+
+def test_command_prints_the_error_of_each_recording(days, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, recording in zip("abc", days[2], strict=True):
+        write_recording(recording, f"{name}.csv", ARM)
+    arguments = ["--arm", "psm", "--output", "model.yaml", "--report", "report.html", "--plots", "plots"]
+    assert main(["identify", "a.csv", "b.csv", *arguments]) == 0
+    text = capsys.readouterr().out
+    assert "2 recordings, 6000 rows" in text and "predicted by a model of the others" in text
+    assert "a.csv" in text and "b.csv" in text
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("Residuals over position and speed") >= 2 and "held-out efforts: b.csv" in page
+    assert (tmp_path / "plots/efforts.png").exists() and (tmp_path / "plots/2/efforts.png").exists()
+    assert main(["validate", "b.csv", "--model", "model.yaml", "--save"]) == 2
+    assert "identified from this recording" in refusal(capsys.readouterr().err)
+    assert main(["identify", "a.csv", "a.csv", "--arm", "psm", "--output", "twice.yaml"]) == 2
+    assert "given twice" in refusal(capsys.readouterr().err) and not (tmp_path / "twice.yaml").exists()
+
+
+def test_rejected_lists(days):
+    poses = ARM.sample_poses(40, np.random.default_rng(0))
+    still = dvrk.Recording(q=poses, tau=dvrk.IdentifiedModel.from_arm(ARM).holding_torque(poses), source="poses.csv")
+    with pytest.raises(RecordingError, match=r"poses\.csv: contains static poses; several recordings"):
+        dvrk.identify([days[2][0], still], ARM)
+    with pytest.raises(RecordingError, match="no recordings were given"):
+        dvrk.identify([], ARM)
+
+
+def test_recordings_are_thinned_to_similar_rates(days):
+    truth, generator = days[0], np.random.default_rng(0)
+    motion = fourier_motion(ARM, generator, 10.0, 15.0, RATE)
+    slow, fast = (recorded(truth, motion, 0.0, generator, rate) for rate in (100.0, 500.0))
+    grids = thinned([motion_grid(recording, ARM, default_settings(ARM)) for recording in (slow, fast)])
+    assert [grid.step for grid in grids] == [1, 5]
+    assert abs(len(grids[0].inner_rows) - len(grids[1].inner_rows)) < 5
