@@ -87,12 +87,12 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     residual = problem.columns.tau - problem.predict(chosen, fit.x)
     cut_off = grid.settings.effort_cut_off
     series = [ResidualSeries(slice(0, len(residual)), grid.rate, period)]
-    covariance = parameter_covariance(problem, fit, residual, cut_off, series)
+    covariance, prior = parameter_covariance(problem, fit, residual, cut_off, series)
     p = problem.num_rigid
     B = derive_base_parameters(problem.regressor).combination[:, :p]
     B = B[np.any(B, axis=1)]
     standard_error = np.sqrt(np.diag(B @ covariance[:p, :p] @ B.T))
-    prior_error = np.sqrt(np.diag(B @ np.diag(problem.deviation**2) @ B.T))
+    prior_error = np.sqrt(np.diag(B @ prior[:p, :p] @ B.T))
     z = B @ (fit.x[:p] - truth.parameters[:p]) / standard_error
     return z, standard_error / prior_error, (fit.x[p:] - truth.coefficients) / np.sqrt(np.diag(covariance))[p:]
 

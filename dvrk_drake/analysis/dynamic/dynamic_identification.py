@@ -150,10 +150,10 @@ def identify_dynamic(
     covariance = parameter_covariance(problem, fit, measured - predicted, settings.effort_cut_off, series)
     estimates = DynamicEstimates(problem, fit, covariance)
     floors = [_repeatability(own, motion) for own, motion in zip(tau, motions, strict=True)]
-    section = _section(problem, effects, fit, covariance, np.sum((measured - held_out) ** 2, axis=0), floors)
+    section = _section(problem, effects, fit, covariance.estimates, np.sum((measured - held_out) ** 2, axis=0), floors)
     section.links = estimates.links()
     section.base_parameters, section.correlations = estimates.base_parameters()
-    model = _model(recordings, arm, section, covariance)
+    model = _model(recordings, arm, section, covariance.estimates)
     progress(1.0)
     nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
     return DynamicIdentification(

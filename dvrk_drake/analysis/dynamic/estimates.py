@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
-from scipy.linalg import matmul_toeplitz
 
 from dvrk_drake.analysis.dynamic.columns import RecordingEffect
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
@@ -81,6 +81,12 @@ _OVERSAMPLING = 2.0
 #: Smallest overlap of a motion with the same motion shifted by one period, as a share of the duration of the motion.
 #: With a smaller overlap, the errors that repeat are not estimated.
 _MIN_OVERLAP = 0.2
+#: Smallest number of directions from which the size of the deviations from the SDF is estimated, and largest variance
+#: of the noise in such a direction, as a share of the prior variance.
+_MIN_DIRECTIONS, _MAX_NOISE = 5, 0.1
+#: Smallest accepted ratio of the variance of the deviations from the SDF to the prior variance. A smaller estimate may
+#: be due to chance.
+_MIN_SCALE = 0.5
 
 
 class ResidualSeries(NamedTuple):
@@ -97,20 +103,33 @@ class ResidualSeries(NamedTuple):
     period: float | None
 
 
+class ParameterCovariance(NamedTuple):
+    """Covariances (p + e, p + e) of the rigid-body parameters and effect coefficients.
+
+    Attributes:
+        estimates: Covariance of the estimates.
+        prior: Covariance before the recording, for the size of the deviations from the SDF that the recording shows.
+    """
+
+    estimates: NDArray[np.float64]
+    prior: NDArray[np.float64]
+
+
 def parameter_covariance(
     problem: DynamicProblem,
     fit: ConsistentFit,
     residuals: NDArray[np.float64],
     cut_off: float,
     series: Sequence[ResidualSeries],
-) -> NDArray[np.float64]:
-    """Returns the covariance (p + e, p + e) of `fit.x`, for a fixed set of effects and without inequality constraints.
+) -> ParameterCovariance:
+    """Returns the covariance of `fit.x`, for a fixed set of effects and without inequality constraints.
 
     The inverse Hessian of the cost is A = (X'WX + P)^-1. The covariance is
 
         A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
 
-    where P is the Hessian of the priors, and X_i are the columns and w_i the weight of actuator i. Omega_i (r, r) is
+    where P is the Hessian of the priors, and X_i are the columns and w_i the weight of actuator i. The block of P for
+    the rigid-body parameters is multiplied by `_deviation_scale` in the second factor. Omega_i (r, r) is
     the covariance matrix of the errors of actuator i at the rows. It is estimated from the residuals. Therefore, slowly
     varying errors, for example of the friction model, count as few measurements. Errors that repeat in every period
     count once, regardless of the number of periods.
@@ -138,8 +157,42 @@ def parameter_covariance(
         rows = slice(motion.rows.start, motion.rows.stop, step)
         for i, (weight, (own, X)) in enumerate(zip(fit.weights, columns, strict=True)):
             covariance = error_covariance(residuals[rows, i], held_out[rows, i], motion.rate / step, motion.period)
-            middle[own[:, None], own] += (weight * step) ** 2 * (X[rows].T @ matmul_toeplitz(covariance, X[rows]))
-    return np.asarray(A @ (to_base.T @ middle @ to_base + fit.prior_precision) @ A, dtype=np.float64)
+            middle[own[:, None], own] += (weight * step) ** 2 * (
+                X[rows].T @ scipy.linalg.matmul_toeplitz(covariance, X[rows])
+            )
+    noise = to_base.T @ middle @ to_base
+    factor = np.ones(len(A))
+    factor[: problem.num_rigid] = np.sqrt(_deviation_scale(fit, problem.prior, A @ noise @ A))
+    scaled = fit.prior_precision * np.outer(factor, factor)
+    prior = _inverse(fit.prior_precision) * np.outer(factor, factor)
+    return ParameterCovariance(A @ (noise + scaled) @ A, prior)
+
+
+def _deviation_scale(fit: ConsistentFit, mean: NDArray[np.float64], noise: NDArray[np.float64]) -> float:
+    """Returns the variance of the deviations of an arm's links from the SDF, divided by the prior variance.
+
+    The links of an arm can deviate more or less from its SDF than the prior assumes. The ratio is estimated from the
+    directions in parameter space that the recording determines. Without enough such directions, it is 1.
+
+    Args:
+        fit: Solution of the problem.
+        mean: Prior means (p,) of the rigid-body parameters.
+        noise: Covariance of `fit.x` due to the errors of the efforts.
+    """
+    p = len(mean)
+    P, H = fit.prior_precision[:p, :p], fit.information
+    coupling = H[:p, p:] @ _inverse(H[p:, p:] + fit.prior_precision[p:, p:]) @ H[p:, :p] if len(H) > p else 0.0
+    unit = 1 / np.sqrt(np.diag(P))
+    information, V = scipy.linalg.eigh((H[:p, :p] - coupling) * np.outer(unit, unit), P * np.outer(unit, unit))
+    to_units = (V * unit[:, None]).T @ P
+    variance = np.einsum("ij,jk,ik->i", to_units, noise[:p, :p], to_units)
+    shrinkage = (information / (1 + information)) ** 2
+    determined = (variance < _MAX_NOISE) & (shrinkage > 1 - _MAX_NOISE)
+    if np.sum(determined) < _MIN_DIRECTIONS:
+        return 1.0
+    squares = (to_units @ (fit.x[:p] - mean)) ** 2
+    scale = np.mean(squares[determined]) / np.mean(shrinkage[determined] + variance[determined])
+    return max(float(scale), _MIN_SCALE)
 
 
 def _held_out_residuals(
@@ -225,10 +278,10 @@ DRY_KINDS = ("coulomb", "presliding")
 class DynamicEstimates:
     """Parameter estimates of one fit."""
 
-    def __init__(self, problem: DynamicProblem, fit: ConsistentFit, covariance: NDArray[np.float64]) -> None:
-        """Constructs the estimates from a fit and the covariance (p + e, p + e) of `fit.x`."""
-        self._problem, self._fit, self._covariance = problem, fit, covariance
-        self._prior = np.linalg.inv(fit.prior_precision)
+    def __init__(self, problem: DynamicProblem, fit: ConsistentFit, covariance: ParameterCovariance) -> None:
+        """Constructs the estimates from a fit and the covariance of `fit.x`."""
+        self._problem, self._fit = problem, fit
+        self._covariance, self._prior = covariance
         self._effects = [problem.columns.effects[k] for k in fit.effects]
 
     def links(self) -> list[LinkEstimate]:

@@ -62,7 +62,11 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
     X, weights, prior = [slow, 0.3 * fast + 0.1 * slow], np.array([1.0, 0.3]), 1e-6 * np.eye(6)
     fold = (T % PERIOD / PERIOD * 12).astype(int)
     problem = SimpleNamespace(
-        actuator_columns=lambda i, _: (np.arange(6), X[i]), to_base=lambda _: np.eye(6), fold=fold
+        actuator_columns=lambda i, _: (np.arange(6), X[i]),
+        to_base=lambda _: np.eye(6),
+        fold=fold,
+        num_rigid=0,
+        prior=np.zeros(0),
     )
     information = sum(weight * x.T @ x for weight, x in zip(weights, X, strict=True))
     fit = SimpleNamespace(
@@ -76,7 +80,7 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
         fit.x = np.linalg.solve(information + prior, sums)
         left = error - np.column_stack([x @ fit.x for x in X])
         estimates.append(fit.x)
-        predicted.append(np.diag(parameter_covariance(problem, fit, left, CUT_OFF, [series(PERIOD)])))
+        predicted.append(np.diag(parameter_covariance(problem, fit, left, CUT_OFF, [series(PERIOD)]).estimates))
     spread, mean = np.std(estimates, axis=0), np.sqrt(np.mean(predicted, axis=0))
     # The standard error of the spread of 100 fits is 7 %.
     np.testing.assert_allclose(mean, spread, rtol=0.2, atol=0)
@@ -97,8 +101,12 @@ def test_uninformed_parameters_keep_the_prior_variance():
         lower=np.full(2, -np.inf),
     )
     problem = SimpleNamespace(
-        actuator_columns=lambda i, _: (np.arange(2), X), to_base=lambda _: np.eye(2), fold=(T // 4).astype(int)
+        actuator_columns=lambda i, _: (np.arange(2), X),
+        to_base=lambda _: np.eye(2),
+        fold=(T // 4).astype(int),
+        num_rigid=0,
+        prior=np.zeros(0),
     )
-    covariance = parameter_covariance(problem, fit, tau, CUT_OFF, [series(None)])
+    covariance = parameter_covariance(problem, fit, tau, CUT_OFF, [series(None)]).estimates
     assert covariance[1, 1] == pytest.approx(1 / 4.0)
     assert covariance[0, 0] < 0.01

@@ -85,7 +85,7 @@ def test_model_contains_mean_offsets_and_friction(days, result):
 
 
 def test_held_out_errors_are_errors_on_another_day(days, result):
-    truth, effort, recordings = days
+    _, _, recordings = days
     assert [motion.recording.source for motion in result.motions] == ["day1.csv", "day2.csv", "day3.csv"]
     for left_out, motion in enumerate(result.motions):
         others = [recording for i, recording in enumerate(recordings) if i != left_out]
