@@ -51,13 +51,13 @@ if __name__ == "__main__":
     arm = dvrk.load_arm("psm")
     short = dvrk.identify(dvrk.read_recording(SAMPLES_FOLDER / "psm_motion.csv", arm), arm).model
     recording = long_motion(short, minutes)
-    print(f"{len(recording)} rows", flush=True)
+    print(f"motion of {minutes:g} min: {len(recording)} rows, {memory():.0f} MB before the identification")
     start = time.perf_counter()
 
     def progress(step: str, share: float) -> None:
-        print(f"{time.perf_counter() - start:7.1f} s  {memory():5.0f} MB  {step} {share:.2f}", flush=True)
+        if share == 1.0:
+            print(f"{step}: finished after {time.perf_counter() - start:.0f} s, largest memory {memory():.0f} MB")
 
     result = dvrk.identify(recording, arm, progress=progress)
-    print(f"time {time.perf_counter() - start:.1f} s, largest memory of the process {memory():.0f} MB")
-    actuators = result.model.dynamic_model.section.actuators
-    print("cross-validated error [%]", [round(100 * a.rms_cross_validation / a.rms_effort, 2) for a in actuators])
+    errors = [a.rms_cross_validation / a.rms_effort for a in result.model.dynamic_model.section.actuators]
+    print("cross-validated errors [%]:", *(f"{100 * error:.1f}" for error in errors))

@@ -186,6 +186,7 @@ def _print_motion_errors(console: Console, result: DynamicIdentification, verdic
     table.add_row("mean", "", *(percent(mean) if mean > 0 else "" for mean in means), "")
     console.print(table)
     if several:
+        console.print()
         _print_error_of_each_recording(console, result)
     tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:

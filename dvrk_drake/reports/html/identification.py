@@ -90,10 +90,8 @@ def identification_page(
             Section("Verdict per joint", [verdict_table(result), *_locked(result)]),
             _data_quality(result, efforts),
             Section("Parameters", parameter_tables(result.model), note=_parameter_note(result)),
-            _efforts(efforts),
-            _residuals(efforts),
-            _error_budget(efforts),
-            *(section for other in others for section in _other_motion(other)),
+            *_error_sections(efforts, _name(recording) if others else ""),
+            *(section for other in others for section in _error_sections(other, _name(other.recording), first=False)),
             _cross_validation(result, efforts),
             Section("Physical consistency", consistency_blocks(result.model)),
             _drives(result, efforts),
@@ -107,10 +105,10 @@ def _name(recording: Recording) -> str:
     return Path(recording.source).name or "recording"
 
 
-def _other_motion(efforts: MotionEfforts) -> list[Section]:
-    """Returns the sections of a recording after the first one."""
-    sections = _efforts(efforts, with_view=False), _residuals(efforts), _error_budget(efforts)
-    return [replace(section, title=f"{section.title}: {_name(efforts.recording)}") for section in sections]
+def _error_sections(efforts: Efforts, name: str, *, first: bool = True) -> list[Section]:
+    """Returns the sections on the efforts and errors of one recording, with its name unless it is the only one."""
+    sections = [_efforts(efforts, with_view=first), _residuals(efforts), _error_budget(efforts)]
+    return [replace(section, title=f"{section.title}: {name}") for section in sections] if name else sections
 
 
 def _locked(result: Identification | Validation) -> list[Block]:
