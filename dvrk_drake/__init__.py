@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dvrk_drake.analysis.check.recording_check import check
+    from dvrk_drake.analysis.excitation.design import design_excitation
+    from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+    from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
     from dvrk_drake.analysis.identification import identify
     from dvrk_drake.analysis.payload.payload import payload
     from dvrk_drake.analysis.recalibration import recalibrate
@@ -39,11 +42,14 @@ _MODULES = {
     "DvrkDrakeError": "errors",
     "GravityPidController": "systems.gravity_pid_controller",
     "IdentifiedModel": "dynamics.identified_model",
+    "MotionLimits": "analysis.excitation.motion_limits",
+    "PeriodicMotion": "analysis.excitation.periodic_motion",
     "Recording": "recordings.recording",
     "Scenario": "experiments.scenario",
     "TeleoperatedArms": "systems.teleoperated_arms",
     "add_closed_loop": "systems.closed_loop",
     "check": "analysis.check.recording_check",
+    "design_excitation": "analysis.excitation.design",
     "export_model": "export.model_export",
     "identify": "analysis.identification",
     "load_arm": "models.arm_files",
@@ -66,11 +72,14 @@ __all__ = [
     "DvrkDrakeError",
     "GravityPidController",
     "IdentifiedModel",
+    "MotionLimits",
+    "PeriodicMotion",
     "Recording",
     "Scenario",
     "TeleoperatedArms",
     "add_closed_loop",
     "check",
+    "design_excitation",
     "export_model",
     "identify",
     "load_arm",

@@ -60,5 +60,9 @@ class CollectionError(DvrkDrakeError):
     """Error for poses that the arm cannot reach, or for a run of `collect` that cannot be started or continued."""
 
 
+class ExcitationError(DvrkDrakeError):
+    """Error for a motion file, or for limits that no motion of the arm can meet."""
+
+
 class StudyError(DvrkDrakeError):
     """Error for a study that cannot be read, run or resumed."""

@@ -1,0 +1,117 @@
+"""Compares identification from designed, published and random motions, on simulated arms with known dynamics.
+
+    python benchmarks/excitation.py FOLDER [--arms 20] [--tests 20]
+
+FOLDER contains mtm_one.csv and psm_one.csv (docs/public_recordings.md), of which only the positions are used. Each
+motion lasts 30 s. The random motion is a Fourier series that reaches the same limits as the designed motion. The links
+of each simulated arm differ from those of the SDF, with a standard deviation of 20 % of their mass. Its drives have
+viscous, Coulomb and presliding friction of random size. The efforts have noise of 5 % of the RMS effort. The models are
+tested on random motions that were not used for identification.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from timing import print_table
+
+import dvrk_drake as dvrk
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.excitation.design import design_excitation, random_motion, state_of
+from dvrk_drake.analysis.excitation.information import MotionInformation
+from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.models.arm import Arm
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
+from motions import friction_everywhere, recorded, true_dynamics
+
+RATE, SECONDS, NOISE, SPREAD = 1000.0, 30.0, 0.05, 0.1
+LIMITS = MotionLimits()
+
+
+def published(folder: Path, arm: Arm) -> tuple[np.ndarray, ...]:
+    """Returns t, q, v and vd of the positions of the public motion, for `SECONDS` at 1 kHz."""
+    recording = dvrk.read_recording(folder / f"{arm.name[:3].lower()}_one.csv", arm, coordinates="wpi")
+    grid = motion_grid(recording, arm, default_settings(arm))
+    t = np.arange(round(SECONDS * RATE)) / RATE
+    at = np.minimum(t, grid.t[-1] - grid.t[0])
+    signals = (np.column_stack([np.interp(at, grid.t - grid.t[0], x) for x in s.T]) for s in (grid.q, grid.v, grid.vd))
+    return (t, *signals)
+
+
+def sampled(motion: dvrk.PeriodicMotion, seconds: float = SECONDS) -> tuple[np.ndarray, ...]:
+    """Returns t, q, v and vd of a periodic motion at 1 kHz."""
+    motion = dataclasses.replace(motion, repetitions=int(np.ceil(seconds / motion.period)))
+    t = np.arange(round(seconds * RATE)) / RATE
+    return (t, *motion.evaluate(t)[:3])
+
+
+def main() -> None:
+    """Prints two tables per arm: expected errors, and errors of identified models."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder of the public motions")
+    parser.add_argument("--arms", type=int, default=20, help="number of simulated arms; default: %(default)s")
+    parser.add_argument("--tests", type=int, default=20, help="number of test motions per arm; default: %(default)s")
+    parser.add_argument("--arm", choices=("mtmr", "psm"), help="only this arm")
+    options = parser.parse_args()
+    for name in (options.arm,) if options.arm else ("mtmr", "psm"):
+        compare(dvrk.load_arm(name), options.folder, options.arms, options.tests)
+
+
+def compare(arm: Arm, folder: Path, arms: int, tests: int) -> None:
+    """Prints the tables of one arm."""
+    start = time.perf_counter()
+    design = design_excitation(arm, duration=SECONDS, limits=LIMITS)
+    print(f"{arm.name}: design of {SECONDS:g} s in {time.perf_counter() - start:.0f} s", flush=True)
+    generator = np.random.default_rng(100)
+    randoms = [random_motion(arm, LIMITS, design.motion.period, 8, generator) for _ in range(arms)]
+    public = published(folder, arm)
+    information = MotionInformation(arm, LIMITS)
+
+    def expected(state: np.ndarray, period: float) -> list[str]:
+        error = 100 * information.expected_error(state, period)
+        return [f"{error:.1f}", f"{information.known_parameters(state, period)} of {information.num_base}"]
+
+    one_period = slice(0, round(11.7 * RATE if arm.name != "PSM" else 6.5 * RATE), 100)
+    rows = {
+        "designed": expected(state_of(design.motion, 200), design.motion.period),
+        "published": expected(np.array([x[one_period] for x in public[1:]]), len(public[0][one_period]) * 0.1),
+        "random, median": [
+            f"{np.median([100 * information.expected_error(state_of(m, 200), m.period) for m in randoms]):.1f}",
+            f"{np.median([information.known_parameters(state_of(m, 200), m.period) for m in randoms]):.0f} of "
+            f"{information.num_base}",
+        ],
+    }
+    headings = ["expected error of efforts [%]", "base parameters known to 10 %"]
+    print_table(f"{arm.name}: expected results of {SECONDS:g} s", headings, rows)
+    errors: dict[str, list[np.ndarray]] = {"designed": [], "published": [], "random": []}
+    for seed in range(arms):
+        rng = np.random.default_rng(seed)
+        motions = {"designed": sampled(design.motion), "published": public, "random": sampled(randoms[seed])}
+        friction = friction_everywhere(arm, motions["designed"], 0.15)
+        effects = [dataclasses.replace(e, coefficient=e.coefficient * rng.uniform(0.5, 1.5)) for e in friction]
+        truth = true_dynamics(arm, rng, effects, SPREAD)
+        others = [sampled(random_motion(arm, LIMITS, 10.0, 6, rng), 12.0) for _ in range(tests)]
+        unseen = [recorded(truth, other, 0.0, rng) for other in others]
+        for which, motion in motions.items():
+            model = identify_dynamic([recorded(truth, motion, NOISE, rng)], arm).model
+            found = [[a.relative_error for a in validate_motion(model, test).actuators] for test in unseen]
+            errors[which].append(np.mean(found, axis=0))
+        print(f"arm {seed + 1} of {arms}", file=sys.stderr, flush=True)
+    rows = {
+        which: [f"{100 * x:.1f}" for x in (*np.mean(of, axis=0), np.mean(of), np.max(np.mean(of, axis=0)))]
+        for which, of in errors.items()
+    }
+    headings = [*arm.joint_names, "mean", "worst joint"]
+    print_table(f"{arm.name}: relative effort error on {tests} unseen motions of {arms} arms [%]", headings, rows)
+
+
+if __name__ == "__main__":
+    main()

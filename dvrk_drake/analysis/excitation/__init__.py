@@ -1,0 +1,1 @@
+"""Designs motions that excite the dynamics of an arm."""

@@ -1,0 +1,351 @@
+"""Designs a motion that gives the most information about the dynamics of an arm, within all limits."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
+
+from dvrk_drake.analysis.excitation.information import MotionInformation
+from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.errors import ExcitationError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.progress import Progress, step_progress
+
+#: Number of times per harmonic at which the limits are imposed and the information is computed.
+LIMIT_TIMES, INFORMATION_TIMES = 20, 10
+#: Share of the limits that the optimisation uses. Between the times, a motion may exceed the limits slightly.
+_USED = 0.99
+#: Largest number of major iterations of the solver.
+MAX_ITERATIONS = 150
+#: Factor by which a motion is contracted towards its centre until it has no collision and meets all limits, and largest
+#: number of contractions.
+_CONTRACTION, _MAX_CONTRACTIONS = 0.99, 150
+#: Step of the numerical derivatives of the efforts, relative to the limits of positions, velocities and accelerations.
+_STEP = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationDesign:
+    """Designed motion and the information that it gives.
+
+    Attributes:
+        motion: Motion within all limits.
+        expected_error: Expected RMS error of efforts that a model predicts after this motion, relative to the RMS
+            efforts, see `MotionInformation.expected_error`.
+        known_parameters: Number of base parameters with a standard error of at most 10 %.
+        num_parameters: Number of base parameters.
+        log_determinant: See `MotionInformation.log_determinant` (D-optimality).
+        condition_number: See `MotionInformation.condition_number`.
+        random_error: Smallest expected error of the random motions from which the optimisation started.
+    """
+
+    motion: PeriodicMotion
+    expected_error: float
+    known_parameters: int
+    num_parameters: int
+    log_determinant: float
+    condition_number: float
+    random_error: float
+
+    def __repr__(self) -> str:
+        return (
+            f"<ExcitationDesign of {self.motion.arm}: {self.motion.duration:g} s, expected error "
+            f"{100 * self.expected_error:.1f} %>"
+        )
+
+
+def design_excitation(
+    arm: Arm,
+    *,
+    duration: float = 30.0,
+    period: float = 10.0,
+    harmonics: int = 8,
+    limits: MotionLimits | None = None,
+    starts: int = 4,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> ExcitationDesign:
+    """Designs a motion for `identify`: periodic, at rest at both ends, and within all limits.
+
+    The motion of each joint is a Fourier series. The coefficients minimise the expected error of efforts that the
+    identified model predicts in random states of the arm (V-optimality), see `MotionInformation`. The solver is SNOPT,
+    started from several random motions. The best motion is contracted towards its centre until `motion_violations`
+    finds nothing.
+
+    Args:
+        arm: Arm to move.
+        duration: Duration of the motion [s]. It is rounded up to whole periods.
+        period: Period [s].
+        harmonics: Number of harmonics, 2 to 20.
+        limits: Limits of the motion. None: the defaults of `MotionLimits`.
+        starts: Number of random motions from which the optimisation starts.
+        seed: Seed of the random motions.
+        progress: Callback that receives the name of the step ("optimising") and the finished share (0 to 1).
+
+    Raises:
+        ExcitationError: An argument is out of range, or no motion meets the limits.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("mtml")
+        >>> design = dvrk.design_excitation(arm, duration=5.0, period=5.0, harmonics=3, starts=1)
+        >>> design.motion.duration
+        5.0
+        >>> design.expected_error < design.random_error
+        True
+    """
+    for name, value, lowest, highest in (
+        ("period", period, 1.0, 600.0),
+        ("duration", duration, period, 36_000.0),
+        ("harmonics", harmonics, 2, 20),
+        ("starts", starts, 1, 100),
+    ):
+        if not lowest <= value <= highest:
+            raise ExcitationError(f"{name} is {value:g}; allowed: {lowest:g} to {highest:g}")
+    limits = limits or MotionLimits()
+    limits.of_arm(arm)
+    share = step_progress(progress, "optimising")
+    share(0.0)
+    problems = [_Problem(arm, limits, period, harmonics, seed + k) for k in range(starts)]
+    results = []
+    for result in _in_parallel(problems, share):
+        results.append(result)
+        share(0.9 * len(results) / starts)
+    best = min(results, key=lambda result: result[1])
+    motion = contracted(best[0], arm, limits)
+    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)))
+    share(1.0)
+    information = MotionInformation(arm, limits)
+    state = state_of(motion, INFORMATION_TIMES * harmonics)
+    return ExcitationDesign(
+        motion=motion,
+        expected_error=information.expected_error(state, period),
+        known_parameters=information.known_parameters(state, period),
+        num_parameters=information.num_base,
+        log_determinant=information.log_determinant(state, period),
+        condition_number=information.condition_number(state),
+        random_error=min(result[2] for result in results),
+    )
+
+
+def state_of(motion: PeriodicMotion, count: int) -> NDArray[np.float64]:
+    """Returns the states (3, count, n) of one period of a motion: q, v and vd."""
+    return np.array(motion.evaluate(np.arange(count) * motion.period / count)[:3])
+
+
+def random_motion(
+    arm: Arm, limits: MotionLimits, period: float, harmonics: int, generator: np.random.Generator
+) -> PeriodicMotion:
+    """Returns a random Fourier motion that reaches at least one of the limits of `MotionLimits.of_arm` for each joint.
+
+    The amplitudes of the harmonics are random with equal distributions of the velocities.
+    """
+    basis = FourierBasis.of(period, harmonics)
+    center = arm.sample_poses(200, generator, max(limits.margin, 0.2)).mean(axis=0)
+    k = np.arange(1, harmonics + 1)
+    sine, cosine = generator.normal(size=(2, arm.num_joints, harmonics)) / k
+    weights = np.hstack([sine @ basis.sines[:, : harmonics - 1], cosine @ basis.cosines[:, harmonics - 1 :]])
+    coefficients = np.column_stack([center, weights])
+    # All joints together meet the coupled limits. Each joint is scaled alone otherwise.
+    coefficients[:, 1:] *= _joint_scales(coefficients, basis, arm, limits)[:, None]
+    coefficients[:, 1:] *= _largest_scale(coefficients, basis, arm, limits)
+    return PeriodicMotion.of_coefficients(arm, basis, coefficients, 1)
+
+
+def contracted(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> PeriodicMotion:
+    """Returns the motion after the smallest contraction towards its centre with which it meets all limits.
+
+    Raises:
+        ExcitationError: The motion does not meet the limits after `_MAX_CONTRACTIONS` contractions.
+    """
+    for _ in range(_MAX_CONTRACTIONS):
+        violations = motion_violations(motion, arm, limits)
+        if not violations:
+            return motion
+        sine, cosine = ((_CONTRACTION * np.array(x)).tolist() for x in (motion.sine, motion.cosine))
+        motion = replace(motion, sine=sine, cosine=cosine)
+    raise ExcitationError(f"{arm.name}: no motion meets all limits: {violations[0]}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Optimisation from one random motion."""
+
+    arm: Arm
+    limits: MotionLimits
+    period: float
+    harmonics: int
+    seed: int
+
+    def solve(self) -> tuple[PeriodicMotion, float, float]:
+        """Returns the motion, its expected error, and the expected error of the random motion."""
+        arm, basis = self.arm, FourierBasis.of(self.period, self.harmonics)
+        information = MotionInformation(arm, self.limits)
+        start = random_motion(arm, self.limits, self.period, self.harmonics, np.random.default_rng(self.seed))
+        n, size, unit = arm.num_joints, 2 * self.harmonics - 1, information.scales[0]
+        program = MathematicalProgram()
+        x = program.NewContinuousVariables(n, size, "x")
+        _add_joint_limits(program, x, unit, basis, arm, self.limits)
+        _add_effort_limits(program, x, unit, basis, arm, self.limits)
+        values = basis.values(_times(basis, INFORMATION_TIMES))[:3]
+
+        def cost(variables: NDArray) -> object:
+            is_gradient = variables.dtype == object
+            number = ExtractValue(variables).ravel() if is_gradient else variables
+            state = _state(values, unit[:, None] * number.reshape(n, size))
+            if not is_gradient:
+                return float(np.log(information.expected_error(state, self.period)))
+            value, by_state = information.expected_error_gradient(state, self.period)
+            gradient = np.einsum("kmj,kmb->jb", by_state, values) * unit[:, None]
+            return InitializeAutoDiff([value], gradient.reshape(1, -1) @ ExtractGradient(variables))[0, 0]
+
+        program.AddCost(cost, vars=x.ravel())
+        guess = _coefficients(start, basis) / unit[:, None]
+        program.SetInitialGuess(x, guess)
+        options = SolverOptions()
+        options.SetOption(SnoptSolver.id(), "Major iterations limit", MAX_ITERATIONS)
+        options.SetOption(SnoptSolver.id(), "Major optimality tolerance", 1e-3)
+        result = SnoptSolver().Solve(program, None, options)
+        found = unit[:, None] * result.GetSolution(x)
+        random_error = information.expected_error(_state(values, unit[:, None] * guess), self.period)
+        motion = PeriodicMotion.of_coefficients(arm, basis, found, 1)
+        return motion, information.expected_error(_state(values, found), self.period), random_error
+
+
+def _solve(problem: _Problem) -> tuple[PeriodicMotion, float, float]:
+    return problem.solve()
+
+
+def _in_parallel(
+    problems: list[_Problem], share: Callable[[float], object]
+) -> Iterable[tuple[PeriodicMotion, float, float]]:
+    if len(problems) == 1:
+        yield problems[0].solve()
+        return
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as executor:
+        yield from executor.map(_solve, problems)
+
+
+def _times(basis: FourierBasis, per_harmonic: int) -> NDArray[np.float64]:
+    count = per_harmonic * len(basis.rates)
+    return np.arange(count) * 2 * np.pi / basis.rates[0] / count
+
+
+def _state(values: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(values @ coefficients.T)
+
+
+def _coefficients(motion: PeriodicMotion, basis: FourierBasis) -> NDArray[np.float64]:
+    weights = np.array(motion.sine) @ basis.sines + np.array(motion.cosine) @ basis.cosines
+    return np.column_stack([motion.center, weights])
+
+
+def _add_joint_limits(
+    program: MathematicalProgram,
+    x: NDArray,
+    unit: NDArray[np.float64],
+    basis: FourierBasis,
+    arm: Arm,
+    limits: MotionLimits,
+) -> None:
+    """Adds the linear constraints on positions, velocities, accelerations and jerks."""
+    joints, values = limits.of_arm(arm), basis.values(_times(basis, LIMIT_TIMES))
+    middle, half = (joints.lower + joints.upper) / 2, _USED * (joints.upper - joints.lower) / 2
+    for row, center, allowed in zip(joints.A, middle, half, strict=True):
+        used = np.flatnonzero(row)
+        rows = np.hstack([row[j] * unit[j] * values[0] for j in used])
+        one = np.ones(len(rows))
+        program.AddLinearConstraint(rows, (center - allowed) * one, (center + allowed) * one, x[used].ravel())
+    for k, limit in ((1, joints.speed), (2, joints.acceleration), (3, joints.jerk)):
+        for j in range(arm.num_joints):
+            scaled = values[k] * unit[j] / limit[j]
+            bound = np.full(len(scaled), _USED)
+            program.AddLinearConstraint(scaled[:, 1:], -bound, bound, x[j, 1:])
+
+
+def _add_effort_limits(
+    program: MathematicalProgram,
+    x: NDArray,
+    unit: NDArray[np.float64],
+    basis: FourierBasis,
+    arm: Arm,
+    limits: MotionLimits,
+) -> None:
+    """Adds the constraints on the efforts of the SDF, relative to their limits."""
+    regressor, allowed = DynamicRegressor(arm), _USED * _effort_without_friction(arm, limits)
+    values, n = basis.values(_times(basis, INFORMATION_TIMES))[:3], arm.num_joints
+    scales = MotionInformation(arm, limits).scales
+
+    def effort(state: NDArray[np.float64]) -> NDArray[np.float64]:
+        q, v, vd = state
+        return regressor.torque(q, v, vd, regressor.values) / allowed
+
+    def constraint(variables: NDArray) -> object:
+        is_gradient = variables.dtype == object
+        number = ExtractValue(variables).ravel() if is_gradient else variables
+        state = _state(values, unit[:, None] * number.reshape(n, -1))
+        tau = effort(state)
+        if not is_gradient:
+            return tau.ravel()
+        # (m, i, j, b): derivative of the effort of joint i with respect to coefficient b of joint j.
+        gradient = np.zeros((*tau.shape, n, values.shape[2]))
+        for k in range(3):
+            for j in range(n):
+                step = _STEP * scales[k, j]
+                ahead, back = state.copy(), state.copy()
+                ahead[k, :, j] += step
+                back[k, :, j] -= step
+                slope = (effort(ahead) - effort(back)) / (2 * step)
+                gradient[:, :, j] += slope[:, :, None] * values[k][:, None] * unit[j]
+        return InitializeAutoDiff(tau.ravel(), gradient.reshape(tau.size, -1) @ ExtractGradient(variables)).ravel()
+
+    bound = np.ones(values.shape[1] * n)
+    program.AddConstraint(constraint, lb=-bound, ub=bound, vars=x.ravel())
+
+
+def _effort_without_friction(arm: Arm, limits: MotionLimits) -> NDArray[np.float64]:
+    """Returns the largest joint efforts (n,) without dry friction [N m, N].
+
+    Raises:
+        ExcitationError: The dry friction of a joint exceeds the limit.
+    """
+    allowed = limits.of_arm(arm).effort - arm.dry_friction()
+    if np.any(allowed <= 0):
+        name = arm.joint_names[int(np.argmin(allowed))]
+        raise ExcitationError(f"{name}: the dry friction exceeds {100 * limits.effort:g} % of the effort limit")
+    return np.asarray(allowed)
+
+
+def _joint_scales(
+    coefficients: NDArray[np.float64], basis: FourierBasis, arm: Arm, limits: MotionLimits
+) -> NDArray[np.float64]:
+    """Returns the largest factors (n,) with which the amplitude of each joint meets its own limits."""
+    joints, n = limits.of_arm(arm), arm.num_joints
+    values = basis.values(_times(basis, LIMIT_TIMES))
+    x = np.array([np.abs(v[:, 1:] @ coefficients[:, 1:].T).max(axis=0) for v in values])
+    room = np.minimum(joints.upper[:n] - coefficients[:, 0], coefficients[:, 0] - joints.lower[:n])
+    allowed = np.array([room, joints.speed, joints.acceleration, joints.jerk])
+    return np.asarray(_USED * np.min(allowed / x, axis=0))
+
+
+def _largest_scale(coefficients: NDArray[np.float64], basis: FourierBasis, arm: Arm, limits: MotionLimits) -> float:
+    """Returns the largest factor up to 1 with which the motion meets the coupled limits and the effort limits."""
+    joints, values = limits.of_arm(arm), basis.values(_times(basis, LIMIT_TIMES))
+    regressor, allowed = DynamicRegressor(arm), _effort_without_friction(arm, limits)
+    for scale in 0.95 ** np.arange(100):
+        scaled = np.column_stack([coefficients[:, 0], scale * coefficients[:, 1:]])
+        q, v, vd = _state(values[:3], scaled)
+        positions = q @ joints.A.T
+        tau = regressor.torque(q, v, vd, regressor.values)
+        if np.all((positions >= joints.lower) & (positions <= joints.upper)) and np.all(np.abs(tau) <= allowed):
+            return float(scale)
+    raise ExcitationError(f"{arm.name}: no random motion meets the limits")

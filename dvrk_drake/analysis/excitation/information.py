@@ -1,0 +1,190 @@
+"""Information that a motion gives about the parameters of an arm, and the expected error of predicted efforts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.dynamic.columns import BaseColumns, base_columns
+from dvrk_drake.analysis.dynamic.problem import FRICTION_DEVIATION, LINK_DEVIATION, MIN_ROTOR_DEVIATION
+from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.physical_consistency import LinkScale
+from dvrk_drake.models.arm import Arm
+
+#: Relative error of a measured effort, and time over which errors are correlated [s]. The errors are those of the
+#: model, not of the sensor. The values are those of the public motions of a real MTM and PSM.
+EFFORT_ERROR, CORRELATION_TIME = 0.1, 0.1
+#: Number of random states for which the expected error is computed.
+NUM_STATES = 1000
+#: Width of the smoothed sign function of Coulomb friction, divided by the speed limit.
+COULOMB_WIDTH = 0.05
+#: Prior standard deviation of an offset, as a share of the RMS effort.
+OFFSET_DEVIATION = 1.0
+#: Step of the central differences with respect to positions, velocities and accelerations, relative to their limits.
+_STEP = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class MotionInformation:
+    """Linear model of the efforts of an arm, with the priors of `identify`.
+
+    The unknowns are the base parameters, and the viscous friction, the Coulomb friction and the offset of each
+    actuator. Cables, springs and presliding are not included.
+
+    Attributes:
+        arm: Arm to identify.
+        limits: Limits of the motion. The states for which efforts are predicted are uniformly distributed over the
+            allowed positions, and have normally distributed velocities and accelerations with a third of the limits as
+            standard deviation.
+    """
+
+    arm: Arm
+    limits: MotionLimits
+
+    @cached_property
+    def _regressor(self) -> DynamicRegressor:
+        return DynamicRegressor(self.arm)
+
+    @cached_property
+    def _base(self) -> BaseColumns:
+        return base_columns([self._regressor])
+
+    @cached_property
+    def num_base(self) -> int:
+        """Number of base parameters."""
+        return len(self._base.independent)
+
+    @cached_property
+    def scales(self) -> NDArray[np.float64]:
+        """Typical sizes (3, n) of positions, velocities and accelerations: half the range, and the limits."""
+        joints = self.limits.of_arm(self.arm)
+        return np.array([0.5 * (self.arm.position_upper - self.arm.position_lower), joints.speed, joints.acceleration])
+
+    @cached_property
+    def states(self) -> NDArray[np.float64]:
+        """States (3, `NUM_STATES`, n) for which efforts are predicted: q, v and vd."""
+        generator, shape = np.random.default_rng(1), (2, NUM_STATES, self.arm.num_joints)
+        q = self.arm.sample_poses(NUM_STATES, generator, self.limits.margin)
+        return np.concatenate([q[None], self.scales[1:, None] / 3 * generator.normal(size=shape)])
+
+    @cached_property
+    def effort(self) -> NDArray[np.float64]:
+        """RMS efforts (n,) of the actuators in `states`, according to the SDF and the friction in the arm file."""
+        regressor = self._regressor
+        q, v, vd = self.states
+        tau = self.arm.transmission.inverse.pull_back_effort(regressor.torque(q, v, vd, regressor.values))
+        friction = self.arm.transmission.inverse.pull_back_effort(self.arm.dry_friction()[None])[0]
+        return np.sqrt(np.mean(tau**2, axis=0) + friction**2)
+
+    def columns(self, state: NDArray[np.float64]) -> list[tuple[NDArray[np.int_], NDArray[np.float64]]]:
+        """Returns indices (c,) and values (m, c) of the nonzero regressor columns of each actuator for (3, m, n)."""
+        arm, count = self.arm, state.shape[1]
+        q, v, vd = state
+        Y = self._regressor.regressor(q, v, vd)
+        a_dot = arm.transmission.velocity(v)
+        speed = np.abs(arm.transmission.matrix) @ self.scales[1]
+        columns = []
+        for i in range(arm.num_joints):
+            own, of_base = self._base.of_actuator(Y, arm.transmission.inverse.matrix[:, i])
+            u = a_dot[:, i] / speed[i]
+            effects = np.column_stack([u, np.tanh(u / COULOMB_WIDTH), np.ones(count)]) * self.effort[i]
+            columns.append((np.append(own, self.num_base + 3 * i + np.arange(3)), np.hstack([of_base, effects])))
+        return columns
+
+    @cached_property
+    def prior(self) -> NDArray[np.float64]:
+        """Prior precision (k, k) of the unknowns, see `identify`."""
+        regressor = self._regressor
+        p = self._base.base.shape[1]
+        links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
+        rotors = np.maximum(LINK_DEVIATION * regressor.values[10 * len(links) : p], MIN_ROTOR_DEVIATION)
+        scaled = self._base.base * np.concatenate([*links, rotors])
+        of_actuator = [FRICTION_DEVIATION, FRICTION_DEVIATION, OFFSET_DEVIATION]
+        effects = np.diag(np.tile(of_actuator, self.arm.num_joints) ** -2.0)
+        return np.asarray(scipy.linalg.block_diag(_inverse(scaled @ scaled.T), effects))
+
+    @cached_property
+    def _target(self) -> NDArray[np.float64]:
+        """Mean (k, k) of x x' / (n s^2) over the states and the actuators, for columns x and RMS efforts s."""
+        total = np.zeros_like(self.prior)
+        for (own, X), size in zip(self.columns(self.states), self.effort, strict=True):
+            total[own[:, None], own] += X.T @ X / (len(X) * size**2 * len(self.effort))
+        return total
+
+    def weight(self, period: float, rows: int) -> float:
+        """Returns the number of independent measurements per row, for rows that are evenly spread over a period [s]."""
+        return period / (CORRELATION_TIME * rows * EFFORT_ERROR**2)
+
+    def precision(self, state: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+        """Returns the precision (k, k) of the unknowns after a motion with states (3, m, n) and a period [s]."""
+        H, weight = self.prior.copy(), self.weight(period, state.shape[1])
+        for (own, X), size in zip(self.columns(state), self.effort, strict=True):
+            H[own[:, None], own] += weight / size**2 * (X.T @ X)
+        return H
+
+    def expected_error(self, state: NDArray[np.float64], period: float) -> float:
+        """Returns the expected RMS error of predicted efforts in random states, relative to the RMS efforts [1].
+
+        Errors that a larger number of parameters would explain are not included. The square is the criterion of
+        V-optimality.
+        """
+        return float(np.sqrt(np.sum(self._target * _inverse(self.precision(state, period)))))
+
+    def expected_error_gradient(self, state: NDArray[np.float64], period: float) -> tuple[float, NDArray[np.float64]]:
+        """Returns the logarithm of the `expected_error` and its derivatives (3, m, n) with respect to the states."""
+        C = _inverse(self.precision(state, period))
+        square = float(np.sum(self._target * C))
+        weight = self.weight(period, state.shape[1])
+        D = -weight / square * (C @ self._target @ C)
+        # Derivative of log(error) with respect to the columns X of an actuator: X D / s^2.
+        G = [
+            (own, X @ D[own[:, None], own] / size**2)
+            for (own, X), size in zip(self.columns(state), self.effort, strict=True)
+        ]
+        gradient = np.empty_like(state)
+        for k in range(3):
+            for j in range(state.shape[2]):
+                step = _STEP * self.scales[k, j]
+                ahead, back = state.copy(), state.copy()
+                ahead[k, :, j] += step
+                back[k, :, j] -= step
+                gradient[k, :, j] = sum(
+                    np.sum(g * (X - Z), axis=1)
+                    for (_, g), (_, X), (_, Z) in zip(G, self.columns(ahead), self.columns(back), strict=True)
+                ) / (2 * step)
+        return 0.5 * float(np.log(square)), gradient
+
+    def known_parameters(self, state: NDArray[np.float64], period: float, share: float = 0.1) -> int:
+        """Returns the number of base parameters whose standard error is at most a share of their absolute value."""
+        C = _inverse(self.precision(state, period))
+        values = self._base.base @ self._regressor.values[: self._base.base.shape[1]]
+        b = self.num_base
+        return int(np.sum(np.sqrt(np.diag(C)[:b]) <= share * np.abs(values)))
+
+    def condition_number(self, state: NDArray[np.float64]) -> float:
+        """Returns the condition number of the base parameters' columns, divided by the efforts and column norms."""
+        H = np.zeros((self.num_base, self.num_base))
+        for (own, X), size in zip(self.columns(state), self.effort, strict=True):
+            of_base = own < self.num_base
+            H[own[of_base][:, None], own[of_base]] += X[:, of_base].T @ X[:, of_base] / size**2
+        norms = np.sqrt(np.diag(H))
+        if not np.all(norms > 0):
+            return float("inf")
+        values = np.linalg.eigvalsh(H / np.outer(norms, norms))
+        return float(np.sqrt(values[-1] / max(values[0], np.finfo(float).tiny)))
+
+    def log_determinant(self, state: NDArray[np.float64], period: float) -> float:
+        """Returns the gain in log-determinant of the precision over the prior, divided by the number of unknowns."""
+        ratio = np.linalg.slogdet(self.precision(state, period))[1] - np.linalg.slogdet(self.prior)[1]
+        return float(ratio) / len(self.prior)
+
+
+def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
+    unit = 1 / np.sqrt(np.diag(H))
+    factor = scipy.linalg.cho_factor(H * np.outer(unit, unit), lower=True)
+    return np.asarray(scipy.linalg.cho_solve(factor, np.diag(unit)) * unit[:, None])

@@ -1,0 +1,238 @@
+"""Limits of a designed motion, and a check of a motion that is independent of its design."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import HalfSpace
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.tree import MultibodyForces
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
+from dvrk_drake.errors import ExcitationError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.models.schema_fault import number_fault, within
+
+#: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
+CHECK_RATE, ROUNDING = 1000.0, 1e-9
+#: Rate at which collisions are checked [Hz].
+COLLISION_RATE = 50.0
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Limits of a designed motion. Position limits are those of the arm, including the coupled limits.
+
+    Attributes:
+        margin: Share of each position range that is not used, at each end.
+        traverse_time: Shortest time in which a joint may cross its position range [s]. The speed limit is the range
+            divided by this time, or `speed` if it is smaller.
+        speed: Largest speed of revolute and prismatic joints [rad/s, m/s].
+        speed_time: Shortest time in which a joint may reach its speed limit from rest [s].
+        acceleration_time: Shortest time in which a joint may reach the acceleration limit [s].
+        effort: Largest predicted effort, as a share of the effort limits. Dry friction is added to the prediction.
+        positions: Name of a joint -> lower and upper limit of its position [rad, m], in addition to those of the arm.
+        tip_box: Lower and upper corner (3,) of the box in the base frame that the tip must not leave [m], or None.
+        table: Height of a table in the base frame [m], which is the half-space below this height, or None.
+    """
+
+    margin: float = field(default=0.05, metadata=within(0.0, 0.4))
+    traverse_time: float = field(default=1.0, metadata=within(0.1, 100.0, "s"))
+    speed: tuple[float, float] = field(default=(3.0, 0.2), metadata=within(1e-3, 100.0, "rad/s or m/s"))
+    speed_time: float = field(default=0.2, metadata=within(0.01, 100.0, "s"))
+    acceleration_time: float = field(default=0.1, metadata=within(0.001, 100.0, "s"))
+    effort: float = field(default=0.6, metadata=within(0.05, 1.0))
+    positions: dict[str, tuple[float, float]] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
+    tip_box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
+
+    def __post_init__(self) -> None:
+        if fault := number_fault(self):
+            raise ExcitationError(f"limits of the motion: {fault}")
+
+    def of_arm(self, arm: Arm) -> JointLimits:
+        """Returns the limits of the joints of an arm.
+
+        Raises:
+            ExcitationError: A joint in `positions` is unknown, or no position is allowed.
+        """
+        A, lower, upper = arm.limit_matrix()
+        inset = self.margin * (upper - lower)
+        lower, upper = lower + inset, upper - inset
+        n = arm.num_joints
+        for name, (low, high) in self.positions.items():
+            if name not in arm.joint_names:
+                raise ExcitationError(f'unknown joint "{name}"; allowed: {", ".join(arm.joint_names)}')
+            j = arm.joint_names.index(name)
+            lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
+            if not lower[j] < upper[j]:
+                raise ExcitationError(
+                    f"{name}: no position is within {low:g}..{high:g} and the limits of {arm.name} with a margin of "
+                    f"{100 * self.margin:g} %"
+                )
+        speed = (arm.position_upper - arm.position_lower) / self.traverse_time
+        speed = np.minimum(speed, arm.per_joint(*self.speed))
+        acceleration = speed / self.speed_time
+        return JointLimits(
+            A,
+            lower,
+            upper,
+            speed,
+            acceleration,
+            acceleration / self.acceleration_time,
+            self.effort * arm.effort_limits[:n],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Limits of the joints of one arm.
+
+    Attributes:
+        A, lower, upper: Position limits lower <= A q <= upper, see `Arm.limit_matrix`.
+        speed, acceleration, jerk: Largest absolute values (n,).
+        effort: Largest absolute joint efforts (n,) [N m, N].
+    """
+
+    A: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    jerk: NDArray[np.float64]
+    effort: NDArray[np.float64]
+
+
+def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> list[str]:
+    """Returns a message for each limit that a motion exceeds, evaluated at 1 kHz.
+
+    The check uses only the positions of the motion. Velocities, accelerations and jerks are their spectral derivatives,
+    and efforts are Drake's inverse dynamics of the SDF.
+
+    Args:
+        motion: Motion of the arm.
+        arm: Arm to move.
+        limits: Limits of the motion.
+    """
+    joints = limits.of_arm(arm)
+    count = max(round(CHECK_RATE * motion.period), 4 * len(motion.sine[0]))
+    t = np.arange(count) * motion.period / count
+    q = motion.evaluate(t).q
+    v, vd, jerk = (spectral_derivative(q, motion.period, order) for order in (1, 2, 3))
+    names: Sequence[str] = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
+    effort = inverse_dynamics(arm, q, v, vd)
+    checks: list[tuple[str, Sequence[str], NDArray, NDArray, NDArray]] = [
+        ("position", names, q @ joints.A.T, joints.lower, joints.upper),
+        *(
+            (what, names, value, -limit, limit)
+            for what, value, limit in (
+                ("speed", v, joints.speed),
+                ("acceleration", vd, joints.acceleration),
+                ("jerk", jerk, joints.jerk),
+                ("effort", np.abs(effort) + arm.dry_friction(), joints.effort),
+            )
+        ),
+    ]
+    if limits.tip_box is not None:
+        lower, upper = (np.array(corner) for corner in limits.tip_box)
+        checks.append(("tip", ("x", "y", "z"), tip_positions(arm, q), lower, upper))
+    messages = []
+    for what, of, value, lower, upper in checks:
+        rounding = ROUNDING * (upper - lower)
+        for j in np.flatnonzero(np.any((value < lower - rounding) | (value > upper + rounding), axis=0)).tolist():
+            worst = int(np.argmax(np.maximum(value[:, j] - upper[j], lower[j] - value[:, j])))
+            messages.append(
+                f"{what} of {of[j]} is {value[worst, j]:.6g} at {t[worst]:.3f} s, outside "
+                f"{lower[j]:.6g}..{upper[j]:.6g}"
+            )
+    if collision := first_collision(arm, q[:: round(CHECK_RATE / COLLISION_RATE)], limits.table):
+        row, what = collision
+        messages.append(f"{what} at {row / COLLISION_RATE:.2f} s")
+    return messages
+
+
+def first_collision(arm: Arm, q: NDArray[np.float64], table: float | None = None) -> tuple[int, str] | None:
+    """Returns the index of the first pose with a collision and its description, or None.
+
+    Pairs of links that touch in every arm are ignored, as stated by the collision filters of the SDF.
+
+    Args:
+        arm: Arm with collision shapes.
+        q: Poses (m, n) [rad, m].
+        table: Height of a table in the base frame [m], or None.
+    """
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    add_arm(plant, arm)
+    if table is not None:
+        shape = HalfSpace()
+        plant.RegisterCollisionGeometry(
+            plant.world_body(), RigidTransform([0.0, 0.0, table]), shape, "table", CoulombFriction()
+        )
+    plant.Finalize()
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    query_port, inspector = scene_graph.get_query_output_port(), scene_graph.model_inspector()
+    graph_context, plant_context = (system.GetMyMutableContextFromRoot(context) for system in (scene_graph, plant))
+    for i, pose in enumerate(q):
+        set_arm_positions(plant, plant_context, arm, pose)
+        for pair in query_port.Eval(graph_context).ComputePointPairPenetration():
+            ids = pair.id_A, pair.id_B
+            bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in ids]
+            # The base is mounted at the table.
+            fixed = {plant.world_body().name(), "base_link"}
+            if {body.name() for body in bodies} <= fixed:
+                continue
+            names = ["the table" if body.index() == plant.world_body().index() else body.name() for body in bodies]
+            return i, f"collision of {' and '.join(sorted(names, key=lambda name: name == 'the table'))}"
+    return None
+
+
+def spectral_derivative(x: NDArray[np.float64], period: float, order: int) -> NDArray[np.float64]:
+    """Returns a time derivative of periodic samples x (m, n) of one whole period [s]."""
+    frequency = 2j * np.pi * np.fft.rfftfreq(len(x), period / len(x))
+    spectrum = np.fft.rfft(x, axis=0)
+    # Rounding errors at high frequencies would dominate the derivatives.
+    spectrum[np.abs(spectrum) < 1e-13 * np.abs(spectrum).max()] = 0.0
+    return np.asarray(np.fft.irfft(spectrum * frequency[:, None] ** order, len(x), axis=0))
+
+
+def inverse_dynamics(
+    arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns the joint efforts (m, n) of Drake's inverse dynamics for a motion (m, n) [N m, N]."""
+    plant = make_arm_plant(arm)
+    context, forces, selector = plant.CreateDefaultContext(), MultibodyForces(plant), tree_selector(plant, arm)
+    tau = np.empty(q.shape)
+    tree = np.zeros((3, len(q), plant.num_positions()))
+    for k, x in enumerate((arm.linkage.position(q), arm.linkage.velocity(v), arm.linkage.velocity(vd))):
+        tree[k][:, selector] = x
+    for i in range(len(q)):
+        plant.SetPositions(context, tree[0, i])
+        plant.SetVelocities(context, tree[1, i])
+        plant.CalcForceElementsContribution(context, forces)
+        tau[i] = arm.linkage.pull_back_effort(plant.CalcInverseDynamics(context, tree[2, i], forces)[selector])
+    return tau
+
+
+def tip_positions(arm: Arm, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the positions (m, 3) of the tip in the base frame at poses q (m, n) [m].
+
+    Raises:
+        ExcitationError: The arm file does not name the frame of the tip.
+    """
+    if not arm.view.tip:
+        raise ExcitationError(f"{arm.name}: the arm file does not name a frame of the tip (view.tip)")
+    plant = make_arm_plant(arm)
+    context, tip = plant.CreateDefaultContext(), plant.GetFrameByName(arm.view.tip)
+    p = np.empty((len(q), 3))
+    for i, pose in enumerate(q):
+        set_arm_positions(plant, context, arm, pose)
+        p[i] = tip.CalcPoseInWorld(context).translation()
+    return p

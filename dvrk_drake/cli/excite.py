@@ -1,0 +1,113 @@
+"""Command that designs a motion for the identification of an arm."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from cyclopts import Parameter
+
+import dvrk_drake as dvrk
+from dvrk_drake.cli.app import IDENTIFY, Arm, Gravity, Overwrite, Seconds, Seed, app, whole_number
+from dvrk_drake.cli.support import Steps, check_output, mounted, print_written
+from dvrk_drake.errors import ExcitationError
+
+
+@app.command(group=IDENTIFY)
+def excite(
+    *,
+    arm: Arm,
+    output: Annotated[str, Parameter(metavar="MOTION.yaml")],
+    csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
+    rate: Annotated[float, Parameter(metavar="HZ")] = 200.0,
+    duration: Seconds = 30.0,
+    period: Seconds = 10.0,
+    harmonics: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 8,
+    starts: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 4,
+    seed: Seed = 0,
+    margin: Annotated[float, Parameter(metavar="SHARE")] = 0.05,
+    traverse_time: Seconds = 1.0,
+    effort: Annotated[float, Parameter(metavar="SHARE")] = 0.6,
+    position: Annotated[list[str] | None, Parameter(metavar="JOINT=LOWER:UPPER ..", consume_multiple=True)] = None,
+    table: Annotated[float | None, Parameter(metavar="Z")] = None,
+    gravity: Gravity = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Design a motion for the identification of an arm.
+
+    The motion is periodic, at rest at both ends, and within all limits. It gives the smallest expected error of the
+    efforts that an identified model predicts anywhere in the workspace.
+
+    Args:
+        output: Motion file to write.
+        csv: File for the positions and velocities over time, for other programs.
+        rate: Rate of the rows of --csv, 1 to 10000.
+        duration: Duration of the motion, rounded up to whole periods.
+        period: Period of the motion.
+        harmonics: Number of harmonics, 2 to 20.
+        starts: Number of random motions from which the optimisation starts.
+        margin: Share of each position range that is not used, at each end, 0 to 0.4.
+        traverse_time: Shortest time in which a joint may cross its position range. It determines the speed limits.
+        effort: Largest predicted effort, as a share of the effort limits, 0.05 to 1.
+        position: Additional position limits [rad, m], e.g. insertion=0.05:0.2.
+        table: Height of a table in the base frame [m].
+    """
+    import numpy as np
+
+    from dvrk_drake.recordings.recording import write_csv
+    from dvrk_drake.reports.terminal_tables import make_console, print_answer
+
+    check_output(output, overwrite=overwrite)
+    if csv is not None:
+        check_output(csv, output, overwrite=overwrite)
+    if not 1.0 <= rate <= 10_000.0:
+        raise ExcitationError(f"--rate is {rate:g}; allowed: 1 to 10000")
+    limits = dvrk.MotionLimits(
+        margin=margin, traverse_time=traverse_time, effort=effort, positions=_positions(position or []), table=table
+    )
+    moved = mounted(dvrk.load_arm(arm), gravity, None)
+    with Steps("optimising") as steps:
+        design = dvrk.design_excitation(
+            moved,
+            duration=duration,
+            period=period,
+            harmonics=harmonics,
+            limits=limits,
+            starts=starts,
+            seed=seed,
+            progress=steps,
+        )
+    motion = design.motion
+    motion.save(output, overwrite=True)
+    if csv is not None:
+        t = np.arange(round(motion.duration * rate) + 1) / rate
+        q, v = motion.evaluate(t)[:2]
+        names = ["t", *(f"{name}{j + 1}" for name in ("q", "qd") for j in range(moved.num_joints))]
+        write_csv(csv, names, np.column_stack([t, q, v]))
+    console = make_console()
+    print_answer(
+        console,
+        f"{moved.name}: motion of {motion.duration:g} s. Expected error of predicted efforts: "
+        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with the best random motion).",
+        f"dvrk-drake identify RECORDING.csv --arm {arm} --output model.yaml",
+    )
+    console.print(
+        f"Base parameters known to 10 %: {design.known_parameters} of {design.num_parameters}. Condition number: "
+        f"{design.condition_number:.3g}. Information per parameter (log-determinant): {design.log_determinant:.2f}."
+    )
+    print_written(output)
+    if csv is not None:
+        print_written(csv)
+
+
+def _positions(texts: list[str]) -> dict[str, tuple[float, float]]:
+    positions = {}
+    for text in texts:
+        name, _, limits = text.partition("=")
+        lower, _, upper = limits.partition(":")
+        try:
+            positions[name] = float(lower), float(upper)
+        except ValueError:
+            raise ExcitationError(
+                f'--position: "{text}" is not of the form JOINT=LOWER:UPPER, e.g. insertion=0.05:0.2'
+            ) from None
+    return positions

@@ -1,0 +1,140 @@
+"""Expected errors compared with simulated estimates, and designed motions compared with random ones."""
+
+import numpy as np
+import pytest
+from command_output import refusal
+
+import dvrk_drake as dvrk
+from dvrk_drake.analysis.excitation.design import contracted, random_motion, state_of
+from dvrk_drake.analysis.excitation.information import MotionInformation
+from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
+from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
+from dvrk_drake.cli import main
+from dvrk_drake.errors import ExcitationError
+
+PERIOD = 5.0
+
+
+@pytest.fixture(scope="module", params=["mtmr", "psm"])
+def information(request):
+    return MotionInformation(dvrk.load_arm(request.param), MotionLimits())
+
+
+@pytest.fixture
+def state(information):
+    motion = random_motion(information.arm, MotionLimits(), PERIOD, 4, np.random.default_rng(2))
+    return state_of(motion, 40)
+
+
+def test_expected_error_is_that_of_simulated_estimates(information, state):
+    """Parameters from the prior and measurements with noise give maximum-a-posteriori estimates with this error."""
+    generator, effort = np.random.default_rng(0), information.effort
+    deviation = np.linalg.cholesky(np.linalg.inv(information.prior))
+    H = information.precision(state, PERIOD)
+    weight = information.weight(PERIOD, state.shape[1])
+    squares = []
+    for _ in range(200):
+        x = deviation @ generator.normal(size=len(deviation))
+        b = np.zeros(len(x))
+        for (own, X), size in zip(information.columns(state), effort, strict=True):
+            tau = X @ x[own] + size / np.sqrt(weight) * generator.normal(size=len(X))
+            b[own] += weight / size**2 * (X.T @ tau)
+        error = np.linalg.solve(H, b) - x
+        squares.append(
+            [
+                np.mean((X @ error[own]) ** 2) / size**2
+                for (own, X), size in zip(information.columns(information.states), effort, strict=True)
+            ]
+        )
+    assert np.sqrt(np.mean(squares)) == pytest.approx(information.expected_error(state, PERIOD), rel=0.1)
+
+
+def test_gradient_is_the_derivative(information, state):
+    value, gradient = information.expected_error_gradient(state, PERIOD)
+    assert np.exp(value) == pytest.approx(information.expected_error(state, PERIOD), rel=1e-9)
+    generator = np.random.default_rng(1)
+    for _ in range(3):
+        direction = generator.normal(size=state.shape) * information.scales[:, None]
+        above, below = (np.log(information.expected_error(state + step * direction, PERIOD)) for step in (1e-5, -1e-5))
+        assert np.sum(gradient * direction) == pytest.approx((above - below) / 2e-5, rel=1e-3, abs=1e-4)
+
+
+def test_more_information_gives_a_smaller_error(information, state):
+    once, twice = (information.expected_error(state, period) for period in (PERIOD, 2 * PERIOD))
+    assert twice < once
+    assert information.known_parameters(state, 1e6) >= information.known_parameters(state, PERIOD)
+    assert information.log_determinant(state, 2 * PERIOD) > information.log_determinant(state, PERIOD) > 0
+    at_rest = state.copy()
+    at_rest[1:] = 0.0
+    assert information.expected_error(at_rest, PERIOD) > once
+    assert information.condition_number(state) < information.condition_number(at_rest)
+
+
+def test_designed_motion_meets_all_limits_and_is_better_than_random_ones(information):
+    arm = information.arm
+    limits = MotionLimits(margin=0.1, traverse_time=1.5)
+    design = dvrk.design_excitation(arm, duration=12.0, period=PERIOD, harmonics=4, limits=limits, starts=1)
+    assert design.motion.duration == 15.0
+    assert motion_violations(design.motion, arm, limits) == []
+    own = MotionInformation(arm, limits)
+    generator = np.random.default_rng(4)
+    randoms = [own.expected_error(state_of(random_motion(arm, limits, PERIOD, 4, generator), 40), PERIOD) for _ in "ab"]
+    assert design.expected_error < 0.75 * min(*randoms, design.random_error)
+    assert design.expected_error == pytest.approx(own.expected_error(state_of(design.motion, 40), PERIOD), rel=1e-6)
+
+
+def test_random_motions_meet_nearly_all_limits(information):
+    arm, limits = information.arm, MotionLimits()
+    for seed in range(3):
+        motion = random_motion(arm, limits, PERIOD, 5, np.random.default_rng(seed))
+        # Between the times at which they are scaled, they may exceed a limit slightly.
+        assert motion_violations(contracted(motion, arm, limits), arm, limits) == []
+
+
+def test_motion_above_a_table_is_contracted():
+    arm = dvrk.load_arm("psm")
+    limits = MotionLimits(positions={"insertion": (0.05, 0.2)}, table=-0.17)
+    design = dvrk.design_excitation(arm, duration=4.0, period=4.0, harmonics=3, limits=limits, starts=1)
+    assert motion_violations(design.motion, arm, limits) == []
+    q = design.motion.evaluate(np.linspace(0, 4, 400)).q[:, 2]
+    assert q.min() >= 0.05 and q.max() <= 0.2
+    with pytest.raises(ExcitationError, match="no motion meets all limits: collision of"):
+        dvrk.design_excitation(arm, duration=4.0, period=4.0, harmonics=2, limits=MotionLimits(table=0.0), starts=1)
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ({"harmonics": 1}, "harmonics is 1; allowed: 2 to 20"),
+        ({"duration": 3.0, "period": 5.0}, "duration is 3; allowed: 5 to 36000"),
+        ({"starts": 0}, "starts is 0"),
+        ({"limits": MotionLimits(effort=0.05)}, "the dry friction exceeds 5 % of the effort limit"),
+    ],
+)
+def test_wrong_arguments_are_rejected(argument, message):
+    with pytest.raises(ExcitationError) as error:
+        dvrk.design_excitation(dvrk.load_arm("mtml"), starts=argument.pop("starts", 1), **argument)
+    assert message in str(error.value)
+
+
+def test_command_writes_the_motion(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    short = ["--period", "4", "--duration", "8", "--harmonics", "3", "--starts", "1"]
+    assert main(["excite", "--arm", "mtmr", "--output", "m.yaml", "--csv", "m.csv", "--rate", "100", *short]) == 0
+    out = capsys.readouterr().out
+    assert "motion of 8 s. Expected error of predicted efforts:" in " ".join(out.split())
+    motion = PeriodicMotion.load("m.yaml", dvrk.load_arm("mtmr"))
+    rows = np.loadtxt("m.csv", delimiter=",", skiprows=1)
+    assert rows.shape == (801, 15)
+    np.testing.assert_allclose(rows[:, 1:8], motion.evaluate(rows[:, 0]).q, atol=1e-12)
+    np.testing.assert_allclose(rows[:, 8:], motion.evaluate(rows[:, 0]).v, atol=1e-12)
+    for options, message in (
+        (["--output", "m.yaml"], "m.yaml already exists"),
+        (["--output", "n.yaml", "--position", "elbow_pitch=0"], "not of the form JOINT=LOWER:UPPER"),
+        (["--output", "n.yaml", "--csv", "n.yaml"], "n.yaml"),
+        (["--output", "n.yaml", "--csv", "n.csv", "--rate", "0"], "--rate is 0; allowed: 1 to 10000"),
+        (["--output", "n.yaml", "--effort", "2"], "effort is 2; allowed: 0.05..1"),
+    ):
+        assert main(["excite", "--arm", "mtmr", *options, *short]) == 2
+        assert message in refusal(capsys.readouterr().err)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.csv", "m.yaml"]
