@@ -4,6 +4,7 @@ python tests/support/formula_study.py study STUDY.yaml --output RESULTS.csv --wo
 """
 
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -46,4 +47,6 @@ if __name__ in ("__main__", "__mp_main__"):  # the command, and its workers
 if __name__ == "__main__":
     from dvrk_drake.cli import main
 
+    # A shell without job control starts background processes with SIGINT ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(main(sys.argv[1:]))

@@ -96,15 +96,18 @@ def test_message_is_received_after_a_loss_of_the_network():
 
 
 @pytest.fixture
-def deadman():
+def deadman(arm):
     """Deadman process of this process, which publishes a command like a bridge. Then the network is lost."""
     domain = ros.RosDomain(1)
     commands = [domain.advertise(topic, JointState) for topic in (ros_arm.COMMAND, "/MTML/servo_jp")]
     process = DeadmanProcess("/MTML", 1)
     try:
         assert not process.problem()
+        # On a busy computer, the arm could confirm the hold of the deadman process before the network is lost.
+        arm.send_signal(signal.SIGSTOP)
         commands[0].publish(JointState(effort=[1.0]))
         network("down")
+        arm.send_signal(signal.SIGCONT)
         assert domain.wait_until(lambda: "not connected" in process.problem(), TIMEOUT)
         yield process
     finally:
