@@ -34,6 +34,8 @@ from motions import friction_everywhere, recorded, true_dynamics
 
 RATE, SECONDS, NOISE, SPREAD = 1000.0, 30.0, 0.05, 0.1
 LIMITS = MotionLimits()
+#: Periods of the public motions [s].
+PERIODS = {"MTMR": 11.67, "PSM": 6.48}
 
 
 def published(folder: Path, arm: Arm) -> tuple[np.ndarray, ...]:
@@ -71,7 +73,8 @@ def compare(arm: Arm, folder: Path, arms: int, tests: int) -> None:
     design = design_excitation(arm, duration=SECONDS, limits=LIMITS)
     print(f"{arm.name}: design of {SECONDS:g} s in {time.perf_counter() - start:.0f} s", flush=True)
     generator = np.random.default_rng(100)
-    randoms = [random_motion(arm, LIMITS, design.motion.period, 8, generator) for _ in range(arms)]
+    harmonics = len(design.motion.sine[0])
+    randoms = [random_motion(arm, LIMITS, design.motion.period, harmonics, generator) for _ in range(arms)]
     public = published(folder, arm)
     information = MotionInformation(arm, LIMITS)
 
@@ -79,7 +82,7 @@ def compare(arm: Arm, folder: Path, arms: int, tests: int) -> None:
         error = 100 * information.expected_error(state, period)
         return [f"{error:.1f}", f"{information.known_parameters(state, period)} of {information.num_base}"]
 
-    one_period = slice(0, round(11.7 * RATE if arm.name != "PSM" else 6.5 * RATE), 100)
+    one_period = slice(0, round(PERIODS[arm.name] * RATE), 100)
     rows = {
         "designed": expected(state_of(design.motion, 200), design.motion.period),
         "published": expected(np.array([x[one_period] for x in public[1:]]), len(public[0][one_period]) * 0.1),
@@ -95,7 +98,8 @@ def compare(arm: Arm, folder: Path, arms: int, tests: int) -> None:
     for seed in range(arms):
         rng = np.random.default_rng(seed)
         motions = {"designed": sampled(design.motion), "published": public, "random": sampled(randoms[seed])}
-        friction = friction_everywhere(arm, motions["designed"], 0.15)
+        # The widths and travels of the friction are those of another random motion.
+        friction = friction_everywhere(arm, sampled(random_motion(arm, LIMITS, 10.0, 6, rng)), 0.15)
         effects = [dataclasses.replace(e, coefficient=e.coefficient * rng.uniform(0.5, 1.5)) for e in friction]
         truth = true_dynamics(arm, rng, effects, SPREAD)
         others = [sampled(random_motion(arm, LIMITS, 10.0, 6, rng), 12.0) for _ in range(tests)]

@@ -21,11 +21,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 
 #: Number of times per harmonic at which the limits are imposed and the information is computed.
-LIMIT_TIMES, INFORMATION_TIMES = 20, 10
-#: Share of the limits that the optimisation uses. Between the times, a motion may exceed the limits slightly.
-_USED = 0.99
+LIMIT_TIMES, INFORMATION_TIMES = 14, 8
+#: Share of the limits and of the effort limits that the optimisation uses. Between the times, a motion may exceed the
+#: limits slightly.
+_USED, _USED_EFFORT = 0.98, 0.95
 #: Largest number of major iterations of the solver.
-MAX_ITERATIONS = 150
+MAX_ITERATIONS = 60
 #: Factor by which a motion is contracted towards its centre until it has no collision and meets all limits, and largest
 #: number of contractions.
 _CONTRACTION, _MAX_CONTRACTIONS = 0.99, 150
@@ -67,8 +68,8 @@ def design_excitation(
     arm: Arm,
     *,
     duration: float = 30.0,
-    period: float = 10.0,
-    harmonics: int = 8,
+    period: float = 15.0,
+    harmonics: int = 12,
     limits: MotionLimits | None = None,
     starts: int = 4,
     seed: int = 0,
@@ -281,8 +282,8 @@ def _add_effort_limits(
     limits: MotionLimits,
 ) -> None:
     """Adds the constraints on the efforts of the SDF, relative to their limits."""
-    regressor, allowed = DynamicRegressor(arm), _USED * _effort_without_friction(arm, limits)
-    values, n = basis.values(_times(basis, INFORMATION_TIMES))[:3], arm.num_joints
+    regressor, allowed = DynamicRegressor(arm), _USED_EFFORT * _effort_without_friction(arm, limits)
+    values, n = basis.values(_times(basis, LIMIT_TIMES))[:3], arm.num_joints
     scales = MotionInformation(arm, limits).scales
 
     def effort(state: NDArray[np.float64]) -> NDArray[np.float64]:
