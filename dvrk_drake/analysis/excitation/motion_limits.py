@@ -40,6 +40,12 @@ class MotionLimits:
         positions: Name of a joint -> lower and upper limit of its position [rad, m], in addition to those of the arm.
         tip_box: Lower and upper corner (3,) of the box in the base frame that the tip must not leave [m], or None.
         table: Height of a table in the base frame [m], which is the half-space below this height, or None.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> limits = dvrk.MotionLimits(traverse_time=2.0, positions={"insertion": (0.05, 0.2)})
+        >>> limits.of_arm(dvrk.load_arm("psm")).speed.round(2).tolist()
+        [1.59, 0.93, 0.12, 3.0, 1.4, 1.4, 1.05]
     """
 
     margin: float = field(default=0.05, metadata=within(0.0, 0.4))

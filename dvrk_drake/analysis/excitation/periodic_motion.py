@@ -92,6 +92,16 @@ class PeriodicMotion:
         repetitions: Number of periods.
         center: Mean positions (n,) [rad, m].
         sine, cosine: Coefficients (n, h) [rad, m].
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("mtml")
+        >>> design = dvrk.design_excitation(arm, duration=4.0, period=4.0, harmonics=2, starts=1)
+        >>> design.motion.save("motion.yaml")
+        >>> dvrk.PeriodicMotion.load("motion.yaml", arm) == design.motion
+        True
+        >>> design.motion.evaluate([0.0, 1.0]).q.shape
+        (2, 7)
     """
 
     format: str = "dvrk_drake motion 1"
