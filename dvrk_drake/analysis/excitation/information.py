@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import BaseColumns, base_columns
+from dvrk_drake.analysis.dynamic.columns import COULOMB_WIDTHS, BaseColumns, base_columns
 from dvrk_drake.analysis.dynamic.problem import FRICTION_DEVIATION, LINK_DEVIATION, MIN_ROTOR_DEVIATION
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -21,8 +21,8 @@ from dvrk_drake.models.arm import Arm
 EFFORT_ERROR, CORRELATION_TIME = 0.1, 0.1
 #: Number of random states for which the expected error is computed.
 NUM_STATES = 1000
-#: Width of the smoothed sign function of Coulomb friction, divided by the speed limit.
-COULOMB_WIDTH = 0.05
+#: RMS speed for which Coulomb friction has the widths of `identify`, as a share of the speed limit.
+RMS_SPEED = 1 / 3
 #: Prior standard deviation of an offset, as a share of the RMS effort.
 OFFSET_DEVIATION = 1.0
 #: Step of the central differences with respect to positions, velocities and accelerations, relative to their limits.
@@ -33,8 +33,8 @@ _STEP = 1e-5
 class MotionInformation:
     """Linear model of the efforts of an arm, with the priors of `identify`.
 
-    The unknowns are the base parameters, and the viscous friction, the Coulomb friction and the offset of each
-    actuator. Cables, springs and presliding are not included.
+    The unknowns are the base parameters, and the viscous friction, the Coulomb friction with several widths and the
+    offset of each actuator. Cables, springs and presliding are not included.
 
     Attributes:
         arm: Arm to identify.
@@ -92,8 +92,10 @@ class MotionInformation:
         for i in range(arm.num_joints):
             own, of_base = self._base.of_actuator(Y, arm.transmission.inverse.matrix[:, i])
             u = a_dot[:, i] / speed[i]
-            effects = np.column_stack([u, np.tanh(u / COULOMB_WIDTH), np.ones(count)]) * self.effort[i]
-            columns.append((np.append(own, self.num_base + 3 * i + np.arange(3)), np.hstack([of_base, effects])))
+            friction = np.tanh(u[:, None] / (RMS_SPEED * np.array(COULOMB_WIDTHS)))
+            effects = np.column_stack([u, friction, np.ones(count)]) * self.effort[i]
+            first, size = self.num_base + effects.shape[1] * i, effects.shape[1]
+            columns.append((np.append(own, first + np.arange(size)), np.hstack([of_base, effects])))
         return columns
 
     @cached_property
@@ -104,7 +106,7 @@ class MotionInformation:
         links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
         rotors = np.maximum(LINK_DEVIATION * regressor.values[10 * len(links) : p], MIN_ROTOR_DEVIATION)
         scaled = self._base.base * np.concatenate([*links, rotors])
-        of_actuator = [FRICTION_DEVIATION, FRICTION_DEVIATION, OFFSET_DEVIATION]
+        of_actuator = [*[FRICTION_DEVIATION] * (1 + len(COULOMB_WIDTHS)), OFFSET_DEVIATION]
         effects = np.diag(np.tile(of_actuator, self.arm.num_joints) ** -2.0)
         return np.asarray(scipy.linalg.block_diag(_inverse(scaled @ scaled.T), effects))
 
