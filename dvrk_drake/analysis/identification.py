@@ -19,6 +19,9 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 
+#: Largest share of the rows of a motion that may occur in another motion. Real efforts do not repeat exactly.
+MAX_COMMON_ROWS = 0.05
+
 
 def identify(
     recording: Recording | Sequence[Recording],
@@ -73,6 +76,9 @@ def identify(
     """
     if not isinstance(recording, Recording):
         if len(recording) != 1:
+            if method != "robust" or low_speed_segments:
+                what = "low-speed segments" if low_speed_segments else f'method "{method}"'
+                raise RecordingError(f"{what}: requires one recording, but {len(recording)} were given")
             return _identify_several(recording, arm, progress)
         (recording,) = recording
     poses = find_poses(recording, arm, low_speed_segments)
@@ -98,10 +104,15 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
         name = recording.source or f"recording {i + 1}"
         if not find_poses(recording, arm).moves:
             raise RecordingError(
-                f"{name}: contains static poses; several recordings can be combined only if all of them are motions"
+                f"{name}: contains static poses, or is sampled too slowly for a motion; several recordings can be "
+                "combined only if all of them are motions"
             )
-        if any(recording.sha256 and recording.sha256 == other.sha256 for other in recordings[:i]):
-            raise RecordingError(f"{name}: was given twice; each recording must be another one")
+        for k, other in enumerate(recordings[:i]):
+            if _num_common_rows(recording, other) > MAX_COMMON_ROWS * min(len(recording), len(other)):
+                raise RecordingError(
+                    f"{name}: contains the same efforts as {other.source or f'recording {k + 1}'}; give different "
+                    "recordings, because each of them is predicted from the others"
+                )
         report = require_usable(recording, arm, progress, channels=True)
         warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in report.warnings]
     try:
@@ -110,6 +121,12 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
         error.findings = tuple(warnings)
         raise
     return replace(result, warnings=(*warnings, *_unexplained(result)))
+
+
+def _num_common_rows(a: Recording, b: Recording) -> int:
+    """Returns the number of different effort rows that two recordings have in common, without rows of zeros."""
+    rows = [{row.tobytes() for row in x.measured_effort().round(9) if row.any()} for x in (a, b)]
+    return len(rows[0] & rows[1])
 
 
 def _unexplained(result: DynamicIdentification) -> tuple[Finding, ...]:

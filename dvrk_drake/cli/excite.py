@@ -8,8 +8,11 @@ from cyclopts import Parameter
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli.app import IDENTIFY, Arm, Gravity, Overwrite, Seconds, Seed, app, whole_number
-from dvrk_drake.cli.support import Steps, check_output, mounted, print_written
+from dvrk_drake.cli.support import Steps, check_output, mounted, print_written, quiet_drake
 from dvrk_drake.errors import ExcitationError
+
+#: Default rate of the rows of --csv [Hz].
+DEFAULT_RATE = 200.0
 
 
 @app.command(group=IDENTIFY)
@@ -18,7 +21,7 @@ def excite(
     arm: Arm,
     output: Annotated[str, Parameter(metavar="MOTION.yaml")],
     csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
-    rate: Annotated[float, Parameter(metavar="HZ")] = 200.0,
+    rate: Annotated[float, Parameter(metavar="HZ")] = DEFAULT_RATE,
     duration: Seconds = 30.0,
     period: Seconds = 15.0,
     harmonics: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 12,
@@ -34,8 +37,8 @@ def excite(
 ) -> None:
     """Design a motion for the identification of an arm.
 
-    The motion is periodic, at rest at both ends, and within all limits. It gives the smallest expected error of the
-    efforts that an identified model predicts anywhere in the workspace.
+    The motion is periodic, at rest at both ends, and within all limits. It minimises the expected error of the efforts
+    that an identified model predicts in random states of the workspace.
 
     Args:
         output: Motion file to write.
@@ -56,6 +59,9 @@ def excite(
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console, print_answer
 
+    quiet_drake()
+    if csv is None and rate != DEFAULT_RATE:
+        raise ExcitationError("--rate requires --csv")
     check_output(output, overwrite=overwrite)
     if csv is not None:
         check_output(csv, output, overwrite=overwrite)
@@ -100,9 +106,11 @@ def excite(
 
 
 def _positions(texts: list[str]) -> dict[str, tuple[float, float]]:
-    positions = {}
+    positions: dict[str, tuple[float, float]] = {}
     for text in texts:
         name, _, limits = text.partition("=")
+        if name in positions:
+            raise ExcitationError(f"--position: {name} was given twice; give each joint once")
         lower, _, upper = limits.partition(":")
         try:
             positions[name] = float(lower), float(upper)

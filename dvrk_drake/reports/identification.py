@@ -205,6 +205,7 @@ def _print_error_of_each_recording(console: Console, result: DynamicIdentificati
         table.add_row(name, *(percent(error) if np.isfinite(error) else "" for error in row))
     table.add_row("mean", *map(percent, np.nanmean(errors, axis=0)))
     console.print(table)
+    print_note(console, f"The intervals include only the differences between these {len(names)} recordings.")
 
 
 def _print_motion_details(console: Console, result: DynamicIdentification) -> None:

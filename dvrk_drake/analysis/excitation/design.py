@@ -13,7 +13,7 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
 from dvrk_drake.analysis.excitation.information import MotionInformation
-from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
+from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, first_collision, motion_violations
 from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ExcitationError
@@ -114,6 +114,8 @@ def design_excitation(
             raise ExcitationError(f"{name} is {value:g}; allowed: {lowest:g} to {highest:g}")
     limits = limits or MotionLimits()
     limits.of_arm(arm)
+    if collision := first_collision(arm, _center(arm, limits, np.random.default_rng(seed))[None], limits.table):
+        raise ExcitationError(f"{arm.name}: no motion meets all limits: {collision[1]} in the middle of the motion")
     share = step_progress(progress, "optimising")
     share(0.0)
     problems = [_Problem(arm, limits, period, harmonics, seed + k) for k in range(starts)]
@@ -151,7 +153,7 @@ def random_motion(
     The amplitudes of the harmonics are random with equal distributions of the velocities.
     """
     basis = FourierBasis.of(period, harmonics)
-    center = arm.sample_poses(200, generator, max(limits.margin, 0.2)).mean(axis=0)
+    center = _center(arm, limits, generator)
     k = np.arange(1, harmonics + 1)
     sine, cosine = generator.normal(size=(2, arm.num_joints, harmonics)) / k
     weights = np.hstack([sine @ basis.sines[:, : harmonics - 1], cosine @ basis.cosines[:, harmonics - 1 :]])
@@ -160,6 +162,16 @@ def random_motion(
     coefficients[:, 1:] *= _joint_scales(coefficients, basis, arm, limits)[:, None]
     coefficients[:, 1:] *= _largest_scale(coefficients, basis, arm, limits)
     return PeriodicMotion.of_coefficients(arm, basis, coefficients, 1)
+
+
+def _center(arm: Arm, limits: MotionLimits, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Returns the mean of random poses (n,), moved into the additional position limits."""
+    center = arm.sample_poses(200, generator, max(limits.margin, 0.2)).mean(axis=0)
+    if not limits.positions:
+        return center
+    joints, n = limits.of_arm(arm), arm.num_joints
+    middle, half = (joints.lower[:n] + joints.upper[:n]) / 2, (joints.upper[:n] - joints.lower[:n]) / 2
+    return np.asarray(np.clip(center, middle - 0.5 * half, middle + 0.5 * half))
 
 
 def contracted(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> PeriodicMotion:

@@ -76,12 +76,14 @@ class MotionLimits:
             if name not in arm.joint_names:
                 raise ExcitationError(f'unknown joint "{name}"; allowed: {", ".join(arm.joint_names)}')
             j = arm.joint_names.index(name)
-            lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
-            if not lower[j] < upper[j]:
+            if not low < high:
+                raise ExcitationError(f"{name}: the lower limit {low:g} must be less than the upper limit {high:g}")
+            if not max(lower[j], low) < min(upper[j], high):
                 raise ExcitationError(
-                    f"{name}: no position is within {low:g}..{high:g} and the limits of {arm.name} with a margin of "
-                    f"{100 * self.margin:g} %"
+                    f"{name}: no position is within {low:g}..{high:g}; allowed: {lower[j]:g}..{upper[j]:g}, the limits "
+                    f"of {arm.name} with a margin of {100 * self.margin:g} %"
                 )
+            lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
         speed = (arm.position_upper - arm.position_lower) / self.traverse_time
         speed = np.minimum(speed, arm.per_joint(*self.speed))
         acceleration = speed / self.speed_time

@@ -127,14 +127,27 @@ def test_command_prints_the_error_of_each_recording(days, tmp_path, capsys, monk
     assert main(["validate", "b.csv", "--model", "model.yaml", "--save"]) == 2
     assert "identified from this recording" in refusal(capsys.readouterr().err)
     assert main(["identify", "a.csv", "a.csv", "--arm", "psm", "--output", "twice.yaml"]) == 2
-    assert "given twice" in refusal(capsys.readouterr().err) and not (tmp_path / "twice.yaml").exists()
+    assert (
+        "contains the same efforts as a.csv" in refusal(capsys.readouterr().err)
+        and not (tmp_path / "twice.yaml").exists()
+    )
 
 
 def test_rejected_lists(days):
     poses = ARM.sample_poses(40, np.random.default_rng(0))
     still = dvrk.Recording(q=poses, tau=dvrk.IdentifiedModel.from_arm(ARM).holding_torque(poses), source="poses.csv")
-    with pytest.raises(RecordingError, match=r"poses\.csv: contains static poses; several recordings"):
+    with pytest.raises(RecordingError, match=r"poses\.csv: contains static poses, or is sampled too slowly"):
         dvrk.identify([days[2][0], still], ARM)
+    first = days[2][0]
+    part = dataclasses.replace(
+        first, t=first.t[500:2000], q=first.q[500:2000] + 1e-6, qd=None, tau=first.tau[500:2000], source="part.csv"
+    )
+    with pytest.raises(RecordingError, match=r"part\.csv: contains the same efforts as day1\.csv"):
+        dvrk.identify([first, part], ARM)
+    with pytest.raises(RecordingError, match=r'method "paper": requires one recording, but 3 were given'):
+        dvrk.identify(days[2], ARM, method="paper")
+    with pytest.raises(RecordingError, match="low-speed segments: requires one recording"):
+        dvrk.identify(days[2], ARM, low_speed_segments=True)
     with pytest.raises(RecordingError, match="no recordings were given"):
         dvrk.identify([], ARM)
 

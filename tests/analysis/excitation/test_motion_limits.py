@@ -128,7 +128,8 @@ def test_first_collision_is_found():
         ({"margin": 0.5}, "margin is 0.5; allowed: 0..0.4"),
         ({"traverse_time": 0.0}, "traverse_time is 0"),
         ({"positions": {"elbow": (0.0, 1.0)}}, 'unknown joint "elbow"'),
-        ({"positions": {"yaw": (2.0, 3.0)}}, "yaw: no position is within 2..3"),
+        ({"positions": {"yaw": (2.0, 3.0)}}, "yaw: no position is within 2..3; allowed: -1.4292..1.4292"),
+        ({"positions": {"yaw": (0.5, 0.5)}}, "yaw: the lower limit 0.5 must be less than the upper limit 0.5"),
     ],
 )
 def test_wrong_limits_are_rejected(change, message):
