@@ -99,7 +99,7 @@ def test_motion_above_a_table_is_contracted():
     q = design.motion.evaluate(np.linspace(0, 4, 400)).q[:, 2]
     assert q.min() >= 0.05 and q.max() <= 0.2
     with pytest.raises(
-        ExcitationError, match="no motion meets all limits: collision of .* in the middle of the motion"
+        ExcitationError, match=r"no motion meets all limits: collision of .* in the middle of the motion"
     ):
         dvrk.design_excitation(arm, duration=4.0, period=4.0, harmonics=2, limits=MotionLimits(table=0.0), starts=1)
 
