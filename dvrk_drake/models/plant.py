@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.multibody.tree import ModelInstanceIndex, MultibodyForces
 from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
@@ -161,4 +161,29 @@ def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]
     for row, q in enumerate(poses):
         set_arm_positions(plant, context, arm, q)
         tau[row] = holding_torque(plant, context, arm)
+    return tau
+
+
+def inverse_dynamics(
+    arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns the efforts (m, n) of the independent joints for a motion (m, n), from Drake's inverse dynamics [N m, N].
+
+    The inertial parameters are those of the SDF files. The efforts of the tree are projected as in `holding_torque`.
+
+    Args:
+        arm: Arm that moves.
+        q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
+    """
+    plant = make_arm_plant(arm)
+    context, forces, selector = plant.CreateDefaultContext(), MultibodyForces(plant), tree_selector(plant, arm)
+    tau = np.empty(q.shape)
+    tree = np.zeros((3, len(q), plant.num_positions()))
+    for k, x in enumerate((arm.linkage.position(q), arm.linkage.velocity(v), arm.linkage.velocity(vd))):
+        tree[k][:, selector] = x
+    for i in range(len(q)):
+        plant.SetPositions(context, tree[0, i])
+        plant.SetVelocities(context, tree[1, i])
+        plant.CalcForceElementsContribution(context, forces)
+        tau[i] = arm.linkage.pull_back_effort(plant.CalcInverseDynamics(context, tree[2, i], forces)[selector])
     return tau

@@ -148,9 +148,10 @@ def state_of(motion: PeriodicMotion, count: int) -> NDArray[np.float64]:
 def random_motion(
     arm: Arm, limits: MotionLimits, period: float, harmonics: int, generator: np.random.Generator
 ) -> PeriodicMotion:
-    """Returns a random Fourier motion that reaches at least one of the limits of `MotionLimits.of_arm` for each joint.
+    """Returns a random Fourier motion that nearly reaches the limits.
 
-    The amplitudes of the harmonics are random with equal distributions of the velocities.
+    The velocities of all harmonics have the same distribution. Each joint is scaled to its own limits. Then all joints
+    are scaled by one factor until the coupled limits and the effort limits are met.
     """
     basis = FourierBasis.of(period, harmonics)
     center = _center(arm, limits, generator)
@@ -158,7 +159,6 @@ def random_motion(
     sine, cosine = generator.normal(size=(2, arm.num_joints, harmonics)) / k
     weights = np.hstack([sine @ basis.sines[:, : harmonics - 1], cosine @ basis.cosines[:, harmonics - 1 :]])
     coefficients = np.column_stack([center, weights])
-    # All joints together meet the coupled limits. Each joint is scaled alone otherwise.
     coefficients[:, 1:] *= _joint_scales(coefficients, basis, arm, limits)[:, None]
     coefficients[:, 1:] *= _largest_scale(coefficients, basis, arm, limits)
     return PeriodicMotion.of_coefficients(arm, basis, coefficients, 1)

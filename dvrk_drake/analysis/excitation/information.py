@@ -38,9 +38,9 @@ class MotionInformation:
 
     Attributes:
         arm: Arm to identify.
-        limits: Limits of the motion. The states for which efforts are predicted are uniformly distributed over the
-            allowed positions, and have normally distributed velocities and accelerations with a third of the limits as
-            standard deviation.
+        limits: Limits of the motion. The positions for which efforts are predicted are uniformly distributed over the
+            position ranges of the arm without `margin`. The velocities and accelerations are normally distributed, and
+            their standard deviations are a third of the limits.
     """
 
     arm: Arm

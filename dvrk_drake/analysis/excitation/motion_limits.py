@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from pydrake.geometry import HalfSpace
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
-from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.models.plant import add_arm, inverse_dynamics, make_arm_plant, set_arm_positions
 from dvrk_drake.models.schema_fault import number_fault, within
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
@@ -209,24 +208,6 @@ def spectral_derivative(x: NDArray[np.float64], period: float, order: int) -> ND
     # Rounding errors at high frequencies would dominate the derivatives.
     spectrum[np.abs(spectrum) < 1e-13 * np.abs(spectrum).max()] = 0.0
     return np.asarray(np.fft.irfft(spectrum * frequency[:, None] ** order, len(x), axis=0))
-
-
-def inverse_dynamics(
-    arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Returns the joint efforts (m, n) of Drake's inverse dynamics for a motion (m, n) [N m, N]."""
-    plant = make_arm_plant(arm)
-    context, forces, selector = plant.CreateDefaultContext(), MultibodyForces(plant), tree_selector(plant, arm)
-    tau = np.empty(q.shape)
-    tree = np.zeros((3, len(q), plant.num_positions()))
-    for k, x in enumerate((arm.linkage.position(q), arm.linkage.velocity(v), arm.linkage.velocity(vd))):
-        tree[k][:, selector] = x
-    for i in range(len(q)):
-        plant.SetPositions(context, tree[0, i])
-        plant.SetVelocities(context, tree[1, i])
-        plant.CalcForceElementsContribution(context, forces)
-        tau[i] = arm.linkage.pull_back_effort(plant.CalcInverseDynamics(context, tree[2, i], forces)[selector])
-    return tau
 
 
 def tip_positions(arm: Arm, q: NDArray[np.float64]) -> NDArray[np.float64]:

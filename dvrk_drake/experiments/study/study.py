@@ -12,7 +12,7 @@ import sysconfig
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -65,7 +65,7 @@ def run_study(
         try:
             for case in missing:
                 futures[executor.submit(run_case, study.scenario_of(case), study.measures)] = case
-            for future in _finished(list(futures)):
+            for future in as_completed(list(futures)):
                 case = futures.pop(future)
                 if loss := _loss(future):
                     losses.append((case, loss))
@@ -155,23 +155,10 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 
 def await_results(futures: Sequence[Future[Result]], progress: Callable[[float], object]) -> list[Result]:
     """Returns the results of all futures in order, or raises the first error; reports the finished share."""
-    for done, future in enumerate(_finished(futures), start=1):
+    for done, future in enumerate(as_completed(futures), start=1):
         future.result()
         progress(done / len(futures))
     return [future.result() for future in futures]
-
-
-def _finished(futures: Sequence[Future[Result]]) -> Iterator[Future[Result]]:
-    """Yields the futures as they finish, like `as_completed`.
-
-    Python handles Ctrl-C only after a call that blocks without a timeout, if the signal arrives just before this call.
-    """
-    pending = set(futures)
-    while pending:
-        with suppress(TimeoutError):
-            for future in as_completed(pending, timeout=1.0):
-                pending.discard(future)
-                yield future
 
 
 def _allocator_environment() -> dict[str, str]:

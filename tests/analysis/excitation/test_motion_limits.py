@@ -8,7 +8,6 @@ import pytest
 from dvrk_drake.analysis.excitation.motion_limits import (
     MotionLimits,
     first_collision,
-    inverse_dynamics,
     motion_violations,
     tip_positions,
 )
@@ -16,6 +15,7 @@ from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, Periodi
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.plant import inverse_dynamics
 
 LIMITS = MotionLimits()
 
