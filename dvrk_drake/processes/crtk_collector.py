@@ -22,15 +22,8 @@ from dvrk_drake.dynamics.identified_model import ControlModel
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
-from dvrk_drake.processes.collector import (
-    MAX_TRACKING_ERROR,
-    MEASURE,
-    REST,
-    REST_TIME,
-    SETTLE,
-    CollectionSettings,
-    Steps,
-)
+from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, REST, REST_TIME, SETTLE, Steps
+from dvrk_drake.processes.collector import MEASURE, CollectionSettings
 from dvrk_drake.processes.crtk_monitor import CrtkMonitor, unit
 from dvrk_drake.processes.teacher import RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
