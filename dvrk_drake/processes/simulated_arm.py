@@ -16,6 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.lcm_messages import command_channel, describe_state, status_channel
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.processes.lcm_network import handle_message, listen
@@ -83,6 +84,8 @@ class SimulatedArm:
         url: str,
         q: ArrayLike,
         wall_clock: Callable[[], int] = monotonic_utime,
+        *,
+        effects: ArmEffects | None = None,
     ) -> None:
         """Creates the arm at rest. The arm's clock starts at the current time of day.
 
@@ -93,6 +96,7 @@ class SimulatedArm:
             q: Initial pose (n,) [rad, m].
             wall_clock: Function that returns a monotonic time [us]. The guard uses this function, so that commands also
                 expire while this process is late or suspended.
+            effects: Simulated effects of the real arm. None: no effects.
         """
         self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0
@@ -100,7 +104,7 @@ class SimulatedArm:
         self._memory = DrakeLcm("memq://")
         self._memory.Subscribe(status_channel(arm), self._keep_status)
         builder = DiagramBuilder()
-        station = builder.AddSystem(ArmStation(arm))
+        station = builder.AddSystem(ArmStation(arm, effects=effects))
         self._driver = apply_driver_config(
             driver,
             station,

@@ -14,11 +14,11 @@ from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
 from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, first_collision, motion_violations
-from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
+from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
 #: Number of times per harmonic at which the limits are imposed and the information is computed.
 LIMIT_TIMES, INFORMATION_TIMES = 14, 8
@@ -125,7 +125,7 @@ def design_excitation(
         share(0.9 * len(results) / starts)
     best = min(results, key=lambda result: result[1])
     motion = contracted(best[0], arm, limits)
-    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)))
+    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)), table=limits.table)
     share(1.0)
     information = MotionInformation(arm, limits)
     state = state_of(motion, INFORMATION_TIMES * harmonics)

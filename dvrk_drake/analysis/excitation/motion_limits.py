@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import HalfSpace
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, inverse_dynamics, make_arm_plant, set_arm_positions
 from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
 CHECK_RATE, ROUNDING = 1000.0, 1e-9
@@ -114,6 +114,36 @@ class JointLimits:
     acceleration: NDArray[np.float64]
     jerk: NDArray[np.float64]
     effort: NDArray[np.float64]
+
+
+def execution_limits(table: float | None) -> MotionLimits:
+    """Returns the limits that every motion must meet before an arm follows it.
+
+    The speed limit is slightly below that of the command guard with default settings.
+
+    Args:
+        table: Height of a table in the base frame [m], or None.
+    """
+    return MotionLimits(
+        margin=0.0,
+        traverse_time=0.55,
+        speed=(10.0, 1.0),
+        speed_time=0.05,
+        acceleration_time=0.01,
+        effort=0.95,
+        table=table,
+    )
+
+
+def path_collision(arm: Arm, q_start: ArrayLike, q_end: ArrayLike, table: float | None) -> str:
+    """Returns a message if the straight path in joint space between two poses (n,) has a collision, else "".
+
+    The joints move by at most 1 % of their ranges between two checked poses.
+    """
+    start, end = np.asarray(q_start, dtype=np.float64), np.asarray(q_end, dtype=np.float64)
+    steps = int(np.ceil(100 * np.max(np.abs(end - start) / (arm.position_upper - arm.position_lower)))) + 1
+    collision = first_collision(arm, start + np.linspace(0, 1, steps + 1)[:, None] * (end - start), table)
+    return collision[1] if collision else ""
 
 
 def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> list[str]:
