@@ -68,7 +68,7 @@ def test_heavier_links_leave_less_effort_for_the_motion(arm):
     ]
     assert efforts
     assert motion_violations(moves, arm, replace(limits, effort=1.0), same) == []
-    with pytest.raises(ExcitationError, match="no motion meets all limits: the effort of .* exceeds 60 %"):
+    with pytest.raises(ExcitationError, match=r"no motion meets all limits: the effort of .* exceeds 60 %"):
         random_motion(arm, limits, PERIOD, 4, np.random.default_rng(0), heavy)
 
 
