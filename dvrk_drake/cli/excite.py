@@ -20,6 +20,7 @@ def excite(
     *,
     arm: Arm,
     output: Annotated[str, Parameter(metavar="MOTION.yaml")],
+    model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
     csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
     rate: Annotated[float, Parameter(metavar="HZ")] = DEFAULT_RATE,
     duration: Seconds = 30.0,
@@ -42,6 +43,8 @@ def excite(
 
     Args:
         output: Motion file to write.
+        model: Earlier model of the arm, written by identify. It replaces the parameters and the gravity vector of the
+            arm, and the motion gives the most additional information. Default: no earlier model.
         csv: File for the positions and velocities over time, for other programs.
         rate: Rate of the rows of --csv, 1 to 10000.
         duration: Duration of the motion, rounded up to whole periods.
@@ -70,7 +73,10 @@ def excite(
     limits = dvrk.MotionLimits(
         margin=margin, traverse_time=traverse_time, effort=effort, positions=_positions(position or []), table=table
     )
+    if model is not None and gravity is not None:
+        raise ExcitationError("--gravity cannot be used with --model, because the model contains the gravity vector")
     moved = mounted(dvrk.load_arm(arm), gravity, None)
+    earlier = None if model is None else dvrk.IdentifiedModel.load(model, moved)
     with Steps("optimising") as steps:
         design = dvrk.design_excitation(
             moved,
@@ -78,6 +84,7 @@ def excite(
             period=period,
             harmonics=harmonics,
             limits=limits,
+            model=earlier,
             starts=starts,
             seed=seed,
             progress=steps,

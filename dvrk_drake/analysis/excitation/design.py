@@ -14,7 +14,8 @@ from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
 from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, first_collision, motion_violations
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
@@ -71,6 +72,7 @@ def design_excitation(
     period: float = 15.0,
     harmonics: int = 12,
     limits: MotionLimits | None = None,
+    model: IdentifiedModel | None = None,
     starts: int = 4,
     seed: int = 0,
     progress: Progress | None = None,
@@ -88,12 +90,15 @@ def design_excitation(
         period: Period [s].
         harmonics: Number of harmonics, 2 to 20.
         limits: Limits of the motion. None: the defaults of `MotionLimits`.
+        model: Earlier model of the arm. Its parameters and gravity vector replace those of `arm`, for the effort limits
+            and for the expected results. The motion gives the most information in addition to that of the model, see
+            `MotionInformation`.
         starts: Number of random motions from which the optimisation starts.
         seed: Seed of the random motions.
         progress: Callback that receives the name of the step ("optimising") and the finished share (0 to 1).
 
     Raises:
-        ExcitationError: An argument is out of range, or no motion meets the limits.
+        ExcitationError: An argument is out of range, the model is that of another arm, or no motion meets the limits.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -114,20 +119,29 @@ def design_excitation(
             raise ExcitationError(f"{name} is {value:g}; allowed: {lowest:g} to {highest:g}")
     limits = limits or MotionLimits()
     limits.of_arm(arm)
+    if model is not None:
+        if (model.arm.name, model.arm.joint_names) != (arm.name, arm.joint_names):
+            raise ExcitationError(
+                f"the model is for {model.arm.name} with the joints {', '.join(model.arm.joint_names)}; allowed: a "
+                f"model of {arm.name} with the joints {', '.join(arm.joint_names)}"
+            )
+        arm = arm.with_gravity(model.arm.gravity.tolist())
+        # A copy has no compiled functions, which cannot be sent to another process.
+        model = replace(model)
     if collision := first_collision(arm, _center(arm, limits, np.random.default_rng(seed))[None], limits.table):
         raise ExcitationError(f"{arm.name}: no motion meets all limits: {collision[1]} in the middle of the motion")
     share = step_progress(progress, "optimising")
     share(0.0)
-    problems = [_Problem(arm, limits, period, harmonics, seed + k) for k in range(starts)]
+    problems = [_Problem(arm, limits, model, period, harmonics, seed + k) for k in range(starts)]
     results = []
     for result in _in_parallel(problems, share):
         results.append(result)
         share(0.9 * len(results) / starts)
     best = min(results, key=lambda result: result[1])
-    motion = contracted(best[0], arm, limits)
+    motion = contracted(best[0], arm, limits, model)
     motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)), table=limits.table)
     share(1.0)
-    information = MotionInformation(arm, limits)
+    information = MotionInformation(arm, limits, model)
     state = state_of(motion, INFORMATION_TIMES * harmonics)
     return ExcitationDesign(
         motion=motion,
@@ -146,7 +160,12 @@ def state_of(motion: PeriodicMotion, count: int) -> NDArray[np.float64]:
 
 
 def random_motion(
-    arm: Arm, limits: MotionLimits, period: float, harmonics: int, generator: np.random.Generator
+    arm: Arm,
+    limits: MotionLimits,
+    period: float,
+    harmonics: int,
+    generator: np.random.Generator,
+    model: IdentifiedModel | None = None,
 ) -> PeriodicMotion:
     """Returns a random Fourier motion that nearly reaches the limits.
 
@@ -160,7 +179,7 @@ def random_motion(
     weights = np.hstack([sine @ basis.sines[:, : harmonics - 1], cosine @ basis.cosines[:, harmonics - 1 :]])
     coefficients = np.column_stack([center, weights])
     coefficients[:, 1:] *= _joint_scales(coefficients, basis, arm, limits)[:, None]
-    coefficients[:, 1:] *= _largest_scale(coefficients, basis, arm, limits)
+    coefficients[:, 1:] *= _largest_scale(coefficients, basis, PredictedEffort(arm, model), limits)
     return PeriodicMotion.of_coefficients(arm, basis, coefficients, 1)
 
 
@@ -174,14 +193,16 @@ def _center(arm: Arm, limits: MotionLimits, generator: np.random.Generator) -> N
     return np.asarray(np.clip(center, middle - 0.5 * half, middle + 0.5 * half))
 
 
-def contracted(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> PeriodicMotion:
+def contracted(
+    motion: PeriodicMotion, arm: Arm, limits: MotionLimits, model: IdentifiedModel | None = None
+) -> PeriodicMotion:
     """Returns the motion after the smallest contraction towards its centre with which it meets all limits.
 
     Raises:
         ExcitationError: The motion does not meet the limits after `_MAX_CONTRACTIONS` contractions.
     """
     for _ in range(_MAX_CONTRACTIONS):
-        violations = motion_violations(motion, arm, limits)
+        violations = motion_violations(motion, arm, limits, model)
         if not violations:
             return motion
         sine, cosine = ((_CONTRACTION * np.array(x)).tolist() for x in (motion.sine, motion.cosine))
@@ -195,6 +216,7 @@ class _Problem:
 
     arm: Arm
     limits: MotionLimits
+    model: IdentifiedModel | None
     period: float
     harmonics: int
     seed: int
@@ -202,13 +224,14 @@ class _Problem:
     def solve(self) -> tuple[PeriodicMotion, float, float]:
         """Returns the motion, its expected error, and the expected error of the random motion."""
         arm, basis = self.arm, FourierBasis.of(self.period, self.harmonics)
-        information = MotionInformation(arm, self.limits)
-        start = random_motion(arm, self.limits, self.period, self.harmonics, np.random.default_rng(self.seed))
+        information = MotionInformation(arm, self.limits, self.model)
+        generator = np.random.default_rng(self.seed)
+        start = random_motion(arm, self.limits, self.period, self.harmonics, generator, self.model)
         n, size, unit = arm.num_joints, 2 * self.harmonics - 1, information.scales[0]
         program = MathematicalProgram()
         x = program.NewContinuousVariables(n, size, "x")
         _add_joint_limits(program, x, unit, basis, arm, self.limits)
-        _add_effort_limits(program, x, unit, basis, arm, self.limits)
+        _add_effort_limits(program, x, basis, information)
         values = basis.values(_times(basis, INFORMATION_TIMES))[:3]
 
         def cost(variables: NDArray) -> object:
@@ -286,21 +309,15 @@ def _add_joint_limits(
 
 
 def _add_effort_limits(
-    program: MathematicalProgram,
-    x: NDArray,
-    unit: NDArray[np.float64],
-    basis: FourierBasis,
-    arm: Arm,
-    limits: MotionLimits,
+    program: MathematicalProgram, x: NDArray, basis: FourierBasis, information: MotionInformation
 ) -> None:
-    """Adds the constraints on the efforts of the SDF, relative to their limits."""
-    regressor, allowed = DynamicRegressor(arm), _USED_EFFORT * _effort_without_friction(arm, limits)
-    values, n = basis.values(_times(basis, LIMIT_TIMES))[:3], arm.num_joints
-    scales = MotionInformation(arm, limits).scales
+    """Adds the constraints on the predicted efforts, relative to their limits."""
+    predicted, scales = information.predicted, information.scales
+    allowed, unit = _USED_EFFORT * _effort_without_friction(predicted, information.limits), scales[0]
+    values, n = basis.values(_times(basis, LIMIT_TIMES))[:3], len(allowed)
 
     def effort(state: NDArray[np.float64]) -> NDArray[np.float64]:
-        q, v, vd = state
-        return regressor.torque(q, v, vd, regressor.values) / allowed
+        return predicted.without_dry_friction(*state) / allowed
 
     def constraint(variables: NDArray) -> object:
         is_gradient = variables.dtype == object
@@ -325,15 +342,15 @@ def _add_effort_limits(
     program.AddConstraint(constraint, lb=-bound, ub=bound, vars=x.ravel())
 
 
-def _effort_without_friction(arm: Arm, limits: MotionLimits) -> NDArray[np.float64]:
+def _effort_without_friction(predicted: PredictedEffort, limits: MotionLimits) -> NDArray[np.float64]:
     """Returns the largest joint efforts (n,) without dry friction [N m, N].
 
     Raises:
         ExcitationError: The dry friction of a joint exceeds the limit.
     """
-    allowed = limits.of_arm(arm).effort - arm.dry_friction()
+    allowed = limits.of_arm(predicted.arm).effort - predicted.dry_friction
     if np.any(allowed <= 0):
-        name = arm.joint_names[int(np.argmin(allowed))]
+        name = predicted.arm.joint_names[int(np.argmin(allowed))]
         raise ExcitationError(f"{name}: the dry friction exceeds {100 * limits.effort:g} % of the effort limit")
     return np.asarray(allowed)
 
@@ -350,15 +367,25 @@ def _joint_scales(
     return np.asarray(_USED * np.min(allowed / x, axis=0))
 
 
-def _largest_scale(coefficients: NDArray[np.float64], basis: FourierBasis, arm: Arm, limits: MotionLimits) -> float:
+def _largest_scale(
+    coefficients: NDArray[np.float64], basis: FourierBasis, predicted: PredictedEffort, limits: MotionLimits
+) -> float:
     """Returns the largest factor up to 1 with which the motion meets the coupled limits and the effort limits."""
+    arm = predicted.arm
     joints, values = limits.of_arm(arm), basis.values(_times(basis, LIMIT_TIMES))
-    regressor, allowed = DynamicRegressor(arm), _effort_without_friction(arm, limits)
+    allowed = _effort_without_friction(predicted, limits)
     for scale in 0.95 ** np.arange(100):
         scaled = np.column_stack([coefficients[:, 0], scale * coefficients[:, 1:]])
         q, v, vd = _state(values[:3], scaled)
         positions = q @ joints.A.T
-        tau = regressor.torque(q, v, vd, regressor.values)
+        tau = predicted.without_dry_friction(q, v, vd)
         if np.all((positions >= joints.lower) & (positions <= joints.upper)) and np.all(np.abs(tau) <= allowed):
             return float(scale)
-    raise ExcitationError(f"{arm.name}: no random motion meets the limits")
+    j = int(np.argmax(np.abs(tau).max(axis=0) / allowed))
+    reason = "the middle of the motion exceeds a position limit"
+    if np.abs(tau[:, j]).max() > allowed[j]:
+        reason = (
+            f"the effort of {arm.joint_names[j]} in the middle of the motion, including dry friction, exceeds "
+            f"{100 * limits.effort:g} % of the effort limit"
+        )
+    raise ExcitationError(f"{arm.name}: no motion meets all limits: {reason}")

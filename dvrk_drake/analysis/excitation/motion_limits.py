@@ -12,9 +12,11 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import add_arm, inverse_dynamics, make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
@@ -146,16 +148,19 @@ def path_collision(arm: Arm, q_start: ArrayLike, q_end: ArrayLike, table: float 
     return collision[1] if collision else ""
 
 
-def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> list[str]:
+def motion_violations(
+    motion: PeriodicMotion, arm: Arm, limits: MotionLimits, model: IdentifiedModel | None = None
+) -> list[str]:
     """Returns a message for each limit that a motion exceeds, evaluated at 1 kHz.
 
     The check uses only the positions of the motion. Velocities, accelerations and jerks are their spectral derivatives,
-    and efforts are Drake's inverse dynamics of the SDF.
+    and efforts are computed with Drake's inverse dynamics.
 
     Args:
         motion: Motion of the arm.
         arm: Arm to move.
         limits: Limits of the motion.
+        model: Model that predicts the efforts, see `PredictedEffort`. None: the SDF.
     """
     joints = limits.of_arm(arm)
     count = max(round(CHECK_RATE * motion.period), 4 * len(motion.sine[0]))
@@ -163,7 +168,8 @@ def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) ->
     q = motion.evaluate(t).q
     v, vd, jerk = (spectral_derivative(q, motion.period, order) for order in (1, 2, 3))
     names: Sequence[str] = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
-    effort = inverse_dynamics(arm, q, v, vd)
+    predicted = PredictedEffort(arm, model)
+    effort = np.abs(predicted.by_drake(q, v, vd)) + predicted.dry_friction
     checks: list[tuple[str, Sequence[str], NDArray, NDArray, NDArray]] = [
         ("position", names, q @ joints.A.T, joints.lower, joints.upper),
         *(
@@ -172,7 +178,7 @@ def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) ->
                 ("speed", v, joints.speed),
                 ("acceleration", vd, joints.acceleration),
                 ("jerk", jerk, joints.jerk),
-                ("effort", np.abs(effort) + arm.dry_friction(), joints.effort),
+                ("effort", effort, joints.effort),
             )
         ),
     ]
