@@ -7,15 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import HalfSpace
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
-from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.analysis.excitation.collisions import first_collision
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import add_arm, inverse_dynamics, make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import inverse_dynamics, make_arm_plant, set_arm_positions
 from dvrk_drake.models.schema_fault import number_fault, within
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
@@ -162,43 +159,6 @@ def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) ->
         row, what = collision
         messages.append(f"{what} at {row / COLLISION_RATE:.2f} s")
     return messages
-
-
-def first_collision(arm: Arm, q: NDArray[np.float64], table: float | None = None) -> tuple[int, str] | None:
-    """Returns the index of the first pose with a collision and its description, or None.
-
-    Pairs of links that touch in every arm are ignored, as stated by the collision filters of the SDF.
-
-    Args:
-        arm: Arm with collision shapes.
-        q: Poses (m, n) [rad, m].
-        table: Height of a table in the base frame [m], or None.
-    """
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
-    add_arm(plant, arm)
-    if table is not None:
-        shape = HalfSpace()
-        plant.RegisterCollisionGeometry(
-            plant.world_body(), RigidTransform([0.0, 0.0, table]), shape, "table", CoulombFriction()
-        )
-    plant.Finalize()
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    query_port, inspector = scene_graph.get_query_output_port(), scene_graph.model_inspector()
-    graph_context, plant_context = (system.GetMyMutableContextFromRoot(context) for system in (scene_graph, plant))
-    for i, pose in enumerate(q):
-        set_arm_positions(plant, plant_context, arm, pose)
-        for pair in query_port.Eval(graph_context).ComputePointPairPenetration():
-            ids = pair.id_A, pair.id_B
-            bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in ids]
-            # The base is mounted at the table.
-            fixed = {plant.world_body().name(), "base_link"}
-            if {body.name() for body in bodies} <= fixed:
-                continue
-            names = ["the table" if body.index() == plant.world_body().index() else body.name() for body in bodies]
-            return i, f"collision of {' and '.join(sorted(names, key=lambda name: name == 'the table'))}"
-    return None
 
 
 def spectral_derivative(x: NDArray[np.float64], period: float, order: int) -> NDArray[np.float64]:
