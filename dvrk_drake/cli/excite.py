@@ -30,7 +30,7 @@ def excite(
     seed: Seed = 0,
     margin: Annotated[float, Parameter(metavar="SHARE")] = 0.05,
     traverse_time: Seconds = 1.0,
-    effort: Annotated[float, Parameter(metavar="SHARE")] = 0.6,
+    effort: Annotated[float, Parameter(metavar="SHARE")] = 0.8,
     position: Annotated[list[str] | None, Parameter(metavar="JOINT=LOWER:UPPER ..", consume_multiple=True)] = None,
     table: Annotated[float | None, Parameter(metavar="Z")] = None,
     gravity: Gravity = None,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError
+from dvrk_drake.models.approach import effort_approach
 from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
@@ -18,10 +19,6 @@ from dvrk_drake.recordings.pose_file import CollectionFile
 
 #: Time over which measurements are averaged [s].
 MEASURE = 0.25
-#: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
-#: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
-#: the approach.
-APPROACH = 0.3
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ class Collector(ArmMover):
         self.done = output.finished(poses)
         self._poses, self._output, self._settings = poses, output, settings
         super().__init__(controller, settings.traverse_time, stopped=stopped, report=report)
-        self._approach = APPROACH * self._arm.effort_limits / np.asarray(self._arm.gains.kp)
+        self._approach = effort_approach(self._arm)
         # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import ControlModel
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
+from dvrk_drake.models.approach import range_approach
 from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, REST, REST_TIME, SETTLE, Steps
@@ -38,9 +39,6 @@ GOAL_PERIOD = 0.1
 #: Time without progress towards the goal after which a motion is stopped [s]. Smallest progress, as a fraction of the
 #: range of the joint.
 STALL, _PROGRESS = 2.0, 0.005
-#: Length of an approach, as a fraction of the range of the joint. Dry friction is elastic at first, so a short approach
-#: does not reverse it completely. Random poses have at least a tenth of the range on both sides.
-_APPROACH = 0.08
 #: Speed of an approach as a fraction of the speed of other motions. A fast approach would end with an overshoot, which
 #: changes the friction at the pose.
 _APPROACH_SPEED = 0.4
@@ -292,7 +290,7 @@ def approaches(arm: Arm, pose: NDArray[np.float64], settings: CollectionSettings
     """Returns the pose (n,) at which each approach to `pose` begins, or None for an approach from anywhere."""
     if not settings.both_sides:
         return [None]
-    offset = _APPROACH * (arm.position_upper - arm.position_lower)
+    offset = range_approach(arm)
     return [offset_pose(arm, pose, side * offset) for side in (-1, 1)]
 
 

@@ -7,16 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.geometry import HalfSpace
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
-from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.analysis.excitation.collisions import first_collision
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
@@ -54,7 +51,7 @@ class MotionLimits:
     speed: tuple[float, float] = field(default=(3.0, 0.2), metadata=within(1e-3, 100.0, "rad/s or m/s"))
     speed_time: float = field(default=0.2, metadata=within(0.01, 100.0, "s"))
     acceleration_time: float = field(default=0.1, metadata=within(0.001, 100.0, "s"))
-    effort: float = field(default=0.6, metadata=within(0.05, 1.0))
+    effort: float = field(default=0.8, metadata=within(0.05, 1.0))
     positions: dict[str, tuple[float, float]] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
     tip_box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
@@ -198,43 +195,6 @@ def motion_violations(
         row, what = collision
         messages.append(f"{what} at {row / COLLISION_RATE:.2f} s")
     return messages
-
-
-def first_collision(arm: Arm, q: NDArray[np.float64], table: float | None = None) -> tuple[int, str] | None:
-    """Returns the index of the first pose with a collision and its description, or None.
-
-    Pairs of links that touch in every arm are ignored, as stated by the collision filters of the SDF.
-
-    Args:
-        arm: Arm with collision shapes.
-        q: Poses (m, n) [rad, m].
-        table: Height of a table in the base frame [m], or None.
-    """
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
-    add_arm(plant, arm)
-    if table is not None:
-        shape = HalfSpace()
-        plant.RegisterCollisionGeometry(
-            plant.world_body(), RigidTransform([0.0, 0.0, table]), shape, "table", CoulombFriction()
-        )
-    plant.Finalize()
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    query_port, inspector = scene_graph.get_query_output_port(), scene_graph.model_inspector()
-    graph_context, plant_context = (system.GetMyMutableContextFromRoot(context) for system in (scene_graph, plant))
-    for i, pose in enumerate(q):
-        set_arm_positions(plant, plant_context, arm, pose)
-        for pair in query_port.Eval(graph_context).ComputePointPairPenetration():
-            ids = pair.id_A, pair.id_B
-            bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in ids]
-            # The base is mounted at the table.
-            fixed = {plant.world_body().name(), "base_link"}
-            if {body.name() for body in bodies} <= fixed:
-                continue
-            names = ["the table" if body.index() == plant.world_body().index() else body.name() for body in bodies]
-            return i, f"collision of {' and '.join(sorted(names, key=lambda name: name == 'the table'))}"
-    return None
 
 
 def spectral_derivative(x: NDArray[np.float64], period: float, order: int) -> NDArray[np.float64]:

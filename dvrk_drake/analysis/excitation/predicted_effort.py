@@ -18,18 +18,24 @@ from dvrk_drake.models.plant import inverse_dynamics
 
 @dataclass(frozen=True, eq=False)
 class PredictedEffort:
-    """Efforts of an arm according to its SDF or to an identified model.
+    """Efforts of an arm according to its files or to an identified model.
 
-    A model with dynamics replaces the parameters of the SDF and the friction in the arm file. A model without dynamics
-    replaces the holding efforts. Friction that depends on load or position is not included.
+    A model with dynamics replaces the parameters of the SDF, and the friction, cables and springs in the arm file. A
+    model without dynamics replaces the holding efforts. Friction that depends on load or position is not included.
 
     Attributes:
         arm: Arm that moves, with the gravity vector of the model.
-        model: Identified model of the arm, or None.
+        model: Identified model of the arm. None: SDF, friction, cables and springs of the arm's files.
     """
 
     arm: Arm
     model: IdentifiedModel | None = None
+
+    @cached_property
+    def _known(self) -> IdentifiedModel:
+        """The model, or a model without dynamics of the arm's files."""
+        springs = self.arm.effects.cables + self.arm.effects.springs
+        return self.model or IdentifiedModel.from_arm(self.arm, springs)
 
     @cached_property
     def regressor(self) -> DynamicRegressor:
@@ -59,14 +65,11 @@ class PredictedEffort:
         Args:
             q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the joints.
         """
-        tau = self.regressor.torque(q, v, vd, self.parameters)
-        return tau if self.model is None else tau + self._correction(q, v)
+        return self.regressor.torque(q, v, vd, self.parameters) + self._correction(q, v)
 
     def by_drake(self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the same efforts as `without_dry_friction`, computed with Drake's inverse dynamics."""
-        if self.model is None:
-            return inverse_dynamics(self.arm, q, v, vd)
-        if self.model.dynamics is None:
+        if self.model is None or self.model.dynamics is None:
             return inverse_dynamics(self.arm, q, v, vd) + self._correction(q, v)
         J, rotors = self.arm.transmission, np.array([rotor.value for rotor in self.model.dynamics.rotors])
         inertias = {link.link: link.to_spatial_inertia() for link in self.model.dynamic_model.links}
@@ -79,11 +82,11 @@ class PredictedEffort:
         These are the cables, springs, offsets and viscous friction of a model with dynamics, and the difference between
         the holding efforts of the model and of the SDF otherwise.
         """
-        assert self.model is not None
-        if self.model.dynamics is None:
+        model = self._known
+        if model.dynamics is None:
             rest = np.zeros_like(q)
             of_sdf = self.regressor.torque(q, rest, rest, self.parameters)
-            return self.model.static_model.torque(q, self.model.theta) - of_sdf
+            return model.static_model.torque(q, model.theta) - of_sdf
         tau = np.zeros(q.shape)
         for effect in self._effects:
             if effect.kind == "viscous" or effect.kind in POSITION_KINDS:
