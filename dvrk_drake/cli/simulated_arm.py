@@ -91,7 +91,7 @@ def arm(
         return
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
-    start = start_pose(simulated_arm, pose)
+    start = start_pose(simulated_arm, pose, simulated_effects)
     url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
     print(f"starting the simulated {simulated_arm.name}", flush=True)
     with interrupt_ends_process():
@@ -126,7 +126,7 @@ def _run_ros_arm(
     if options.rate is not None:
         driver.rate = options.rate
         driver.check()
-    start = start_pose(arm, pose)
+    start = start_pose(arm, pose, effects)
     print(f"starting the simulated {arm.name}", flush=True)
     if realtime:
         for warning in make_realtime():
