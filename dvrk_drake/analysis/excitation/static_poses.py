@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, candidate_effects
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, MIN_TORQUE
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.approach import effort_approach, range_approach
 from dvrk_drake.models.arm import Arm
@@ -26,7 +27,7 @@ from dvrk_drake.recordings.pose_file import save_poses
 
 #: Number of random poses from which the poses are selected, largest number of random poses that are drawn for this
 #: pool, and largest number of selected poses.
-POOL, MAX_DRAWN, MAX_POSES = 1500, 300_000, 300
+POOL, MAX_DRAWN, MAX_POSES = 1500, 30_000, 300
 #: Margin of the default limits, as for random poses of `collect`: there is room to approach a pose from both sides.
 MARGIN = 0.1
 #: Smallest share of an approach offset of a joint that must remain inside the limits, on both sides.
@@ -180,16 +181,16 @@ class PoseInformation:
 
     @cached_property
     def effort(self) -> NDArray[np.float64]:
-        """RMS holding efforts (n,) at random poses of the workspace, according to SDF, cables and springs.
+        """RMS holding efforts (n,) at random poses of the workspace, according to the SDF.
 
         The value is at least `MIN_TORQUE` times the effort limit.
         """
-        nominal = IdentifiedModel.from_arm(self.arm, self.arm.effects.cables + self.arm.effects.springs)
-        rms = np.sqrt(np.mean(nominal.holding_torque(self._targets) ** 2, axis=0))
+        zero = np.zeros_like(self._targets)
+        rms = np.sqrt(np.mean(inverse_dynamics(self.arm, self._targets, zero, zero) ** 2, axis=0))
         return np.asarray(np.maximum(rms, MIN_TORQUE * self.arm.effort_limits))
 
     @cached_property
-    def _effects(self) -> list:
+    def _effects(self) -> list[ActuatorEffect]:
         return [effect for group in candidate_effects(self._problem) for effect in group]
 
     @cached_property
@@ -209,9 +210,7 @@ class PoseInformation:
         The unknowns are divided by their prior standard deviations, the efforts by their measurement errors.
         """
         return np.asarray(
-            self._problem.regressor(self._effects)
-            * self._deviations
-            / (EFFORT_ERROR * self.arm.effort_limits[:, None])
+            self._problem.regressor(self._effects) * self._deviations / (EFFORT_ERROR * self.arm.effort_limits[:, None])
         )
 
     @cached_property
@@ -224,7 +223,7 @@ class PoseInformation:
     def covariance(self, chosen: list[int] | NDArray[np.int_]) -> NDArray[np.float64]:
         """Returns the covariance (p, p) of the scaled unknowns after the measurement of some poses of the pool."""
         X = self.columns[chosen].reshape(-1, len(self._deviations))
-        return np.linalg.inv(X.T @ X + np.eye(X.shape[1]))
+        return np.asarray(np.linalg.inv(X.T @ X + np.eye(X.shape[1])))
 
     def expected_error(self, chosen: list[int] | NDArray[np.int_]) -> float:
         """Returns the expected RMS error of predicted holding efforts, relative to the RMS holding efforts [1].
@@ -309,7 +308,7 @@ class PoseChecker:
         """
         n, drawn = self._arm.num_joints, 0
         poses, reasons = np.empty((0, n)), Counter[str]()
-        while len(poses) < size and drawn < (MAX_DRAWN if len(poses) < least else MAX_DRAWN // 10):
+        while len(poses) < size and drawn < MAX_DRAWN:
             q = generator.uniform(self._joints.lower[:n], self._joints.upper[:n], (size, n))
             drawn += size
             found = self.violations(q)
@@ -420,7 +419,7 @@ def _ordered(
             if a in index and b in index:
                 travel[index[a], index[b]] = _BLOCKED
         order = [chosen[i] for i in short_path(travel)]
-        pairs = list(zip(order, order[1:], strict=False))
+        pairs = list(pairwise(order))
         if any(pair in blocked for pair in pairs):
             ends = Counter(k for pair in blocked for k in pair if k in index)
             return order, [ends.most_common(1)[0][0]]
