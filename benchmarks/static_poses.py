@@ -6,8 +6,8 @@ The links of each simulated arm differ from those of the SDF, with a standard de
 torques of cables and springs are 0 to 100 % of those in the arm file, and the friction is 50 % to 150 %. Each pose is
 approached from below and from above, at the distances of `collect --ros`. Friction is elastic before it slides, so it
 does not cancel completely. The noise of the averaged efforts is 0.5 % of the effort limits. The random poses are those
-of `collect --random`. The models are tested at 200 random poses of the whole workspace. An error is relative to the RMS holding
-effort of the joint, or to 2 % of its effort limit if the RMS holding effort is smaller.
+of `collect --random`. The models are tested at 200 random poses of the whole workspace. An error is relative to the RMS
+holding effort of the joint, or to 2 % of its effort limit if the RMS holding effort is smaller.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ def compare(arm: Arm, arms: int, count: int) -> None:
     start = time.perf_counter()
     design = dvrk.design_poses(arm, count)
     print(f"{arm.name}: design of {count} poses in {time.perf_counter() - start:.0f} s", flush=True)
-    errors: dict[str, list[np.ndarray]] = {"designed": [], "random": []}
-    duration: dict[str, list[float]] = {"designed": [], "random": []}
+    names = [f"{count} designed", f"{count} random", f"{3 * count // 2} random"]
+    errors: dict[str, list[np.ndarray]] = {which: [] for which in names}
+    duration: dict[str, list[float]] = {which: [] for which in names}
     residuals, signs = [], np.array(list(itertools.product((1.0, -1.0), repeat=arm.num_joints - 1)))
     signs = np.column_stack([np.ones(len(signs)), signs])
     for seed in range(arms):
@@ -62,31 +63,32 @@ def compare(arm: Arm, arms: int, count: int) -> None:
         truth, friction = simulated_arm(arm, rng)
         test = arm.sample_poses(TESTS, rng)
         expected = holding(truth, test)
-        size = np.maximum(np.sqrt(np.mean(expected**2, axis=0)), MIN_TORQUE * arm.effort_limits)
-        for which, poses in (("designed", design.poses), ("random", arm.sample_poses(count, rng, margin=0.1))):
+        scale = np.maximum(np.sqrt(np.mean(expected**2, axis=0)), MIN_TORQUE * arm.effort_limits)
+        others = [arm.sample_poses(size, rng, margin=0.1) for size in (count, 3 * count // 2)]
+        for which, poses in zip(names, (design.poses, *others), strict=True):
             average = averaged_friction(arm, friction, poses)
             tau = holding(truth, poses) + average + NOISE * arm.effort_limits * rng.normal(size=poses.shape)
             model = identify_static(dvrk.Recording(q=poses, tau=tau, source="simulated"), arm).model
             error = model.holding_torque(test) - expected
-            errors[which].append(np.sqrt(np.mean(error**2, axis=0)) / size)
+            errors[which].append(np.sqrt(np.mean(error**2, axis=0)) / scale)
             duration[which].append(estimated_duration(arm, poses[0], poses, CrtkCollectionSettings()) / 60)
         # Friction that the average does not cancel, for equal signs (first row) and for all other sign patterns.
         own = np.sum([abs(e.coefficient * joint_row(arm, e.coordinate)) for e in friction], axis=0)
         left = [averaged_friction(arm, friction, design.poses, pattern) for pattern in signs]
         residuals.append([np.sqrt(np.mean(np.square(x), axis=0)) / own for x in left])
         print(f"arm {seed + 1} of {arms}", file=sys.stderr, flush=True)
-    expected_errors = {"designed": design.expected_error, "random": design.random_error}
+    expectations = (f"{100 * design.expected_error:.1f}", f"{100 * design.random_error:.1f}", "")
     rows = {
         which: [
-            f"{100 * expected_errors[which]:.1f}",
+            expectation,
             *(f"{100 * x:.1f}" for x in np.mean(of, axis=0)),
             f"{100 * np.mean(of):.1f}",
             f"{100 * np.mean(np.max(of, axis=1)):.1f}",
             f"{np.mean(duration[which]):.1f}",
         ]
-        for which, of in errors.items()
+        for (which, of), expectation in zip(errors.items(), expectations, strict=True)
     }
-    headings = ["expected", *arm.joint_names, "mean", "worst joint", "duration [min]"]
+    headings = ["expected mean", *arm.joint_names, "mean", "worst joint", "duration [min]"]
     print_table(
         f"{arm.name}: relative error of holding efforts at {TESTS} unseen poses of {arms} arms [%]", headings, rows
     )
