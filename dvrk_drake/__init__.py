@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.check.recording_check import check
     from dvrk_drake.analysis.excitation.design import design_excitation
     from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+    from dvrk_drake.analysis.excitation.static_poses import design_poses
     from dvrk_drake.analysis.identification import identify
     from dvrk_drake.analysis.payload.payload import payload
     from dvrk_drake.analysis.recalibration import recalibrate
@@ -50,6 +51,7 @@ _MODULES = {
     "add_closed_loop": "systems.closed_loop",
     "check": "analysis.check.recording_check",
     "design_excitation": "analysis.excitation.design",
+    "design_poses": "analysis.excitation.static_poses",
     "export_model": "export.model_export",
     "identify": "analysis.identification",
     "load_arm": "models.arm_files",
@@ -80,6 +82,7 @@ __all__ = [
     "add_closed_loop",
     "check",
     "design_excitation",
+    "design_poses",
     "export_model",
     "identify",
     "load_arm",

@@ -1,7 +1,8 @@
-"""Command that designs a motion for the identification of an arm."""
+"""Command that designs a motion or static poses for the identification of an arm."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -19,40 +20,44 @@ DEFAULT_RATE = 200.0
 def excite(
     *,
     arm: Arm,
-    output: Annotated[str, Parameter(metavar="MOTION.yaml")],
+    output: Annotated[str, Parameter(metavar="FILE.yaml")],
+    static: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
     model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
     csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
-    rate: Annotated[float, Parameter(metavar="HZ")] = DEFAULT_RATE,
-    duration: Seconds = 30.0,
-    period: Seconds = 15.0,
-    harmonics: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 12,
-    starts: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 4,
+    rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
+    duration: Seconds | None = None,
+    period: Seconds | None = None,
+    harmonics: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
+    starts: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
     seed: Seed = 0,
-    margin: Annotated[float, Parameter(metavar="SHARE")] = 0.05,
-    traverse_time: Seconds = 1.0,
+    margin: Annotated[float | None, Parameter(metavar="SHARE")] = None,
+    traverse_time: Seconds | None = None,
     effort: Annotated[float, Parameter(metavar="SHARE")] = 0.8,
     position: Annotated[list[str] | None, Parameter(metavar="JOINT=LOWER:UPPER ..", consume_multiple=True)] = None,
     table: Annotated[float | None, Parameter(metavar="Z")] = None,
     gravity: Gravity = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Design a motion for the identification of an arm.
+    """Design a motion or static poses for the identification of an arm.
 
     The motion is periodic, at rest at both ends, and within all limits. It minimises the expected error of the efforts
-    that an identified model predicts in random states of the workspace.
+    that an identified model predicts in random states of the workspace. With --static, the command selects poses for
+    collect instead of a motion. The poses minimise the expected error of predicted holding efforts.
 
     Args:
-        output: Motion file to write.
+        output: Motion file or pose file to write.
+        static: Select N static poses, 8 to 300.
         model: Earlier model of the arm, written by identify. It replaces the parameters and the gravity vector of the
             arm, and the motion gives the most additional information. Default: no earlier model.
         csv: File for the positions and velocities over time, for other programs.
-        rate: Rate of the rows of --csv, 1 to 10000.
-        duration: Duration of the motion, rounded up to whole periods.
-        period: Period of the motion.
-        harmonics: Number of harmonics, 2 to 20.
-        starts: Number of random motions from which the optimisation starts.
-        margin: Share of each position range that is not used, at each end, 0 to 0.4.
+        rate: Rate of the rows of --csv, 1 to 10000. Default: 200.
+        duration: Duration of the motion, rounded up to whole periods. Default: 30.
+        period: Period of the motion. Default: 15.
+        harmonics: Number of harmonics, 2 to 20. Default: 12.
+        starts: Number of random motions from which the optimisation starts. Default: 4.
+        margin: Share of each position range that is not used, at each end, 0 to 0.4. Default: 0.05, with --static 0.1.
         traverse_time: Shortest time in which a joint may cross its position range. It determines the speed limits.
+            Default: 1.
         effort: Largest predicted effort, as a share of the effort limits, 0.05 to 1.
         position: Additional position limits [rad, m], e.g. insertion=0.05:0.2.
         table: Height of a table in the base frame [m].
@@ -62,16 +67,36 @@ def excite(
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console, print_answer
 
-    quiet_drake()
-    if csv is None and rate != DEFAULT_RATE:
+    of_motion = {
+        "model": model,
+        "csv": csv,
+        "rate": rate,
+        "duration": duration,
+        "period": period,
+        "harmonics": harmonics,
+        "starts": starts,
+        "traverse-time": traverse_time,
+    }
+    if static is not None:
+        if given := [f"--{name}" for name, value in of_motion.items() if value is not None]:
+            raise ExcitationError(f"{' and '.join(given)} cannot be used with --static")
+        check_output(output, overwrite=overwrite)
+        _select_poses(arm, output, static, seed, margin, effort, _positions(position or []), table, gravity)
+        return
+    if csv is None and rate is not None:
         raise ExcitationError("--rate requires --csv")
     check_output(output, overwrite=overwrite)
     if csv is not None:
         check_output(csv, output, overwrite=overwrite)
+    rate = DEFAULT_RATE if rate is None else rate
     if not 1.0 <= rate <= 10_000.0:
         raise ExcitationError(f"--rate is {rate:g}; allowed: 1 to 10000")
     limits = dvrk.MotionLimits(
-        margin=margin, traverse_time=traverse_time, effort=effort, positions=_positions(position or []), table=table
+        margin=0.05 if margin is None else margin,
+        traverse_time=1.0 if traverse_time is None else traverse_time,
+        effort=effort,
+        positions=_positions(position or []),
+        table=table,
     )
     if model is not None and gravity is not None:
         raise ExcitationError("--gravity cannot be used with --model, because the model contains the gravity vector")
@@ -80,12 +105,12 @@ def excite(
     with Steps("optimising") as steps:
         design = dvrk.design_excitation(
             moved,
-            duration=duration,
-            period=period,
-            harmonics=harmonics,
+            duration=30.0 if duration is None else duration,
+            period=15.0 if period is None else period,
+            harmonics=12 if harmonics is None else harmonics,
             limits=limits,
             model=earlier,
-            starts=starts,
+            starts=4 if starts is None else starts,
             seed=seed,
             progress=steps,
         )
@@ -110,6 +135,40 @@ def excite(
     print_written(output)
     if csv is not None:
         print_written(csv)
+
+
+def _select_poses(
+    name: str,
+    output: str,
+    count: int,
+    seed: int,
+    margin: float | None,
+    effort: float,
+    positions: dict[str, tuple[float, float]],
+    table: float | None,
+    gravity: tuple[float, float, float] | None,
+) -> None:
+    """Selects static poses, writes the pose file and prints the expected errors."""
+    from dvrk_drake.analysis.excitation.static_poses import MARGIN
+    from dvrk_drake.reports.terminal_tables import make_console, print_answer
+
+    limits = dvrk.MotionLimits(
+        margin=MARGIN if margin is None else margin, effort=effort, positions=positions, table=table
+    )
+    quiet_drake()
+    arm = mounted(dvrk.load_arm(name), gravity, None)
+    with Steps("selecting poses") as steps:
+        design = dvrk.design_poses(arm, count, limits=limits, seed=seed, progress=steps)
+    design.save(output, overwrite=True)
+    console = make_console()
+    print_answer(
+        console,
+        f"{arm.name}: {count} static poses. Expected error of predicted holding efforts: "
+        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with {count} random poses).",
+        f"dvrk-drake collect --arm {name} --poses {output} --output {Path(output).with_suffix('.csv')}",
+    )
+    console.print(f"Gravity parameters known to 10 %: {design.known_parameters} of {design.num_parameters}.")
+    print_written(output)
 
 
 def _positions(texts: list[str]) -> dict[str, tuple[float, float]]:

@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
@@ -41,6 +42,18 @@ class CollisionDetector:
         self._query_port, self._inspector = scene_graph.get_query_output_port(), scene_graph.model_inspector()
         self._graph_context = scene_graph.GetMyMutableContextFromRoot(self._context)
         self._plant_context = self._plant.GetMyMutableContextFromRoot(self._context)
+
+    def tip(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the position (3,) of the tip in the base frame at a pose (n,) [m].
+
+        Raises:
+            ExcitationError: The arm file does not name the frame of the tip.
+        """
+        if not self._arm.view.tip:
+            raise ExcitationError(f"{self._arm.name}: the arm file does not name a frame of the tip (view.tip)")
+        set_arm_positions(self._plant, self._plant_context, self._arm, pose)
+        frame = self._plant.GetFrameByName(self._arm.view.tip)
+        return np.asarray(frame.CalcPoseInWorld(self._plant_context).translation())
 
     def collision(self, pose: NDArray[np.float64]) -> str:
         """Returns the description of the first collision at a pose (n,), or "" if there is none."""

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.analysis.excitation.collisions import first_collision
+from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
@@ -212,12 +211,5 @@ def tip_positions(arm: Arm, q: NDArray[np.float64]) -> NDArray[np.float64]:
     Raises:
         ExcitationError: The arm file does not name the frame of the tip.
     """
-    if not arm.view.tip:
-        raise ExcitationError(f"{arm.name}: the arm file does not name a frame of the tip (view.tip)")
-    plant = make_arm_plant(arm)
-    context, tip = plant.CreateDefaultContext(), plant.GetFrameByName(arm.view.tip)
-    p = np.empty((len(q), 3))
-    for i, pose in enumerate(q):
-        set_arm_positions(plant, context, arm, pose)
-        p[i] = tip.CalcPoseInWorld(context).translation()
-    return p
+    detector = CollisionDetector(arm)
+    return np.array([detector.tip(pose) for pose in q]).reshape(-1, 3)

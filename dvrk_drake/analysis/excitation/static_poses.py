@@ -1,0 +1,466 @@
+"""Chooses static poses that give the most information about the holding efforts of an arm, within all limits."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.excitation.collisions import CollisionDetector
+from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.analysis.static.effect_selection import StaticProblem, candidate_effects
+from dvrk_drake.analysis.static.static_identification import MIN_POSES, MIN_TORQUE
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.errors import ExcitationError
+from dvrk_drake.models.approach import effort_approach, range_approach
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.coupled_limits import offset_pose
+from dvrk_drake.models.files import refuse_existing
+from dvrk_drake.models.plant import inverse_dynamics
+from dvrk_drake.progress import Progress, step_progress
+from dvrk_drake.recordings.pose_file import save_poses
+
+#: Number of random poses from which the poses are selected, largest number of random poses that are drawn for this
+#: pool, and largest number of selected poses.
+POOL, MAX_DRAWN, MAX_POSES = 1500, 30_000, 300
+#: Margin of the default limits, as for random poses of `collect`: there is room to approach a pose from both sides.
+MARGIN = 0.1
+#: Smallest share of an approach offset of a joint that must remain inside the limits, on both sides.
+MIN_APPROACH = 0.4
+#: Standard deviation of the error of a measured holding effort, as a share of the effort limit.
+EFFORT_ERROR = 0.01
+#: Number of random poses for which holding efforts are predicted, and number of random selections for the comparison.
+NUM_TARGETS, NUM_RANDOM = 2000, 20
+#: Largest distance between two poses at which a straight path is checked, as a share of each position range.
+PATH_STEP = 0.02
+#: Smallest relative reduction of the squared expected error by an exchange.
+_MIN_REDUCTION = 1e-6
+#: Travel that replaces the travel of a blocked path, in units of the position ranges.
+_BLOCKED = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class StaticPoseDesign:
+    """Static poses for `collect` and the information that they give.
+
+    Attributes:
+        arm: Arm of the poses.
+        poses: Poses (m, n) in the order of a short path [rad, m].
+        expected_error: Expected RMS error of the holding efforts that an identified model predicts at random poses of
+            the workspace, relative to the RMS holding efforts, see `PoseInformation.expected_error`.
+        random_error: Median expected error after as many random poses within the same limits.
+        known_parameters: Number of base parameters of gravity with a standard error of at most 10 %.
+        num_parameters: Number of base parameters of gravity.
+    """
+
+    arm: Arm
+    poses: NDArray[np.float64]
+    expected_error: float
+    random_error: float
+    known_parameters: int
+    num_parameters: int
+
+    def __repr__(self) -> str:
+        return (
+            f"<StaticPoseDesign of {self.arm.name}: {len(self.poses)} poses, expected error "
+            f"{100 * self.expected_error:.1f} %>"
+        )
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Writes the poses to a pose file of `collect`.
+
+        Raises:
+            DvrkDrakeError: The file exists and `overwrite` is False, or the file cannot be written.
+        """
+        refuse_existing(path, overwrite)
+        save_poses(self.poses, self.arm, path)
+
+
+def design_poses(
+    arm: Arm,
+    count: int = 40,
+    *,
+    limits: MotionLimits | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> StaticPoseDesign:
+    """Chooses static poses for `identify`, each with room for the approaches from below and from above.
+
+    The poses are selected from random poses within the limits. They minimise the expected error of the holding efforts
+    that the identified model predicts at random poses of the workspace (V-optimality), see `PoseInformation`. The
+    selection adds one pose at a time, and then exchanges single poses until no exchange reduces the error. The order
+    makes the path short. Collisions are checked along all straight paths of a collection in this order.
+
+    Args:
+        arm: Arm to move.
+        count: Number of poses, 8 to 300.
+        limits: Limits of the poses. The limits of speed, acceleration and jerk are not used. None: the defaults of
+            `MotionLimits` with a margin of 10 %, as for random poses of `collect`.
+        seed: Seed of the random poses.
+        progress: Callback that receives the name of the step ("selecting poses") and the finished share (0 to 1).
+
+    Raises:
+        ExcitationError: An argument is out of range, or too few poses meet the limits.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> design = dvrk.design_poses(dvrk.load_arm("mtml"), 20)
+        >>> design.poses.shape
+        (20, 7)
+        >>> design.expected_error < design.random_error
+        True
+        >>> design.save("poses.yaml")
+    """
+    if not MIN_POSES <= count <= MAX_POSES:
+        raise ExcitationError(f"the number of poses is {count}; allowed: {MIN_POSES} to {MAX_POSES}")
+    limits = limits or MotionLimits(margin=MARGIN)
+    share = step_progress(progress, "selecting poses")
+    share(0.0)
+    checker = PoseChecker(arm, limits)
+    pool = checker.random_poses(max(POOL, 4 * count), count, np.random.default_rng(seed))
+    share(0.2)
+    information = PoseInformation(arm, pool)
+    usable = np.ones(len(pool), bool)
+    chosen = information.select(count, usable)
+    random = np.random.default_rng([seed, 1])
+    errors = [information.expected_error(random.permutation(len(pool))[:count]) for _ in range(NUM_RANDOM)]
+    blocked: set[tuple[int, int]] = set()
+    while True:
+        share(0.6)
+        excluded = checker.unreachable(pool, chosen)
+        if not excluded:
+            chosen, excluded = _ordered(checker, pool, chosen, blocked)
+        if not excluded:
+            break
+        usable[excluded] = False
+        if usable.sum() < count:
+            raise ExcitationError(
+                f"{arm.name}: only {usable.sum()} of {len(pool)} random poses can be reached on straight paths, but "
+                f"{count} poses are required. Reduce the number of poses, or widen the limits"
+            )
+        chosen = information.select(count, usable, [k for k in chosen if usable[k]])
+    share(1.0)
+    return StaticPoseDesign(
+        arm=arm,
+        poses=pool[chosen],
+        expected_error=information.expected_error(chosen),
+        random_error=float(np.median(errors)),
+        known_parameters=information.known_parameters(chosen),
+        num_parameters=information.num_base,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseInformation:
+    """Linear model of the holding efforts of an arm, with the priors of `identify` for static poses.
+
+    The unknowns are the base parameters of gravity and all candidate effects: offsets, cables and springs. `identify`
+    selects some of these effects after the measurement. Each effort is the average of two approaches, so Coulomb
+    friction is not included.
+
+    Attributes:
+        arm: Arm to identify.
+        pool: Poses (k, n) that can be measured [rad, m].
+    """
+
+    arm: Arm
+    pool: NDArray[np.float64]
+
+    @cached_property
+    def _targets(self) -> NDArray[np.float64]:
+        return self.arm.sample_poses(NUM_TARGETS, np.random.default_rng(1))
+
+    @cached_property
+    def _problem(self) -> StaticProblem:
+        return _without_efforts(self.arm, self.pool)
+
+    @cached_property
+    def effort(self) -> NDArray[np.float64]:
+        """RMS holding efforts (n,) at random poses of the workspace, according to the SDF.
+
+        The value is at least `MIN_TORQUE` times the effort limit.
+        """
+        zero = np.zeros_like(self._targets)
+        rms = np.sqrt(np.mean(inverse_dynamics(self.arm, self._targets, zero, zero) ** 2, axis=0))
+        return np.asarray(np.maximum(rms, MIN_TORQUE * self.arm.effort_limits))
+
+    @cached_property
+    def _effects(self) -> list[ActuatorEffect]:
+        return [effect for group in candidate_effects(self._problem) for effect in group]
+
+    @cached_property
+    def num_base(self) -> int:
+        """Number of base parameters of gravity."""
+        return len(self._problem.base_model.gravity.base.names)
+
+    @cached_property
+    def _deviations(self) -> NDArray[np.float64]:
+        """Prior standard deviations (p,) of the unknowns."""
+        return np.asarray(self._problem.prior_precision(self._effects) ** -0.5)
+
+    @cached_property
+    def columns(self) -> NDArray[np.float64]:
+        """Regressor (k, n, p) of the pool.
+
+        The unknowns are divided by their prior standard deviations, the efforts by their measurement errors.
+        """
+        return np.asarray(
+            self._problem.regressor(self._effects) * self._deviations / (EFFORT_ERROR * self.arm.effort_limits[:, None])
+        )
+
+    @cached_property
+    def _target(self) -> NDArray[np.float64]:
+        """Mean (p, p) of x x' / (n s^2) over the random poses and the joints, for rows x and RMS efforts s."""
+        X = _without_efforts(self.arm, self._targets).regressor(self._effects)
+        X = (X * self._deviations / self.effort[:, None]).reshape(-1, len(self._deviations))
+        return np.asarray(X.T @ X / len(X))
+
+    def covariance(self, chosen: list[int] | NDArray[np.int_]) -> NDArray[np.float64]:
+        """Returns the covariance (p, p) of the scaled unknowns after the measurement of some poses of the pool."""
+        X = self.columns[chosen].reshape(-1, len(self._deviations))
+        return np.asarray(np.linalg.inv(X.T @ X + np.eye(X.shape[1])))
+
+    def expected_error(self, chosen: list[int] | NDArray[np.int_]) -> float:
+        """Returns the expected RMS error of predicted holding efforts, relative to the RMS holding efforts [1].
+
+        The square is the mean over the joints and over random poses of the workspace (V-optimality).
+
+        Args:
+            chosen: Indices of the measured poses in the pool.
+        """
+        return float(np.sqrt(np.sum(self._target * self.covariance(chosen))))
+
+    def known_parameters(self, chosen: list[int] | NDArray[np.int_], share: float = 0.1) -> int:
+        """Returns the number of base parameters whose standard error is at most a share of their absolute value."""
+        b = self.num_base
+        error = self._deviations[:b] * np.sqrt(np.diag(self.covariance(chosen))[:b])
+        return int(np.sum(error <= share * np.abs(self._problem.base_model.gravity.base_values)))
+
+    def reductions(self, C: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the reduction (k,) of the squared expected error by the measurement of each pose of the pool.
+
+        With the rows X of a pose, the new covariance is C - C X' (1 + X C X')^-1 X C.
+
+        Args:
+            C: Covariance (p, p) before the measurement.
+        """
+        X = self.columns
+        XC = (X.reshape(-1, len(C)) @ C).reshape(X.shape)
+        inner = np.eye(X.shape[1]) + XC @ X.transpose(0, 2, 1)
+        outer = (XC.reshape(-1, len(C)) @ self._target).reshape(X.shape) @ XC.transpose(0, 2, 1)
+        return np.asarray(np.trace(np.linalg.solve(inner, outer), axis1=1, axis2=2))
+
+    def select(self, count: int, usable: NDArray[np.bool_], start: list[int] | None = None) -> list[int]:
+        """Returns the indices of poses that minimise the expected error: greedy selection, followed by exchanges.
+
+        No exchange of a single pose with another usable pose of the pool reduces the squared error by more than
+        `_MIN_REDUCTION`.
+
+        Args:
+            count: Number of poses.
+            usable: Mask (k,) of the poses that can be selected.
+            start: Indices of the poses with which the selection begins.
+        """
+        chosen = list(start or [])
+        while len(chosen) < count:
+            chosen.append(self._best(chosen, usable)[0])
+        unchanged, i = 0, 0
+        while unchanged < count:
+            rest = chosen[:i] + chosen[i + 1 :]
+            best, reductions = self._best(rest, usable)
+            least = _MIN_REDUCTION * self.expected_error(chosen) ** 2
+            if reductions[best] > reductions[chosen[i]] + least:
+                chosen[i], unchanged = best, 0
+            else:
+                unchanged += 1
+            i = (i + 1) % count
+        return chosen
+
+    def _best(self, chosen: list[int], usable: NDArray[np.bool_]) -> tuple[int, NDArray[np.float64]]:
+        """Returns the index of the best pose in addition to `chosen`, and the reductions (k,) by all poses."""
+        reductions = self.reductions(self.covariance(chosen))
+        allowed = usable.copy()
+        allowed[chosen] = False
+        return int(np.argmax(np.where(allowed, reductions, -np.inf))), reductions
+
+
+class PoseChecker:
+    """Checks poses and the straight paths of a collection."""
+
+    def __init__(self, arm: Arm, limits: MotionLimits) -> None:
+        """Constructs the checker for an arm and the limits of its poses."""
+        self._arm, self._limits, self._joints = arm, limits, limits.of_arm(arm)
+        self._detector = CollisionDetector(arm, limits.table)
+        self._offsets = effort_approach(arm), range_approach(arm)
+        self._span = arm.position_upper - arm.position_lower
+        self._reachable: set[int] = set()
+
+    def random_poses(self, size: int, least: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Returns up to `size` random poses (k, n) that meet all limits.
+
+        Raises:
+            ExcitationError: Fewer than `least` poses meet all limits.
+        """
+        n, drawn = self._arm.num_joints, 0
+        poses, reasons = np.empty((0, n)), Counter[str]()
+        while len(poses) < size and drawn < MAX_DRAWN:
+            q = generator.uniform(self._joints.lower[:n], self._joints.upper[:n], (size, n))
+            drawn += size
+            found = self.violations(q)
+            reasons.update(found)
+            poses = np.vstack([poses, q[[not reason for reason in found]]])
+        if len(poses) < least:
+            del reasons[""]
+            reason, times = reasons.most_common(1)[0]
+            raise ExcitationError(
+                f"{self._arm.name}: only {len(poses)} of {drawn} random poses meet all limits, but {least} poses are "
+                f"required. Most frequent reason ({times} poses): {reason}"
+            )
+        return poses[:size]
+
+    def violations(self, q: NDArray[np.float64]) -> list[str]:
+        """Returns the limit that each of the poses (m, n) or its approaches exceed, or "" if there is none.
+
+        The approaches are checked for their length and for position limits. `unreachable` checks their collisions.
+        """
+        arm, joints, n = self._arm, self._joints, self._arm.num_joints
+        value = q @ joints.A.T
+        outside = np.any((value < joints.lower) | (value > joints.upper), axis=1)
+        predicted = PredictedEffort(arm)
+        effort = np.abs(predicted.by_drake(q, 0 * q, 0 * q)) + predicted.dry_friction
+        own = [arm.joint_names.index(name) for name in self._limits.positions]
+        reasons = []
+        for pose, is_outside, heavy in zip(q, outside, np.any(effort > joints.effort, axis=1), strict=True):
+            begins = [begin for side in (-1, 1) for begin in self.starts(pose, side)]
+            if is_outside:
+                reasons.append("coupled limit")
+            elif any(
+                np.any(np.abs(begin - pose) < MIN_APPROACH * offset)
+                for begin, offset in zip(begins, 2 * self._offsets, strict=True)
+            ):
+                reasons.append("no room to approach the pose from both sides")
+            elif any(np.any((x < joints.lower[:n])[own] | (x > joints.upper[:n])[own]) for x in begins):
+                reasons.append("position limit at the start of an approach")
+            elif heavy:
+                reasons.append("effort limit")
+            else:
+                reasons.append(self._obstacle(pose))
+        return reasons
+
+    def _obstacle(self, pose: NDArray[np.float64]) -> str:
+        if self._limits.tip_box is not None:
+            lower, upper = self._limits.tip_box
+            tip = self._detector.tip(pose)
+            if np.any((tip < lower) | (tip > upper)):
+                return "tip position"
+        return self._detector.collision(pose)
+
+    def starts(self, pose: NDArray[np.float64], side: int) -> list[NDArray[np.float64]]:
+        """Returns the poses (n,) at which approaches of `pose` begin, for collections over LCM and by the dVRK."""
+        return [offset_pose(self._arm, pose, side * offset) for offset in self._offsets]
+
+    def is_free(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+        """Returns whether the straight path between two poses (n,) is free of collisions."""
+        steps = int(np.ceil(np.max(np.abs(end - begin) / self._span) / PATH_STEP - 1e-9))
+        shares = np.arange(steps + 1) / max(steps, 1)
+        return not any(self._obstacle(begin + share * (end - begin)) for share in shares)
+
+    def unreachable(self, pool: NDArray[np.float64], chosen: list[int]) -> list[int]:
+        """Returns the chosen poses of the pool whose approaches are not free of collisions."""
+        found = []
+        for k in chosen:
+            if k in self._reachable:
+                continue
+            if all(self.is_free(start, pool[k]) for side in (-1, 1) for start in self.starts(pool[k], side)):
+                self._reachable.add(k)
+            else:
+                found.append(k)
+        return found
+
+    def can_follow(self, pose: NDArray[np.float64], following: NDArray[np.float64]) -> bool:
+        """Returns whether the paths from a pose (n,) to the next pose and to its approaches are free of collisions."""
+        return all(self.is_free(pose, goal) for goal in (following, *self.starts(following, -1)))
+
+    def travel(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the travel (m, m) from each pose to the first approach of each other pose.
+
+        The unit is the position range of the joint that needs the longest time, because the speed of each joint in a
+        collection is proportional to its range.
+        """
+        goals = np.array([self.starts(pose, -1)[-1] for pose in poses])
+        return np.asarray(np.max(np.abs(poses[:, None] - goals) / self._span, axis=2))
+
+
+def _without_efforts(arm: Arm, q: NDArray[np.float64]) -> StaticProblem:
+    return StaticProblem(arm, q, np.zeros_like(q), np.ones(q.shape, bool))
+
+
+def _ordered(
+    checker: PoseChecker, pool: NDArray[np.float64], chosen: list[int], blocked: set[tuple[int, int]]
+) -> tuple[list[int], list[int]]:
+    """Returns the chosen poses in the order of a short path without collisions, and a list of poses to exclude.
+
+    If there is no such path, the list contains the pose that most of the blocked paths begin or end at.
+
+    Args:
+        checker: Checker of the paths.
+        pool: Poses (k, n).
+        chosen: Indices of the chosen poses.
+        blocked: Pairs of poses without a free path between them. New pairs are added.
+    """
+    travel, free = checker.travel(pool[chosen]), set[tuple[int, int]]()
+    index = {k: i for i, k in enumerate(chosen)}
+    while True:
+        for a, b in blocked:
+            if a in index and b in index:
+                travel[index[a], index[b]] = _BLOCKED
+        order = [chosen[i] for i in short_path(travel)]
+        pairs = list(pairwise(order))
+        if any(pair in blocked for pair in pairs):
+            ends = Counter(k for pair in blocked for k in pair if k in index)
+            return order, [ends.most_common(1)[0][0]]
+        new = {(a, b) for a, b in pairs if (a, b) not in free and not checker.can_follow(pool[a], pool[b])}
+        if not new:
+            return order, []
+        blocked |= new
+        free |= set(pairs) - new
+
+
+def short_path(travel: NDArray[np.float64]) -> list[int]:
+    """Returns an order of m points with a short total travel: best nearest-neighbour path, improved by 2-opt.
+
+    Args:
+        travel: Travel (m, m) from each point to each other point.
+    """
+    paths = [_nearest_neighbours(travel, first) for first in range(len(travel))]
+    order = np.array(min(paths, key=lambda path: travel[path[:-1], path[1:]].sum()))
+    m = len(order)
+    first, last = np.triu_indices(m, 1)
+    while True:
+        forward = np.concatenate([[0.0], np.cumsum(travel[order[:-1], order[1:]])])
+        backward = np.concatenate([[0.0], np.cumsum(travel[order[1:], order[:-1]])])
+        # Change of the travel if the points from `first` to `last` are visited in the opposite order.
+        change = backward[last] - backward[first] - forward[last] + forward[first]
+        before, after = order[np.maximum(first - 1, 0)], order[np.minimum(last + 1, m - 1)]
+        change += np.where(first > 0, travel[before, order[last]] - travel[before, order[first]], 0.0)
+        change += np.where(last < m - 1, travel[order[first], after] - travel[order[last], after], 0.0)
+        best = int(np.argmin(change))
+        if change[best] > -1e-9:
+            return [int(i) for i in order]
+        i, j = first[best], last[best]
+        order[i : j + 1] = order[i : j + 1][::-1].copy()
+
+
+def _nearest_neighbours(travel: NDArray[np.float64], first: int) -> list[int]:
+    path, left = [first], np.ones(len(travel), bool)
+    left[first] = False
+    while left.any():
+        path.append(int(np.argmin(np.where(left, travel[path[-1]], np.inf))))
+        left[path[-1]] = False
+    return path
