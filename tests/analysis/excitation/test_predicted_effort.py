@@ -9,10 +9,10 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.excitation.design import random_motion, state_of
 from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.plant import holding_torques, inverse_dynamics
