@@ -256,9 +256,9 @@ def _add_joint_limits(
     """Adds the linear constraints on positions, velocities, accelerations and jerks."""
     joints, values = limits.of_arm(arm), basis.values(sample_times(basis, LIMIT_TIMES))
     middle, half = (joints.lower + joints.upper) / 2, USED * (joints.upper - joints.lower) / 2
-    for row, center, allowed in zip(joints.A, middle, half, strict=True):
+    for row, T, center, allowed in zip(joints.A, joints.look_ahead, middle, half, strict=True):
         used = np.flatnonzero(row)
-        rows = np.hstack([row[j] * unit[j] * values[0] for j in used])
+        rows = np.hstack([row[j] * unit[j] * (values[0] + T * values[1]) for j in used])
         one = np.ones(len(rows))
         program.AddLinearConstraint(rows, (center - allowed) * one, (center + allowed) * one, x[used].ravel())
     for k, limit in ((1, joints.speed), (2, joints.acceleration), (3, joints.jerk)):

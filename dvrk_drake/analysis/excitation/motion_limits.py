@@ -14,6 +14,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.soft_walls import SoftWalls
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
@@ -66,6 +67,9 @@ class MotionLimits:
             ExcitationError: A joint in `positions` is unknown, or no position is allowed.
         """
         A, lower, upper = arm.limit_matrix()
+        walls = SoftWalls.of(arm)
+        width = np.maximum(self.margin * (upper - lower), walls.width)
+        behind_walls = lower + width, upper - width
         inset = self.margin * (upper - lower)
         lower, upper = lower + inset, upper - inset
         n = arm.num_joints
@@ -85,9 +89,10 @@ class MotionLimits:
         speed = np.minimum(speed, arm.per_joint(*self.speed))
         acceleration = speed / self.speed_time
         return JointLimits(
-            A,
-            lower,
-            upper,
+            np.vstack([A, A]),
+            np.concatenate([lower, behind_walls[0]]),
+            np.concatenate([upper, behind_walls[1]]),
+            np.concatenate([np.zeros(len(A)), walls.look_ahead]),
             speed,
             acceleration,
             acceleration / self.acceleration_time,
@@ -100,7 +105,8 @@ class JointLimits:
     """Limits of the joints of one arm.
 
     Attributes:
-        A, lower, upper: Position limits lower <= A q <= upper, see `Arm.limit_matrix`.
+        A, lower, upper, look_ahead: Position limits lower <= A (q + T v) <= upper. The first half of the k rows is that
+            of `Arm.limit_matrix`, with T = 0. The second half is the soft walls of the command guard, see `SoftWalls`.
         speed, acceleration, jerk: Largest absolute values (n,).
         effort: Largest absolute joint efforts (n,) [N m, N].
     """
@@ -108,10 +114,15 @@ class JointLimits:
     A: NDArray[np.float64]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+    look_ahead: NDArray[np.float64]
     speed: NDArray[np.float64]
     acceleration: NDArray[np.float64]
     jerk: NDArray[np.float64]
     effort: NDArray[np.float64]
+
+    def positions(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns A (q + T v) (m, k) for positions and velocities (m, n)."""
+        return np.asarray(q @ self.A.T + self.look_ahead * (v @ self.A.T))
 
 
 def execution_limits(table: float | None) -> MotionLimits:
@@ -164,10 +175,11 @@ def motion_violations(
     q = motion.evaluate(t).q
     v, vd, jerk = (spectral_derivative(q, motion.period, order) for order in (1, 2, 3))
     names: Sequence[str] = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
+    with_walls = [*names, *(f"{name}, with the soft wall of the guard," for name in names)]
     predicted = PredictedEffort(arm, model)
     effort = np.abs(predicted.by_drake(q, v, vd)) + predicted.dry_friction
     checks: list[tuple[str, Sequence[str], NDArray, NDArray, NDArray]] = [
-        ("position", names, q @ joints.A.T, joints.lower, joints.upper),
+        ("position", with_walls, joints.positions(q, v), joints.lower, joints.upper),
         *(
             (what, names, value, -limit, limit)
             for what, value, limit in (

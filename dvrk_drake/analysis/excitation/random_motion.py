@@ -87,9 +87,12 @@ def _joint_scales(
     """Returns the largest factors (n,) with which the amplitude of each joint meets its own limits."""
     joints, n = limits.of_arm(arm), arm.num_joints
     values = basis.values(sample_times(basis, LIMIT_TIMES))
-    x = np.array([np.abs(v[:, 1:] @ coefficients[:, 1:].T).max(axis=0) for v in values])
-    room = np.minimum(joints.upper[:n] - coefficients[:, 0], coefficients[:, 0] - joints.lower[:n])
-    allowed = np.array([room, joints.speed, joints.acceleration, joints.jerk])
+    moves = [v[:, 1:] @ coefficients[:, 1:].T for v in values]
+    walls = slice(len(joints.A) // 2, len(joints.A) // 2 + n)
+    x = np.abs([moves[0] + joints.look_ahead[walls] * moves[1], *moves]).max(axis=1)
+    center = coefficients[:, 0]
+    rooms = [np.minimum(joints.upper[k] - center, center - joints.lower[k]) for k in (walls, slice(n))]
+    allowed = np.array([*rooms, joints.speed, joints.acceleration, joints.jerk])
     return np.asarray(USED * np.min(allowed / x, axis=0))
 
 
@@ -103,7 +106,7 @@ def _largest_scale(
     for scale in 0.95 ** np.arange(100):
         scaled = np.column_stack([coefficients[:, 0], scale * coefficients[:, 1:]])
         q, v, vd = states_at(values[:3], scaled)
-        positions = q @ joints.A.T
+        positions = joints.positions(q, v)
         tau = predicted.without_dry_friction(q, v, vd)
         if np.all((positions >= joints.lower) & (positions <= joints.upper)) and np.all(np.abs(tau) <= allowed):
             return float(scale)

@@ -330,7 +330,7 @@ class PoseChecker:
         The approaches are checked for their length and for position limits. `unreachable` checks their collisions.
         """
         arm, joints, n = self._arm, self._joints, self._arm.num_joints
-        value = q @ joints.A.T
+        value = joints.positions(q, 0 * q)
         outside = np.any((value < joints.lower) | (value > joints.upper), axis=1)
         predicted = PredictedEffort(arm)
         effort = np.abs(predicted.by_drake(q, 0 * q, 0 * q)) + predicted.dry_friction
