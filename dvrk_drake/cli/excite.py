@@ -126,7 +126,7 @@ def excite(
         console,
         f"{moved.name}: motion of {motion.duration:g} s. Expected error of predicted efforts: "
         f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with the best random motion).",
-        f"dvrk-drake identify RECORDING.csv --arm {arm} --output model.yaml",
+        f"dvrk-drake collect --arm {arm} --motion {output} --rehearse",
     )
     console.print(
         f"Base parameters known to 10 %: {design.known_parameters} of {design.num_parameters}. Condition number: "
