@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.check.recording_check import check
     from dvrk_drake.analysis.excitation.design import design_excitation
     from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
-    from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
     from dvrk_drake.analysis.excitation.static_poses import design_poses
     from dvrk_drake.analysis.identification import identify
     from dvrk_drake.analysis.payload.payload import payload
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from dvrk_drake.export.model_export import export_model
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.recordings.periodic_motion import PeriodicMotion
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording, write_recording
     from dvrk_drake.recordings.samples import write_samples
@@ -44,7 +44,7 @@ _MODULES = {
     "GravityPidController": "systems.gravity_pid_controller",
     "IdentifiedModel": "dynamics.identified_model",
     "MotionLimits": "analysis.excitation.motion_limits",
-    "PeriodicMotion": "analysis.excitation.periodic_motion",
+    "PeriodicMotion": "recordings.periodic_motion",
     "Recording": "recordings.recording",
     "Scenario": "experiments.scenario",
     "TeleoperatedArms": "systems.teleoperated_arms",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of, whole_number
+from dvrk_drake.cli.collect_motion import collect_motion
 from dvrk_drake.cli.lcm import ControlledArm, ready_controller
 from dvrk_drake.cli.support import (
     check_output,
@@ -30,10 +31,12 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm as LoadedArm
     from dvrk_drake.processes.collector import Collector
     from dvrk_drake.processes.crtk_collector import CrtkCollector
-    from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.recordings.pose_file import CollectionFile
 
+_SOURCE = one_of("Poses or a motion (one is required)")
 _TASK = one_of("Task (one is required)")
+#: Default time to move a joint over its full range [s].
+_TRAVERSE_TIME = 5.0
 
 
 @Parameter(name="*")
@@ -110,7 +113,7 @@ def record(
     recorded, line = load_arm(arm), LiveLine(sys.stderr)
     recorder: Recorder | RosRecorder
     if ros:
-        recorder = RosRecorder(recorded, file, topic, domain, _reporter(line))
+        recorder = RosRecorder(recorded, file, topic, domain, line.report)
     else:
         check_stream_output(file)
         recorder = Recorder(recorded, file, open_lcm(lcm_url).get_lcm_url(), load_key(key))
@@ -128,33 +131,52 @@ def record(
 def collect(
     *,
     controlled: ControlledArm,
-    poses: Annotated[str, Parameter(metavar="POSES.yaml")],
-    output: Annotated[str | None, Parameter(metavar="POSES.csv", group=_TASK)] = None,
+    poses: Annotated[str | None, Parameter(metavar="POSES.yaml", group=_SOURCE)] = None,
+    motion: Annotated[str | None, Parameter(metavar="MOTION.yaml", group=_SOURCE)] = None,
+    output: Annotated[str | None, Parameter(metavar="FILE.csv", group=_TASK)] = None,
     teach: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
     random: Annotated[int | None, Parameter(metavar="N", group=_TASK, converter=whole_number)] = None,
+    rehearse: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
     at_rest: Annotated[bool, Parameter(show_default=False)] = False,
     seed: Seed = 0,
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
-    traverse_time: Seconds = 5.0,
+    traverse_time: Seconds = _TRAVERSE_TIME,
     ros: RosCollection = _ROS,
 ) -> None:
-    """Collect static poses and their holding torques over LCM or ROS 2.
+    """Collect static poses or a motion, and the efforts, over LCM; static poses also over ROS 2.
 
-    After an interruption, run the same command again to continue. With --ros, the messages of each run are also written
-    to a new bag beside the CSV: POSES_1.mcap, POSES_2.mcap, ... Enter pauses the collection, and Ctrl-C ends it. In
-    both cases, the arm holds its pose.
+    After an interruption, run the same command again to continue. Enter pauses a motion, and a collection with --ros;
+    Ctrl-C ends the command. In all cases, the arm holds its pose. With --ros, the messages of each run are also written
+    to a new bag beside the CSV: POSES_1.mcap, POSES_2.mcap, ...
 
     Args:
         poses: Pose file. With --output, the arm moves to the poses in this file. --teach and --random add poses to it.
-        output: Move the arm to each pose of the pose file, and append one row per pose to this CSV file.
+        motion: Motion file written by dvrk-drake excite. The arm follows this motion.
+        output: Move the arm, and write one row per pose, or the measurements during the motion, to this CSV file.
         teach: Compensate gravity so that you can move the arm by hand. The Enter key adds the current pose to the file.
         random: Add N random poses to the pose file.
+        rehearse: Follow one period of the motion at a fifth of its speed. Required once before the first recording.
         at_rest: With --teach: also add each pose at which the arm is at rest for one second.
         both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
         traverse_time: Time to move a joint over its full range, 1 to 60 s. This time defines the speed between poses.
     """
     lcm_only = {name: getattr(controlled, name) for name in ("lcm_url", "key", "realtime", "reset")}
-    check_ros_options(ros.ros, vars(ros) | {"ros": None}, lcm_only)
+    check_ros_options(ros.ros, vars(ros) | {"ros": None}, lcm_only | {"motion": motion})
+    if motion is not None:
+        given = {
+            "--teach": teach,
+            "--random": random is not None,
+            "--at-rest": at_rest,
+            "--no-both-sides": not both_sides,
+            "--traverse-time": traverse_time != _TRAVERSE_TIME,
+        }
+        if wrong := [name for name, is_given in given.items() if is_given]:
+            raise CollectionError(f"{', '.join(wrong)} requires --poses, but --motion was given")
+        collect_motion(controlled, motion, None if rehearse else output)
+        return
+    assert poses is not None
+    if rehearse:
+        raise CollectionError("--rehearse requires --motion, but --poses was given")
     if ros.ros and output is None:
         raise CollectionError(
             "--ros requires --output; --random needs no arm, and --teach needs LCM (dvrk-drake bridge)"
@@ -202,7 +224,7 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
         controller, link, _ = ready_controller(controlled, "gravity")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
-    teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=_reporter(line))
+    teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=line.report)
     event = "Enter or one second of rest" if at_rest else "Enter"
     print(
         f"{controller.arm.name} compensates gravity; move the arm by hand; {event} adds a pose, Ctrl-C ends", flush=True
@@ -244,7 +266,7 @@ def _visit(
         controller, link, _period = ready_controller(controlled, "hold")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
-    collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
+    collector = Collector(poses, controller, output, settings, stopped=stopped, report=line.report)
     print(f"{len(poses) - num_done} poses of {arm.name} remain; after Ctrl-C, the same command continues", flush=True)
     try:
         control(
@@ -301,7 +323,7 @@ def _visit_over_ros(
                 time.sleep(0.02)
 
     print(f"{remaining} poses of {arm.name} remain; after Ctrl-C, the same command continues", flush=True)
-    dialog = Dialog(stopped, confirm, enter, _reporter(line), line.show)
+    dialog = Dialog(stopped, confirm, enter, line.report, line.show)
     collector = None
     try:
         collector = run_crtk_collection(
@@ -345,13 +367,3 @@ def _end(collector: Collector | CrtkCollector, stopped: Callable[[], bool]) -> N
         raise CollectionError(
             f"the arm did not come to rest at poses {numbers}. Run the command again to repeat these poses"
         )
-
-
-def _reporter(line: LiveLine) -> Callable[[str], None]:
-    """Returns a function that prints lines above the live line."""
-
-    def report(text: str) -> None:
-        line.clear()
-        print(text, flush=True)
-
-    return report

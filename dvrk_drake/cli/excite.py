@@ -22,6 +22,7 @@ def excite(
     arm: Arm,
     output: Annotated[str, Parameter(metavar="FILE.yaml")],
     static: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
+    model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
     csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
     rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
     duration: Seconds | None = None,
@@ -31,7 +32,7 @@ def excite(
     seed: Seed = 0,
     margin: Annotated[float | None, Parameter(metavar="SHARE")] = None,
     traverse_time: Seconds | None = None,
-    effort: Annotated[float, Parameter(metavar="SHARE")] = 0.6,
+    effort: Annotated[float, Parameter(metavar="SHARE")] = 0.8,
     position: Annotated[list[str] | None, Parameter(metavar="JOINT=LOWER:UPPER ..", consume_multiple=True)] = None,
     table: Annotated[float | None, Parameter(metavar="Z")] = None,
     gravity: Gravity = None,
@@ -46,6 +47,8 @@ def excite(
     Args:
         output: Motion file or pose file to write.
         static: Select N static poses, 8 to 300.
+        model: Earlier model of the arm, written by identify. It replaces the parameters and the gravity vector of the
+            arm, and the motion gives the most additional information. Default: no earlier model.
         csv: File for the positions and velocities over time, for other programs.
         rate: Rate of the rows of --csv, 1 to 10000. Default: 200.
         duration: Duration of the motion, rounded up to whole periods. Default: 30.
@@ -65,6 +68,7 @@ def excite(
     from dvrk_drake.reports.terminal_tables import make_console, print_answer
 
     of_motion = {
+        "model": model,
         "csv": csv,
         "rate": rate,
         "duration": duration,
@@ -94,8 +98,10 @@ def excite(
         positions=_positions(position or []),
         table=table,
     )
-    quiet_drake()
+    if model is not None and gravity is not None:
+        raise ExcitationError("--gravity cannot be used with --model, because the model contains the gravity vector")
     moved = mounted(dvrk.load_arm(arm), gravity, None)
+    earlier = None if model is None else dvrk.IdentifiedModel.load(model, moved)
     with Steps("optimising") as steps:
         design = dvrk.design_excitation(
             moved,
@@ -103,6 +109,7 @@ def excite(
             period=15.0 if period is None else period,
             harmonics=12 if harmonics is None else harmonics,
             limits=limits,
+            model=earlier,
             starts=4 if starts is None else starts,
             seed=seed,
             progress=steps,

@@ -22,7 +22,20 @@ from cyclopts import (
     ValidationError,
 )
 
-from dvrk_drake.cli import collect, demo, excite, export, identify, lcm, model, recordings, ros, simulate, simulated_arm
+from dvrk_drake.cli import (
+    calibrate,
+    collect,
+    demo,
+    excite,
+    export,
+    identify,
+    lcm,
+    model,
+    recordings,
+    ros,
+    simulate,
+    simulated_arm,
+)
 from dvrk_drake.cli.app import app
 from dvrk_drake.cli.support import command_words, folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
@@ -32,7 +45,7 @@ from dvrk_drake.errors import DvrkDrakeError
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 #: Importing these modules adds their commands to the application.
-COMMANDS = model, recordings, identify, excite, export, simulate, demo, simulated_arm, lcm, ros, collect
+COMMANDS = model, recordings, identify, excite, export, simulate, demo, simulated_arm, lcm, ros, collect, calibrate
 
 #: Mapping from each command to its options that were renamed in version 0.1. The key "" stands for a positional
 #: argument that became an option.

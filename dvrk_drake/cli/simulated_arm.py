@@ -13,6 +13,7 @@ from dvrk_drake.cli.support import check_ros_options, interrupt_ends_process, mo
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm as LoadedArm
+    from dvrk_drake.models.effects_schema import ArmEffects
 
 
 @Parameter(name="*")
@@ -43,14 +44,6 @@ class SimulatedRos:
         Model | None,
         Parameter(help="With --ros: model file for the gravity compensation. Default: the nominal model from the SDF."),
     ] = None
-    effects: Annotated[
-        list[str] | None,
-        Parameter(
-            metavar="NAME ..",
-            consume_multiple=True,
-            help="With --ros: simulated effects, e.g. friction, or all (docs/simulated_effects.md). Default: none.",
-        ),
-    ] = None
     enabled: Annotated[
         bool, Parameter(show_default=False, help="With --ros: enable and home the arm at the start.")
     ] = False
@@ -68,6 +61,7 @@ def arm(
     key: Key = None,
     pose: Annotated[list[float] | None, Parameter(metavar="Q ..", consume_multiple=True)] = None,
     gravity: Gravity = None,
+    effects: Annotated[list[str] | None, Parameter(metavar="NAME ..", consume_multiple=True)] = None,
     meshcat: Annotated[bool, Parameter(show_default=False)] = False,
     realtime: Realtime = False,
     ros: SimulatedRos = _ROS,
@@ -77,6 +71,7 @@ def arm(
     Args:
         driver: Configuration file of the driver (docs/lcm.md). Default: the default configuration.
         pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.
+        effects: Simulated effects, e.g. friction, or all (docs/simulated_effects.md). Default: none.
         meshcat: Show the arm in a web browser.
     """
     from dvrk_drake.models.arm_files import load_arm
@@ -90,16 +85,17 @@ def arm(
     lcm_only = {"driver": driver, "lcm_url": lcm_url, "key": key, "meshcat": meshcat}
     check_ros_options(ros.ros, vars(ros) | {"ros": None}, lcm_only)
     simulated_arm = mounted(load_arm(arm), gravity)
+    simulated_effects = None if effects is None else simulated_arm.effects.only(effects)
     if ros.ros:
-        _run_ros_arm(simulated_arm, ros, pose, realtime)
+        _run_ros_arm(simulated_arm, ros, pose, simulated_effects, realtime)
         return
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
-    start = start_pose(simulated_arm, pose)
+    start = start_pose(simulated_arm, pose, simulated_effects)
     url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
     print(f"starting the simulated {simulated_arm.name}", flush=True)
     with interrupt_ends_process():
-        simulated = SimulatedArm(simulated_arm, configuration, url, start)
+        simulated = SimulatedArm(simulated_arm, configuration, url, start, effects=simulated_effects)
         stopped = stop_on_signals()
     with live_view(arm, url) if meshcat else nullcontext():
         if realtime:
@@ -111,7 +107,9 @@ def arm(
     print(f"ended; {pace.describe()}", flush=True)
 
 
-def _run_ros_arm(arm: LoadedArm, options: SimulatedRos, pose: list[float] | None, realtime: bool) -> None:
+def _run_ros_arm(
+    arm: LoadedArm, options: SimulatedRos, pose: list[float] | None, effects: ArmEffects | None, realtime: bool
+) -> None:
     """Runs the simulated arm of `arm --ros` until a signal.
 
     Raises:
@@ -128,8 +126,7 @@ def _run_ros_arm(arm: LoadedArm, options: SimulatedRos, pose: list[float] | None
     if options.rate is not None:
         driver.rate = options.rate
         driver.check()
-    effects = None if options.effects is None else arm.effects.only(options.effects)
-    start = start_pose(arm, pose)
+    start = start_pose(arm, pose, effects)
     print(f"starting the simulated {arm.name}", flush=True)
     if realtime:
         for warning in make_realtime():

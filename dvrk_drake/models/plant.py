@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from functools import cache
 from typing import get_args
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, MultibodyForces
+from pydrake.multibody.tree import ModelInstanceIndex, MultibodyForces, SpatialInertia
 from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
@@ -165,7 +166,11 @@ def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def inverse_dynamics(
-    arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]
+    arm: Arm,
+    q: NDArray[np.float64],
+    v: NDArray[np.float64],
+    vd: NDArray[np.float64],
+    inertias: Mapping[str, SpatialInertia] | None = None,
 ) -> NDArray[np.float64]:
     """Returns the efforts (m, n) of the independent joints for a motion (m, n), from Drake's inverse dynamics [N m, N].
 
@@ -174,9 +179,16 @@ def inverse_dynamics(
     Args:
         arm: Arm that moves.
         q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
+        inertias: Link -> spatial inertia about the origin of its frame, which replaces that of the SDF. If it is given,
+            the rotors of the SDF have no inertia.
     """
     plant = make_arm_plant(arm)
     context, forces, selector = plant.CreateDefaultContext(), MultibodyForces(plant), tree_selector(plant, arm)
+    if inertias is not None:
+        for link, inertia in inertias.items():
+            plant.GetBodyByName(link).SetSpatialInertiaInBodyFrame(context, inertia)
+        for index in plant.GetJointActuatorIndices():
+            plant.get_joint_actuator(index).SetRotorInertia(context, 0.0)
     tau = np.empty(q.shape)
     tree = np.zeros((3, len(q), plant.num_positions()))
     for k, x in enumerate((arm.linkage.position(q), arm.linkage.velocity(v), arm.linkage.velocity(vd))):

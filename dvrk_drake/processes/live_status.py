@@ -43,6 +43,11 @@ class LiveLine:
         if self._stream.isatty():
             self._write("")
 
+    def report(self, text: str) -> None:
+        """Prints a line of text to the standard output, above the status line."""
+        self.clear()
+        print(text, flush=True)
+
     def _write(self, text: str) -> None:
         # Escape sequence: clear the line to the right of the cursor.
         self._stream.write(f"\r\x1b[K{text}")

@@ -14,8 +14,10 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.lcm_messages import command_channel, describe_state, status_channel
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.processes.lcm_network import handle_message, listen
@@ -29,6 +31,9 @@ from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 #: are handled at the start of a tick. It limits the delay that a flood of messages can cause. Most commands are handled
 #: while this process waits for the next tick.
 _QUEUE, _MESSAGES_PER_STEP = 200, 10
+
+#: Largest effort that holds the default initial pose, as a share of the effort limits.
+_START_EFFORT = 0.6
 
 
 def monotonic_utime() -> int:
@@ -51,20 +56,36 @@ def load_driver(path: str | Path) -> DvrkDriver:
     return driver
 
 
-def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.float64]:
+def nominal_model(arm: Arm, effects: ArmEffects | None) -> IdentifiedModel:
+    """Returns the model of the SDF, with the springs and cables of the simulated effects."""
+    return IdentifiedModel.from_arm(arm, effects.cables + effects.springs if effects else ())
+
+
+def start_pose(arm: Arm, pose: Sequence[float] | None = None, effects: ArmEffects | None = None) -> NDArray[np.float64]:
     """Returns the initial pose (n,) of a simulated arm.
 
     Args:
         arm: Simulated arm.
         pose: Pose (n,) [rad, m]. None: each joint starts at the position nearest to zero that is at least 10 % of its
-            range away from its limits.
+            range away from its limits. A joint whose motor needs more than `_START_EFFORT` of its limit to hold this
+            position starts at the nearest position that needs less.
+        effects: Simulated effects of the arm, whose springs and cables the motors must hold.
 
     Raises:
         StationError: `pose` does not have n entries inside the arm's limits.
     """
     if pose is None:
         inset = 0.1 * (arm.position_upper - arm.position_lower)
-        return np.clip(0.0, arm.position_lower + inset, arm.position_upper - inset)
+        lower, upper = arm.position_lower + inset, arm.position_upper - inset
+        q = np.clip(0.0, lower, upper)
+        model, allowed = nominal_model(arm, effects), _START_EFFORT * arm.effort_limits
+        for j in np.flatnonzero(np.abs(model.holding_torque(q)) > allowed):
+            poses = np.tile(q, (201, 1))
+            poses[:, j] = np.linspace(lower[j], upper[j], len(poses))
+            effort = np.abs(model.holding_torque(poses)[:, j])
+            distance = np.where(effort <= allowed[j], np.abs(poses[:, j] - q[j]), np.inf)
+            q = poses[int(np.argmin(distance))]
+        return q
     q = np.asarray(pose, float)
     if q.shape != (arm.num_joints,) or not np.all(np.isfinite(q)):
         raise StationError(f"a pose of {arm.name} is {arm.num_joints} finite numbers [rad, m]; got {q.tolist()}")
@@ -83,6 +104,8 @@ class SimulatedArm:
         url: str,
         q: ArrayLike,
         wall_clock: Callable[[], int] = monotonic_utime,
+        *,
+        effects: ArmEffects | None = None,
     ) -> None:
         """Creates the arm at rest. The arm's clock starts at the current time of day.
 
@@ -93,6 +116,7 @@ class SimulatedArm:
             q: Initial pose (n,) [rad, m].
             wall_clock: Function that returns a monotonic time [us]. The guard uses this function, so that commands also
                 expire while this process is late or suspended.
+            effects: Simulated effects of the real arm. None: no effects.
         """
         self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0
@@ -100,12 +124,13 @@ class SimulatedArm:
         self._memory = DrakeLcm("memq://")
         self._memory.Subscribe(status_channel(arm), self._keep_status)
         builder = DiagramBuilder()
-        station = builder.AddSystem(ArmStation(arm))
+        station = builder.AddSystem(ArmStation(arm, effects=effects))
         self._driver = apply_driver_config(
             driver,
             station,
             self._memory,
             builder,
+            model=nominal_model(arm, effects),
             start_utime=time.time_ns() // 1000,
             subscribe=False,
             wall_clock=wall_clock,

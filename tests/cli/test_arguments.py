@@ -66,7 +66,10 @@ def refused(capsys, *arguments):
         ),
         (["export", "--sdf", "out.sdf"], "give exactly one of --model, --arm; see dvrk-drake export --help"),
         (["export", "--arm", "psm", "--model", "m.yaml", "--sdf", "o"], "give exactly one of --model, --arm; see"),
-        (["collect", "--arm", "psm", "--poses", "p.yaml"], "give exactly one of --output, --teach, --random; see"),
+        (
+            ["collect", "--arm", "psm", "--poses", "p.yaml"],
+            "give exactly one of --output, --teach, --random, --rehearse; see",
+        ),
         (["study", "s.yaml", "--output", "r.csv", "--workers", "1", "--scheduler", "x"], "give at most one of"),
         (["simulate", "psm"], "psm is an arm, not a scenario; use --arm psm"),
         (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; use --arm psm"),

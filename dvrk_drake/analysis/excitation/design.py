@@ -14,17 +14,26 @@ from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
 from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, first_collision, motion_violations
-from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.analysis.excitation.random_motion import (
+    LIMIT_TIMES,
+    USED,
+    effort_without_friction,
+    middle_pose,
+    random_motion,
+    sample_times,
+    state_of,
+    states_at,
+)
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
+from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
-#: Number of times per harmonic at which the limits are imposed and the information is computed.
-LIMIT_TIMES, INFORMATION_TIMES = 14, 8
-#: Share of the limits and of the effort limits that the optimisation uses. Between the times, a motion may exceed the
-#: limits slightly.
-_USED, _USED_EFFORT = 0.98, 0.95
+#: Number of times per harmonic at which the information is computed.
+INFORMATION_TIMES = 8
+#: Share of the effort limits that the optimisation uses, see `USED`.
+_USED_EFFORT = 0.95
 #: Largest number of major iterations of the solver.
 MAX_ITERATIONS = 60
 #: Factor by which a motion is contracted towards its centre until it has no collision and meets all limits, and largest
@@ -71,6 +80,7 @@ def design_excitation(
     period: float = 15.0,
     harmonics: int = 12,
     limits: MotionLimits | None = None,
+    model: IdentifiedModel | None = None,
     starts: int = 4,
     seed: int = 0,
     progress: Progress | None = None,
@@ -88,12 +98,15 @@ def design_excitation(
         period: Period [s].
         harmonics: Number of harmonics, 2 to 20.
         limits: Limits of the motion. None: the defaults of `MotionLimits`.
+        model: Earlier model of the arm. Its parameters and gravity vector replace those of `arm`, for the effort limits
+            and for the expected results. The motion gives the most information in addition to that of the model, see
+            `MotionInformation`.
         starts: Number of random motions from which the optimisation starts.
         seed: Seed of the random motions.
         progress: Callback that receives the name of the step ("optimising") and the finished share (0 to 1).
 
     Raises:
-        ExcitationError: An argument is out of range, or no motion meets the limits.
+        ExcitationError: An argument is out of range, the model is that of another arm, or no motion meets the limits.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -114,20 +127,29 @@ def design_excitation(
             raise ExcitationError(f"{name} is {value:g}; allowed: {lowest:g} to {highest:g}")
     limits = limits or MotionLimits()
     limits.of_arm(arm)
-    if collision := first_collision(arm, _center(arm, limits, np.random.default_rng(seed))[None], limits.table):
+    if model is not None:
+        if (model.arm.name, model.arm.joint_names) != (arm.name, arm.joint_names):
+            raise ExcitationError(
+                f"the model is for {model.arm.name} with the joints {', '.join(model.arm.joint_names)}; allowed: a "
+                f"model of {arm.name} with the joints {', '.join(arm.joint_names)}"
+            )
+        arm = arm.with_gravity(model.arm.gravity.tolist())
+        # A copy has no compiled functions, which cannot be sent to another process.
+        model = replace(model)
+    if collision := first_collision(arm, middle_pose(arm, limits, np.random.default_rng(seed))[None], limits.table):
         raise ExcitationError(f"{arm.name}: no motion meets all limits: {collision[1]} in the middle of the motion")
     share = step_progress(progress, "optimising")
     share(0.0)
-    problems = [_Problem(arm, limits, period, harmonics, seed + k) for k in range(starts)]
+    problems = [_Problem(arm, limits, model, period, harmonics, seed + k) for k in range(starts)]
     results = []
     for result in _in_parallel(problems, share):
         results.append(result)
         share(0.9 * len(results) / starts)
     best = min(results, key=lambda result: result[1])
-    motion = contracted(best[0], arm, limits)
-    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)))
+    motion = contracted(best[0], arm, limits, model)
+    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)), table=limits.table)
     share(1.0)
-    information = MotionInformation(arm, limits)
+    information = MotionInformation(arm, limits, model)
     state = state_of(motion, INFORMATION_TIMES * harmonics)
     return ExcitationDesign(
         motion=motion,
@@ -140,48 +162,16 @@ def design_excitation(
     )
 
 
-def state_of(motion: PeriodicMotion, count: int) -> NDArray[np.float64]:
-    """Returns the states (3, count, n) of one period of a motion: q, v and vd."""
-    return np.array(motion.evaluate(np.arange(count) * motion.period / count)[:3])
-
-
-def random_motion(
-    arm: Arm, limits: MotionLimits, period: float, harmonics: int, generator: np.random.Generator
+def contracted(
+    motion: PeriodicMotion, arm: Arm, limits: MotionLimits, model: IdentifiedModel | None = None
 ) -> PeriodicMotion:
-    """Returns a random Fourier motion that nearly reaches the limits.
-
-    The velocities of all harmonics have the same distribution. Each joint is scaled to its own limits. Then all joints
-    are scaled by one factor until the coupled limits and the effort limits are met.
-    """
-    basis = FourierBasis.of(period, harmonics)
-    center = _center(arm, limits, generator)
-    k = np.arange(1, harmonics + 1)
-    sine, cosine = generator.normal(size=(2, arm.num_joints, harmonics)) / k
-    weights = np.hstack([sine @ basis.sines[:, : harmonics - 1], cosine @ basis.cosines[:, harmonics - 1 :]])
-    coefficients = np.column_stack([center, weights])
-    coefficients[:, 1:] *= _joint_scales(coefficients, basis, arm, limits)[:, None]
-    coefficients[:, 1:] *= _largest_scale(coefficients, basis, arm, limits)
-    return PeriodicMotion.of_coefficients(arm, basis, coefficients, 1)
-
-
-def _center(arm: Arm, limits: MotionLimits, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Returns the mean of random poses (n,), moved into the additional position limits."""
-    center = arm.sample_poses(200, generator, max(limits.margin, 0.2)).mean(axis=0)
-    if not limits.positions:
-        return center
-    joints, n = limits.of_arm(arm), arm.num_joints
-    middle, half = (joints.lower[:n] + joints.upper[:n]) / 2, (joints.upper[:n] - joints.lower[:n]) / 2
-    return np.asarray(np.clip(center, middle - 0.5 * half, middle + 0.5 * half))
-
-
-def contracted(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> PeriodicMotion:
     """Returns the motion after the smallest contraction towards its centre with which it meets all limits.
 
     Raises:
         ExcitationError: The motion does not meet the limits after `_MAX_CONTRACTIONS` contractions.
     """
     for _ in range(_MAX_CONTRACTIONS):
-        violations = motion_violations(motion, arm, limits)
+        violations = motion_violations(motion, arm, limits, model)
         if not violations:
             return motion
         sine, cosine = ((_CONTRACTION * np.array(x)).tolist() for x in (motion.sine, motion.cosine))
@@ -195,6 +185,7 @@ class _Problem:
 
     arm: Arm
     limits: MotionLimits
+    model: IdentifiedModel | None
     period: float
     harmonics: int
     seed: int
@@ -202,19 +193,20 @@ class _Problem:
     def solve(self) -> tuple[PeriodicMotion, float, float]:
         """Returns the motion, its expected error, and the expected error of the random motion."""
         arm, basis = self.arm, FourierBasis.of(self.period, self.harmonics)
-        information = MotionInformation(arm, self.limits)
-        start = random_motion(arm, self.limits, self.period, self.harmonics, np.random.default_rng(self.seed))
+        information = MotionInformation(arm, self.limits, self.model)
+        generator = np.random.default_rng(self.seed)
+        start = random_motion(arm, self.limits, self.period, self.harmonics, generator, self.model)
         n, size, unit = arm.num_joints, 2 * self.harmonics - 1, information.scales[0]
         program = MathematicalProgram()
         x = program.NewContinuousVariables(n, size, "x")
         _add_joint_limits(program, x, unit, basis, arm, self.limits)
-        _add_effort_limits(program, x, unit, basis, arm, self.limits)
-        values = basis.values(_times(basis, INFORMATION_TIMES))[:3]
+        _add_effort_limits(program, x, basis, information)
+        values = basis.values(sample_times(basis, INFORMATION_TIMES))[:3]
 
         def cost(variables: NDArray) -> object:
             is_gradient = variables.dtype == object
             number = ExtractValue(variables).ravel() if is_gradient else variables
-            state = _state(values, unit[:, None] * number.reshape(n, size))
+            state = states_at(values, unit[:, None] * number.reshape(n, size))
             if not is_gradient:
                 return float(np.log(information.expected_error(state, self.period)))
             value, by_state = information.expected_error_gradient(state, self.period)
@@ -229,9 +221,9 @@ class _Problem:
         options.SetOption(SnoptSolver.id(), "Major optimality tolerance", 1e-3)
         result = SnoptSolver().Solve(program, None, options)
         found = unit[:, None] * result.GetSolution(x)
-        random_error = information.expected_error(_state(values, unit[:, None] * guess), self.period)
+        random_error = information.expected_error(states_at(values, unit[:, None] * guess), self.period)
         motion = PeriodicMotion.of_coefficients(arm, basis, found, 1)
-        return motion, information.expected_error(_state(values, found), self.period), random_error
+        return motion, information.expected_error(states_at(values, found), self.period), random_error
 
 
 def _solve(problem: _Problem) -> tuple[PeriodicMotion, float, float]:
@@ -248,15 +240,6 @@ def _in_parallel(
         yield from executor.map(_solve, problems)
 
 
-def _times(basis: FourierBasis, per_harmonic: int) -> NDArray[np.float64]:
-    count = per_harmonic * len(basis.rates)
-    return np.arange(count) * 2 * np.pi / basis.rates[0] / count
-
-
-def _state(values: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(values @ coefficients.T)
-
-
 def _coefficients(motion: PeriodicMotion, basis: FourierBasis) -> NDArray[np.float64]:
     weights = np.array(motion.sine) @ basis.sines + np.array(motion.cosine) @ basis.cosines
     return np.column_stack([motion.center, weights])
@@ -271,41 +254,35 @@ def _add_joint_limits(
     limits: MotionLimits,
 ) -> None:
     """Adds the linear constraints on positions, velocities, accelerations and jerks."""
-    joints, values = limits.of_arm(arm), basis.values(_times(basis, LIMIT_TIMES))
-    middle, half = (joints.lower + joints.upper) / 2, _USED * (joints.upper - joints.lower) / 2
-    for row, center, allowed in zip(joints.A, middle, half, strict=True):
+    joints, values = limits.of_arm(arm), basis.values(sample_times(basis, LIMIT_TIMES))
+    middle, half = (joints.lower + joints.upper) / 2, USED * (joints.upper - joints.lower) / 2
+    for row, T, center, allowed in zip(joints.A, joints.look_ahead, middle, half, strict=True):
         used = np.flatnonzero(row)
-        rows = np.hstack([row[j] * unit[j] * values[0] for j in used])
+        rows = np.hstack([row[j] * unit[j] * (values[0] + T * values[1]) for j in used])
         one = np.ones(len(rows))
         program.AddLinearConstraint(rows, (center - allowed) * one, (center + allowed) * one, x[used].ravel())
     for k, limit in ((1, joints.speed), (2, joints.acceleration), (3, joints.jerk)):
         for j in range(arm.num_joints):
             scaled = values[k] * unit[j] / limit[j]
-            bound = np.full(len(scaled), _USED)
+            bound = np.full(len(scaled), USED)
             program.AddLinearConstraint(scaled[:, 1:], -bound, bound, x[j, 1:])
 
 
 def _add_effort_limits(
-    program: MathematicalProgram,
-    x: NDArray,
-    unit: NDArray[np.float64],
-    basis: FourierBasis,
-    arm: Arm,
-    limits: MotionLimits,
+    program: MathematicalProgram, x: NDArray, basis: FourierBasis, information: MotionInformation
 ) -> None:
-    """Adds the constraints on the efforts of the SDF, relative to their limits."""
-    regressor, allowed = DynamicRegressor(arm), _USED_EFFORT * _effort_without_friction(arm, limits)
-    values, n = basis.values(_times(basis, LIMIT_TIMES))[:3], arm.num_joints
-    scales = MotionInformation(arm, limits).scales
+    """Adds the constraints on the predicted efforts, relative to their limits."""
+    predicted, scales = information.predicted, information.scales
+    allowed, unit = _USED_EFFORT * effort_without_friction(predicted, information.limits), scales[0]
+    values, n = basis.values(sample_times(basis, LIMIT_TIMES))[:3], len(allowed)
 
     def effort(state: NDArray[np.float64]) -> NDArray[np.float64]:
-        q, v, vd = state
-        return regressor.torque(q, v, vd, regressor.values) / allowed
+        return predicted.without_dry_friction(*state) / allowed
 
     def constraint(variables: NDArray) -> object:
         is_gradient = variables.dtype == object
         number = ExtractValue(variables).ravel() if is_gradient else variables
-        state = _state(values, unit[:, None] * number.reshape(n, -1))
+        state = states_at(values, unit[:, None] * number.reshape(n, -1))
         tau = effort(state)
         if not is_gradient:
             return tau.ravel()
@@ -323,42 +300,3 @@ def _add_effort_limits(
 
     bound = np.ones(values.shape[1] * n)
     program.AddConstraint(constraint, lb=-bound, ub=bound, vars=x.ravel())
-
-
-def _effort_without_friction(arm: Arm, limits: MotionLimits) -> NDArray[np.float64]:
-    """Returns the largest joint efforts (n,) without dry friction [N m, N].
-
-    Raises:
-        ExcitationError: The dry friction of a joint exceeds the limit.
-    """
-    allowed = limits.of_arm(arm).effort - arm.dry_friction()
-    if np.any(allowed <= 0):
-        name = arm.joint_names[int(np.argmin(allowed))]
-        raise ExcitationError(f"{name}: the dry friction exceeds {100 * limits.effort:g} % of the effort limit")
-    return np.asarray(allowed)
-
-
-def _joint_scales(
-    coefficients: NDArray[np.float64], basis: FourierBasis, arm: Arm, limits: MotionLimits
-) -> NDArray[np.float64]:
-    """Returns the largest factors (n,) with which the amplitude of each joint meets its own limits."""
-    joints, n = limits.of_arm(arm), arm.num_joints
-    values = basis.values(_times(basis, LIMIT_TIMES))
-    x = np.array([np.abs(v[:, 1:] @ coefficients[:, 1:].T).max(axis=0) for v in values])
-    room = np.minimum(joints.upper[:n] - coefficients[:, 0], coefficients[:, 0] - joints.lower[:n])
-    allowed = np.array([room, joints.speed, joints.acceleration, joints.jerk])
-    return np.asarray(_USED * np.min(allowed / x, axis=0))
-
-
-def _largest_scale(coefficients: NDArray[np.float64], basis: FourierBasis, arm: Arm, limits: MotionLimits) -> float:
-    """Returns the largest factor up to 1 with which the motion meets the coupled limits and the effort limits."""
-    joints, values = limits.of_arm(arm), basis.values(_times(basis, LIMIT_TIMES))
-    regressor, allowed = DynamicRegressor(arm), _effort_without_friction(arm, limits)
-    for scale in 0.95 ** np.arange(100):
-        scaled = np.column_stack([coefficients[:, 0], scale * coefficients[:, 1:]])
-        q, v, vd = _state(values[:3], scaled)
-        positions = q @ joints.A.T
-        tau = regressor.torque(q, v, vd, regressor.values)
-        if np.all((positions >= joints.lower) & (positions <= joints.upper)) and np.all(np.abs(tau) <= allowed):
-            return float(scale)
-    raise ExcitationError(f"{arm.name}: no random motion meets the limits")

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.columns import COULOMB_WIDTHS, BaseColumns, base_columns
 from dvrk_drake.analysis.dynamic.problem import FRICTION_DEVIATION, LINK_DEVIATION, MIN_ROTOR_DEVIATION
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
 
@@ -41,14 +43,23 @@ class MotionInformation:
         limits: Limits of the motion. The positions for which efforts are predicted are uniformly distributed over the
             position ranges of the arm without `margin`. The velocities and accelerations are normally distributed, and
             their standard deviations are a third of the limits.
+        model: Earlier model of the arm, or None. If it has dynamics, the standard errors of its base parameters are
+            used as those of independent measurements. Its friction and offsets are not used, because they can differ
+            between recordings.
     """
 
     arm: Arm
     limits: MotionLimits
+    model: IdentifiedModel | None = None
 
     @cached_property
+    def predicted(self) -> PredictedEffort:
+        """Predicted efforts of the arm."""
+        return PredictedEffort(self.arm, self.model)
+
+    @property
     def _regressor(self) -> DynamicRegressor:
-        return DynamicRegressor(self.arm)
+        return self.predicted.regressor
 
     @cached_property
     def _base(self) -> BaseColumns:
@@ -74,11 +85,10 @@ class MotionInformation:
 
     @cached_property
     def effort(self) -> NDArray[np.float64]:
-        """RMS efforts (n,) of the actuators in `states`, according to the SDF and the friction in the arm file."""
-        regressor = self._regressor
-        q, v, vd = self.states
-        tau = self.arm.transmission.inverse.pull_back_effort(regressor.torque(q, v, vd, regressor.values))
-        friction = self.arm.transmission.inverse.pull_back_effort(self.arm.dry_friction()[None])[0]
+        """RMS efforts (n,) of the actuators in `states`, including dry friction."""
+        to_actuators = self.arm.transmission.inverse.pull_back_effort
+        tau = to_actuators(self.predicted.without_dry_friction(*self.states))
+        friction = to_actuators(self.predicted.dry_friction[None])[0]
         return np.sqrt(np.mean(tau**2, axis=0) + friction**2)
 
     def columns(self, state: NDArray[np.float64]) -> list[tuple[NDArray[np.int_], NDArray[np.float64]]]:
@@ -100,7 +110,7 @@ class MotionInformation:
 
     @cached_property
     def prior(self) -> NDArray[np.float64]:
-        """Prior precision (k, k) of the unknowns, see `identify`."""
+        """Precision (k, k) of the unknowns before the motion: of the prior of `identify`, and of `model`."""
         regressor = self._regressor
         p = self._base.base.shape[1]
         links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
@@ -108,7 +118,24 @@ class MotionInformation:
         scaled = self._base.base * np.concatenate([*links, rotors])
         of_actuator = [*[FRICTION_DEVIATION] * (1 + len(COULOMB_WIDTHS)), OFFSET_DEVIATION]
         effects = np.diag(np.tile(of_actuator, self.arm.num_joints) ** -2.0)
-        return np.asarray(scipy.linalg.block_diag(_inverse(scaled @ scaled.T), effects))
+        return np.asarray(scipy.linalg.block_diag(_inverse(scaled @ scaled.T) + self._earlier, effects))
+
+    @property
+    def _earlier(self) -> NDArray[np.float64]:
+        """Precision (b, b) that the standard errors in `model` add to that of the prior."""
+        earlier = np.zeros((self.num_base, self.num_base))
+        if self.model is None or self.model.dynamics is None:
+            return earlier
+        section = self.model.dynamics
+        regressor = self._regressor.with_gravity(section.gravity_expected or section.gravity)
+        derived = derive_base_parameters(regressor, coupled_rotors=False)
+        row_of = dict(zip(derived.base.names, derived.combination @ np.linalg.pinv(self._base.base), strict=True))
+        for estimate in section.base_parameters:
+            if estimate.standard_error > 0 and estimate.name in row_of:
+                # The variance is (1 - identifiability) times that of the prior.
+                row = row_of[estimate.name]
+                earlier += estimate.identifiability / estimate.standard_error**2 * np.outer(row, row)
+        return earlier
 
     @cached_property
     def _target(self) -> NDArray[np.float64]:
@@ -164,7 +191,7 @@ class MotionInformation:
     def known_parameters(self, state: NDArray[np.float64], period: float, share: float = 0.1) -> int:
         """Returns the number of base parameters whose standard error is at most a share of their absolute value."""
         C = _inverse(self.precision(state, period))
-        values = self._base.base @ self._regressor.values[: self._base.base.shape[1]]
+        values = self._base.base @ self.predicted.parameters[: self._base.base.shape[1]]
         b = self.num_base
         return int(np.sum(np.sqrt(np.diag(C)[:b]) <= share * np.abs(values)))
 

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
-from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
+from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.soft_walls import SoftWalls
+from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
 CHECK_RATE, ROUNDING = 1000.0, 1e-9
@@ -49,7 +51,7 @@ class MotionLimits:
     speed: tuple[float, float] = field(default=(3.0, 0.2), metadata=within(1e-3, 100.0, "rad/s or m/s"))
     speed_time: float = field(default=0.2, metadata=within(0.01, 100.0, "s"))
     acceleration_time: float = field(default=0.1, metadata=within(0.001, 100.0, "s"))
-    effort: float = field(default=0.6, metadata=within(0.05, 1.0))
+    effort: float = field(default=0.8, metadata=within(0.05, 1.0))
     positions: dict[str, tuple[float, float]] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
     tip_box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
@@ -65,6 +67,9 @@ class MotionLimits:
             ExcitationError: A joint in `positions` is unknown, or no position is allowed.
         """
         A, lower, upper = arm.limit_matrix()
+        walls = SoftWalls.of(arm)
+        width = np.maximum(self.margin * (upper - lower), walls.width)
+        behind_walls = lower + width, upper - width
         inset = self.margin * (upper - lower)
         lower, upper = lower + inset, upper - inset
         n = arm.num_joints
@@ -84,9 +89,10 @@ class MotionLimits:
         speed = np.minimum(speed, arm.per_joint(*self.speed))
         acceleration = speed / self.speed_time
         return JointLimits(
-            A,
-            lower,
-            upper,
+            np.vstack([A, A]),
+            np.concatenate([lower, behind_walls[0]]),
+            np.concatenate([upper, behind_walls[1]]),
+            np.concatenate([np.zeros(len(A)), walls.look_ahead]),
             speed,
             acceleration,
             acceleration / self.acceleration_time,
@@ -99,7 +105,8 @@ class JointLimits:
     """Limits of the joints of one arm.
 
     Attributes:
-        A, lower, upper: Position limits lower <= A q <= upper, see `Arm.limit_matrix`.
+        A, lower, upper, look_ahead: Position limits lower <= A (q + T v) <= upper. The first half of the k rows is that
+            of `Arm.limit_matrix`, with T = 0. The second half is the soft walls of the command guard, see `SoftWalls`.
         speed, acceleration, jerk: Largest absolute values (n,).
         effort: Largest absolute joint efforts (n,) [N m, N].
     """
@@ -107,22 +114,60 @@ class JointLimits:
     A: NDArray[np.float64]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+    look_ahead: NDArray[np.float64]
     speed: NDArray[np.float64]
     acceleration: NDArray[np.float64]
     jerk: NDArray[np.float64]
     effort: NDArray[np.float64]
 
+    def positions(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns A (q + T v) (m, k) for positions and velocities (m, n)."""
+        return np.asarray(q @ self.A.T + self.look_ahead * (v @ self.A.T))
 
-def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) -> list[str]:
+
+def execution_limits(table: float | None) -> MotionLimits:
+    """Returns the limits that every motion must meet before an arm follows it.
+
+    The speed limit is slightly below that of the command guard with default settings.
+
+    Args:
+        table: Height of a table in the base frame [m], or None.
+    """
+    return MotionLimits(
+        margin=0.0,
+        traverse_time=0.55,
+        speed=(10.0, 1.0),
+        speed_time=0.05,
+        acceleration_time=0.01,
+        effort=0.95,
+        table=table,
+    )
+
+
+def path_collision(arm: Arm, q_start: ArrayLike, q_end: ArrayLike, table: float | None) -> str:
+    """Returns a message if the straight path in joint space between two poses (n,) has a collision, else "".
+
+    The joints move by at most 1 % of their ranges between two checked poses.
+    """
+    start, end = np.asarray(q_start, dtype=np.float64), np.asarray(q_end, dtype=np.float64)
+    steps = int(np.ceil(100 * np.max(np.abs(end - start) / (arm.position_upper - arm.position_lower)))) + 1
+    collision = first_collision(arm, start + np.linspace(0, 1, steps + 1)[:, None] * (end - start), table)
+    return collision[1] if collision else ""
+
+
+def motion_violations(
+    motion: PeriodicMotion, arm: Arm, limits: MotionLimits, model: IdentifiedModel | None = None
+) -> list[str]:
     """Returns a message for each limit that a motion exceeds, evaluated at 1 kHz.
 
     The check uses only the positions of the motion. Velocities, accelerations and jerks are their spectral derivatives,
-    and efforts are Drake's inverse dynamics of the SDF.
+    and efforts are computed with Drake's inverse dynamics.
 
     Args:
         motion: Motion of the arm.
         arm: Arm to move.
         limits: Limits of the motion.
+        model: Model that predicts the efforts, see `PredictedEffort`. None: the SDF.
     """
     joints = limits.of_arm(arm)
     count = max(round(CHECK_RATE * motion.period), 4 * len(motion.sine[0]))
@@ -130,16 +175,18 @@ def motion_violations(motion: PeriodicMotion, arm: Arm, limits: MotionLimits) ->
     q = motion.evaluate(t).q
     v, vd, jerk = (spectral_derivative(q, motion.period, order) for order in (1, 2, 3))
     names: Sequence[str] = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
-    effort = inverse_dynamics(arm, q, v, vd)
+    with_walls = [*names, *(f"{name}, with the soft wall of the guard," for name in names)]
+    predicted = PredictedEffort(arm, model)
+    effort = np.abs(predicted.by_drake(q, v, vd)) + predicted.dry_friction
     checks: list[tuple[str, Sequence[str], NDArray, NDArray, NDArray]] = [
-        ("position", names, q @ joints.A.T, joints.lower, joints.upper),
+        ("position", with_walls, joints.positions(q, v), joints.lower, joints.upper),
         *(
             (what, names, value, -limit, limit)
             for what, value, limit in (
                 ("speed", v, joints.speed),
                 ("acceleration", vd, joints.acceleration),
                 ("jerk", jerk, joints.jerk),
-                ("effort", np.abs(effort) + arm.dry_friction(), joints.effort),
+                ("effort", effort, joints.effort),
             )
         ),
     ]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, candidate_effects
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, MIN_TORQUE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -331,9 +332,10 @@ class PoseChecker:
         The approaches are checked for their length and for position limits. `unreachable` checks their collisions.
         """
         arm, joints, n = self._arm, self._joints, self._arm.num_joints
-        value = q @ joints.A.T
+        value = joints.positions(q, 0 * q)
         outside = np.any((value < joints.lower) | (value > joints.upper), axis=1)
-        effort = np.abs(inverse_dynamics(arm, q, 0 * q, 0 * q)) + arm.dry_friction()
+        predicted = PredictedEffort(arm)
+        effort = np.abs(predicted.by_drake(q, 0 * q, 0 * q)) + predicted.dry_friction
         own = [arm.joint_names.index(name) for name in self._limits.positions]
         reasons = []
         for pose, is_outside, heavy in zip(q, outside, np.any(effort > joints.effort, axis=1), strict=True):

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.soft_walls import SoftWalls
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:
@@ -22,10 +23,6 @@ Mask = NDArray[np.bool_]
 _ROUNDING = 1e-12
 
 _CLAMPED, _RATE_LIMITED = np.int8(lcmt_dvrk_status.FLAG_EFFORT_CLAMPED), np.int8(lcmt_dvrk_status.FLAG_RATE_LIMITED)
-
-#: Largest gain of a soft wall, divided by the gain of the position controller. Larger gains cause chatter at a period
-#: of 1 ms.
-_WALL_GAIN = 4.0
 
 
 def clip(x: Vector, lower: ArrayLike, upper: ArrayLike) -> Vector:
@@ -93,16 +90,15 @@ class GuardLimits:
         self.following_error = settings.following_error * width[:n]
         self.following_time = settings.following_time
         self._effort_rate = self.effort_limits / settings.effort_rise_time
-        self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
+        walls = SoftWalls.of(arm)
+        self._wall_effort, self._wall_look_ahead = walls.effort, walls.look_ahead
+        self.wall_width = np.maximum(self.margin, walls.width)
         self.kp, self.kd = np.array(arm.gains.kp), np.array(arm.gains.kd)
         self.fault_effort = settings.fault_effort * self.effort_limits
         checks = settings.plausibility
         self.start_gravity = checks.start_gravity * self.effort_limits + arm.dry_friction()
         self.start_gravity += arm.per_joint(checks.hand_effort, 10 * checks.hand_effort)
         self._look_ahead = self.kd / self.kp
-        self._wall_look_ahead = np.array([max(self._look_ahead[row != 0]) for row in self.A])
-        softest = 2 * self._wall_effort[:, None] * self.A**2 / (_WALL_GAIN * self.kp)
-        self.wall_width = np.maximum(self.margin, softest.max(axis=1))
         self._free = 0.5 * width - self.wall_width
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT

@@ -5,12 +5,13 @@ import pytest
 from command_output import refusal
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.excitation.design import contracted, random_motion, state_of
+from dvrk_drake.analysis.excitation.design import contracted
 from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
-from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
+from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
+from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 PERIOD = 5.0
 

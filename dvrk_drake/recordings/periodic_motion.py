@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -90,6 +91,7 @@ class PeriodicMotion:
         arm: Name of the arm.
         period: Period [s].
         repetitions: Number of periods.
+        table: Height of the table in the base frame that the motion avoids [m], or None.
         center: Mean positions (n,) [rad, m].
         sine, cosine: Coefficients (n, h) [rad, m].
 
@@ -108,6 +110,7 @@ class PeriodicMotion:
     arm: str = ""
     period: float = field(default=10.0, metadata=within(0.1, 1e4, "s"))
     repetitions: int = field(default=1, metadata=within(1, 10_000))
+    table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
     center: list[float] = field(default_factory=list, metadata=within(-100.0, 100.0, "rad or m"))
     sine: list[list[float]] = field(default_factory=list, metadata=within(-100.0, 100.0, "rad or m"))
     cosine: list[list[float]] = field(default_factory=list, metadata=within(-100.0, 100.0, "rad or m"))
@@ -164,6 +167,10 @@ class PeriodicMotion:
     def duration(self) -> float:
         """Duration of all repetitions [s]."""
         return self.period * self.repetitions
+
+    def digest(self) -> str:
+        """Returns 16 hexadecimal digits that identify the content of the file."""
+        return hashlib.sha256(repr(asdict(self)).encode()).hexdigest()[:16]
 
     def evaluate(self, t: ArrayLike) -> JointMotion:
         """Returns the motion at times t (m,) [s]. It is at rest before time 0 and after `duration`."""
