@@ -40,7 +40,7 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     """
     if not os.path.lexists(path):
         raise CollectionError(
-            f"{path}: the pose file does not exist. Create it with collect --teach or collect --random."
+            f"{path}: the pose file does not exist. Create it with excite --static, collect --random or --teach."
         )
     content = load_typed_yaml(PoseFile, path, CollectionError, "a pose file")
     if content.format != PoseFile.format:

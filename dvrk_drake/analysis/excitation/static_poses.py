@@ -29,6 +29,8 @@ from dvrk_drake.recordings.pose_file import save_poses
 #: Number of random poses from which the poses are selected, largest number of random poses that are drawn for this
 #: pool, and largest number of selected poses.
 POOL, MAX_DRAWN, MAX_POSES = 1500, 30_000, 300
+#: Number of drawn poses after which the search ends if none of them meets all limits.
+_MAX_FAILED = 4000
 #: Margin of the default limits, as for random poses of `collect`: there is room to approach a pose from both sides.
 MARGIN = 0.1
 #: Smallest share of an approach offset of a joint that must remain inside the limits, on both sides.
@@ -309,7 +311,7 @@ class PoseChecker:
         """
         n, drawn = self._arm.num_joints, 0
         poses, reasons = np.empty((0, n)), Counter[str]()
-        while len(poses) < size and drawn < MAX_DRAWN:
+        while len(poses) < size and drawn < (MAX_DRAWN if len(poses) else _MAX_FAILED):
             q = generator.uniform(self._joints.lower[:n], self._joints.upper[:n], (size, n))
             drawn += size
             found = self.violations(q)
