@@ -200,18 +200,19 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: "LoadedA
         return Step(title, words, done, moves=True)
 
     def parts(name: str) -> list[str]:
-        path = folder / f"{name}.yaml"
-        if not path.exists():
+        """Returns the files with a recorded motion, beginning with the longest part."""
+        if not (folder / f"{name}.yaml").exists():
             return [f"{name}.csv"]
-        loaded = PeriodicMotion.load(path, arm)
+        loaded = PeriodicMotion.load(folder / f"{name}.yaml", arm)
         recorded = motion_parts.recorded_parts(folder / f"{name}.csv", arm, loaded)
-        return [part.path.name for part in motion_parts.useful(recorded, loaded.duration)] or [f"{name}.csv"]
+        useful = sorted(motion_parts.useful(recorded, loaded.duration), key=lambda part: part.begin - part.end)
+        return [part.path.name for part in useful] or [f"{name}.csv"]
 
-    def validate(title: str, name: str, model: str, report: str) -> Step:
+    def validate(title: str, recording: str, model: str, report: str) -> Step:
         def done() -> bool:
             return (folder / report).exists() and IdentifiedModel.load(folder / model).validation is not None
 
-        words = ("validate", parts(name)[0], "--model", model, "--save", "--overwrite", "--report", report)
+        words = ("validate", recording, "--model", model, "--save", "--overwrite", "--report", report)
         return Step(title, words, done)
 
     gravity_file = "--dvrk-gc" if arm.name.startswith("MTM") else "--dvrk-kinematic-gc"
@@ -223,7 +224,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: "LoadedA
         creates("Identify a static model", STATIC, "identify", "poses.csv", *common, *gravity, "--output"),
         poses("Choose other poses", "test_poses.yaml", TEST_POSES, second),
         collect_poses("Collect the other poses", "test_poses", STATIC),
-        validate("Validate the static model", "test_poses", STATIC, "static_report.html"),
+        validate("Validate the static model", "test_poses.csv", STATIC, "static_report.html"),
         motion("Design a motion", "motion.yaml", first, "--duration", repr(settings.duration)),
         rehearse("Rehearse the motion", "motion"),
         record("Record the motion", "motion"),
@@ -231,7 +232,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: "LoadedA
         motion("Design another motion", "test_motion.yaml", second, *TEST_MOTION),
         rehearse("Rehearse the other motion", "test_motion"),
         record("Record the other motion", "test_motion"),
-        validate("Validate the full dynamics", "test_motion", DYNAMIC, "report.html"),
+        validate("Validate the full dynamics", parts("test_motion")[0], DYNAMIC, "report.html"),
         creates("Export the full dynamics", "model.sdf", "export", "--model", DYNAMIC, "--sdf"),
         creates(
             "Export the gravity compensation",
@@ -314,11 +315,14 @@ def _print_result(folder: Path, arm: "LoadedArm", name: str) -> None:
     """Prints the verdicts of both models, and the commands that use them."""
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
 
-    for file, what in ((STATIC, "holding torques"), (DYNAMIC, "motion")):
+    for file, what in ((STATIC, "holding torques of other poses"), (DYNAMIC, "efforts of another motion")):
         validation = IdentifiedModel.load(folder / file).validation
         assert validation is not None
-        verdicts = ", ".join(f"{joint} {verdict}" for joint, verdict in validation.verdicts.items())
-        print(f"{what}, on the other recording: {verdicts}", flush=True)
+        joints: dict[str, list[str]] = {}
+        for joint in arm.joint_names:
+            joints.setdefault(validation.verdicts[joint], []).append(joint)
+        verdicts = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in joints.items())
+        print(f"Verdicts for {what}: {verdicts}", flush=True)
     for file, what in (
         ("report.html", "errors and verdict of the full dynamics"),
         ("static_report.html", "errors and verdict of the static model"),
