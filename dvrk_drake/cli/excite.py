@@ -24,9 +24,9 @@ def excite(
     csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
     rate: Annotated[float, Parameter(metavar="HZ")] = DEFAULT_RATE,
     duration: Seconds = 30.0,
-    period: Seconds = 15.0,
-    harmonics: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 12,
-    starts: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 4,
+    period: Seconds | None = None,
+    harmonics: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 16,
+    starts: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 2,
     seed: Seed = 0,
     margin: Annotated[float, Parameter(metavar="SHARE")] = 0.05,
     traverse_time: Seconds = 1.0,
@@ -39,7 +39,7 @@ def excite(
     """Design a motion for the identification of an arm.
 
     The motion is periodic, at rest at both ends, and within all limits. It minimises the expected error of the efforts
-    that an identified model predicts in random states of the workspace.
+    that an identified model predicts for random motions within the limits.
 
     Args:
         output: Motion file to write.
@@ -48,7 +48,7 @@ def excite(
         csv: File for the positions and velocities over time, for other programs.
         rate: Rate of the rows of --csv, 1 to 10000.
         duration: Duration of the motion, rounded up to whole periods.
-        period: Period of the motion.
+        period: Period of the motion. Default: the duration, at most 30 s.
         harmonics: Number of harmonics, 2 to 20.
         starts: Number of random motions from which the optimisation starts.
         margin: Share of each position range that is not used, at each end, 0 to 0.4.
