@@ -103,7 +103,7 @@ def calibrate(
     Args:
         output: Folder for all files. An existing calibration in this folder is continued.
         poses: Number of static poses, 8 to 300.
-        duration: Duration of the motion, at least 15 s, rounded up to whole periods of 15 s.
+        duration: Duration of the motion, at least 15 s.
         table: Height of a table in the base frame [m].
         reset: Print and clear a fault of the arm before it moves. If the watchdog of the guard holds the arm, resume
             control.

@@ -41,7 +41,7 @@ def excite(
     """Design a motion or static poses for the identification of an arm.
 
     The motion is periodic, at rest at both ends, and within all limits. It minimises the expected error of the efforts
-    that an identified model predicts in random states of the workspace. With --static, the command selects poses for
+    that an identified model predicts for random motions within the limits. With --static, the command selects poses for
     collect instead of a motion. The poses minimise the expected error of predicted holding efforts.
 
     Args:
@@ -52,9 +52,9 @@ def excite(
         csv: File for the positions and velocities over time, for other programs.
         rate: Rate of the rows of --csv, 1 to 10000. Default: 200.
         duration: Duration of the motion, rounded up to whole periods. Default: 30.
-        period: Period of the motion. Default: 15.
-        harmonics: Number of harmonics, 2 to 20. Default: 12.
-        starts: Number of random motions from which the optimisation starts. Default: 4.
+        period: Period of the motion. Default: the duration, at most 30 s.
+        harmonics: Number of harmonics, 2 to 20. Default: 16.
+        starts: Number of random motions from which the optimisation starts. Default: 2.
         margin: Share of each position range that is not used, at each end, 0 to 0.4. Default: 0.05, with --static 0.1.
         traverse_time: Shortest time in which a joint may cross its position range. It determines the speed limits.
             Default: 1.
@@ -106,11 +106,11 @@ def excite(
         design = dvrk.design_excitation(
             moved,
             duration=30.0 if duration is None else duration,
-            period=15.0 if period is None else period,
-            harmonics=12 if harmonics is None else harmonics,
+            period=period,
+            harmonics=16 if harmonics is None else harmonics,
             limits=limits,
             model=earlier,
-            starts=4 if starts is None else starts,
+            starts=2 if starts is None else starts,
             seed=seed,
             progress=steps,
         )

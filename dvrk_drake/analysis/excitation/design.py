@@ -34,6 +34,8 @@ from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 INFORMATION_TIMES = 8
 #: Share of the effort limits that the optimisation uses, see `USED`.
 _USED_EFFORT = 0.95
+#: Longest default period [s].
+MAX_PERIOD = 30.0
 #: Largest number of major iterations of the solver.
 MAX_ITERATIONS = 60
 #: Factor by which a motion is contracted towards its centre until it has no collision and meets all limits, and largest
@@ -77,11 +79,11 @@ def design_excitation(
     arm: Arm,
     *,
     duration: float = 30.0,
-    period: float = 15.0,
-    harmonics: int = 12,
+    period: float | None = None,
+    harmonics: int = 16,
     limits: MotionLimits | None = None,
     model: IdentifiedModel | None = None,
-    starts: int = 4,
+    starts: int = 2,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ExcitationDesign:
@@ -95,7 +97,7 @@ def design_excitation(
     Args:
         arm: Arm to move.
         duration: Duration of the motion [s]. It is rounded up to whole periods.
-        period: Period [s].
+        period: Period [s]. None: the duration, at most `MAX_PERIOD`.
         harmonics: Number of harmonics, 2 to 20.
         limits: Limits of the motion. None: the defaults of `MotionLimits`.
         model: Earlier model of the arm. Its parameters and gravity vector replace those of `arm`, for the effort limits
@@ -117,6 +119,7 @@ def design_excitation(
         >>> design.expected_error < design.random_error
         True
     """
+    period = min(duration, MAX_PERIOD) if period is None else period
     for name, value, lowest, highest in (
         ("period", period, 1.0, 600.0),
         ("duration", duration, period, 36_000.0),

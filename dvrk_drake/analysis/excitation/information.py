@@ -13,18 +13,21 @@ from dvrk_drake.analysis.dynamic.columns import COULOMB_WIDTHS, BaseColumns, bas
 from dvrk_drake.analysis.dynamic.problem import FRICTION_DEVIATION, LINK_DEVIATION, MIN_ROTOR_DEVIATION
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
 
-#: Relative error of a measured effort, and time over which errors are correlated [s]. The errors are those of the
-#: model, not of the sensor. The values are those of the public motions of a real MTM and PSM.
+#: RMS error of a measured effort relative to the RMS effort of the motion, and time over which errors are correlated
+#: [s]. The errors are those of the model, not of the sensor. The values are those of the public motions of a real MTM
+#: and PSM.
 EFFORT_ERROR, CORRELATION_TIME = 0.1, 0.1
-#: Number of random states for which the expected error is computed.
-NUM_STATES = 1000
-#: RMS speed for which Coulomb friction has the widths of `identify`, as a share of the speed limit.
-RMS_SPEED = 1 / 3
+#: Number, period [s] and number of harmonics of the random motions for which the expected error is computed, and number
+#: of states per motion.
+NUM_MOTIONS, MOTION_PERIOD, MOTION_HARMONICS, STATES_PER_MOTION = 20, 10.0, 6, 50
+#: Acceleration below which presliding is smoothed, as a share of the RMS acceleration of the random motions.
+SMOOTHED_ACCELERATION = 0.2
 #: Prior standard deviation of an offset, as a share of the RMS effort.
 OFFSET_DEVIATION = 1.0
 #: Step of the central differences with respect to positions, velocities and accelerations, relative to their limits.
@@ -36,13 +39,13 @@ class MotionInformation:
     """Linear model of the efforts of an arm, with the priors of `identify`.
 
     The unknowns are the base parameters, and the viscous friction, the Coulomb friction with several widths and the
-    offset of each actuator. Cables, springs and presliding are not included.
+    offset of each actuator, and presliding. The state of presliding is that after a reversal of the velocity with
+    constant acceleration. Cables and springs are not included.
 
     Attributes:
         arm: Arm to identify.
-        limits: Limits of the motion. The positions for which efforts are predicted are uniformly distributed over the
-            position ranges of the arm without `margin`. The velocities and accelerations are normally distributed, and
-            their standard deviations are a third of the limits.
+        limits: Limits of the motion. The states for which efforts are predicted are those of random motions within
+            these limits.
         model: Earlier model of the arm, or None. If it has dynamics, the standard errors of its base parameters are
             used as those of independent measurements. Its friction and offsets are not used, because they can differ
             between recordings.
@@ -78,32 +81,53 @@ class MotionInformation:
 
     @cached_property
     def states(self) -> NDArray[np.float64]:
-        """States (3, `NUM_STATES`, n) for which efforts are predicted: q, v and vd."""
-        generator, shape = np.random.default_rng(1), (2, NUM_STATES, self.arm.num_joints)
-        q = self.arm.sample_poses(NUM_STATES, generator, self.limits.margin)
-        return np.concatenate([q[None], self.scales[1:, None] / 3 * generator.normal(size=shape)])
+        """States (3, m, n) for which efforts are predicted: q, v and vd."""
+        generator, shape = np.random.default_rng(1), (MOTION_PERIOD, MOTION_HARMONICS)
+        motions = [random_motion(self.arm, self.limits, *shape, generator, self.model) for _ in range(NUM_MOTIONS)]
+        return np.concatenate([state_of(motion, STATES_PER_MOTION) for motion in motions], axis=1)
 
     @cached_property
     def effort(self) -> NDArray[np.float64]:
-        """RMS efforts (n,) of the actuators in `states`, including dry friction."""
-        to_actuators = self.arm.transmission.inverse.pull_back_effort
-        tau = to_actuators(self.predicted.without_dry_friction(*self.states))
-        friction = to_actuators(self.predicted.dry_friction[None])[0]
-        return np.sqrt(np.mean(tau**2, axis=0) + friction**2)
+        """RMS efforts (n,) of the actuators in `states`, see `rms_effort`."""
+        return self.rms_effort(self.states)
+
+    def rms_effort(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the RMS efforts (n,) of the actuators in states (3, m, n), including dry friction."""
+        return np.sqrt(self._mean_squares(self._efforts(state)))
+
+    def _efforts(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the efforts (m, n) of the actuators in states (3, m, n), without dry friction."""
+        return self.arm.transmission.inverse.pull_back_effort(self.predicted.without_dry_friction(*state))
+
+    def _mean_squares(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the mean squares (n,) of efforts (m, n) of the actuators plus their dry friction."""
+        friction = self.arm.transmission.inverse.pull_back_effort(self.predicted.dry_friction[None])[0]
+        return np.asarray(np.mean(tau**2, axis=0) + friction**2)
+
+    @cached_property
+    def _typical(self) -> NDArray[np.float64]:
+        """Standard deviations (3, n) of positions, velocities and accelerations of the actuators in `states`."""
+        J, (q, v, vd) = self.arm.transmission, self.states
+        return np.array([x.std(axis=0) for x in (J.position(q), J.velocity(v), J.velocity(vd))])
+
+    @property
+    def _travels(self) -> NDArray[np.float64]:
+        return np.array(self.arm.identification.presliding_travels)
 
     def columns(self, state: NDArray[np.float64]) -> list[tuple[NDArray[np.int_], NDArray[np.float64]]]:
         """Returns indices (c,) and values (m, c) of the nonzero regressor columns of each actuator for (3, m, n)."""
         arm, count = self.arm, state.shape[1]
         q, v, vd = state
         Y = self._regressor.regressor(q, v, vd)
-        a_dot = arm.transmission.velocity(v)
-        speed = np.abs(arm.transmission.matrix) @ self.scales[1]
+        a_dot, a_ddot = (arm.transmission.velocity(x) / y for x, y in zip((v, vd), self._typical[1:], strict=True))
         columns = []
         for i in range(arm.num_joints):
             own, of_base = self._base.of_actuator(Y, arm.transmission.inverse.matrix[:, i])
-            u = a_dot[:, i] / speed[i]
-            friction = np.tanh(u[:, None] / (RMS_SPEED * np.array(COULOMB_WIDTHS)))
-            effects = np.column_stack([u, friction, np.ones(count)]) * self.effort[i]
+            u = a_dot[:, i, None]
+            coulomb = np.tanh(u / COULOMB_WIDTHS)
+            travels = self._typical[0, i] * self._typical[2, i] / self._typical[1, i] ** 2 * self._travels
+            presliding = _presliding(u, a_ddot[:, i, None], travels)
+            effects = np.hstack([u, coulomb, presliding, np.ones((count, 1))]) * self.effort[i]
             first, size = self.num_base + effects.shape[1] * i, effects.shape[1]
             columns.append((np.append(own, first + np.arange(size)), np.hstack([of_base, effects])))
         return columns
@@ -116,7 +140,8 @@ class MotionInformation:
         links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
         rotors = np.maximum(LINK_DEVIATION * regressor.values[10 * len(links) : p], MIN_ROTOR_DEVIATION)
         scaled = self._base.base * np.concatenate([*links, rotors])
-        of_actuator = [*[FRICTION_DEVIATION] * (1 + len(COULOMB_WIDTHS)), OFFSET_DEVIATION]
+        num_friction = 1 + len(COULOMB_WIDTHS) + len(self._travels)
+        of_actuator = [*[FRICTION_DEVIATION] * num_friction, OFFSET_DEVIATION]
         effects = np.diag(np.tile(of_actuator, self.arm.num_joints) ** -2.0)
         return np.asarray(scipy.linalg.block_diag(_inverse(scaled @ scaled.T) + self._earlier, effects))
 
@@ -152,7 +177,7 @@ class MotionInformation:
     def precision(self, state: NDArray[np.float64], period: float) -> NDArray[np.float64]:
         """Returns the precision (k, k) of the unknowns after a motion with states (3, m, n) and a period [s]."""
         H, weight = self.prior.copy(), self.weight(period, state.shape[1])
-        for (own, X), size in zip(self.columns(state), self.effort, strict=True):
+        for (own, X), size in zip(self.columns(state), self.rms_effort(state), strict=True):
             H[own[:, None], own] += weight / size**2 * (X.T @ X)
         return H
 
@@ -170,11 +195,14 @@ class MotionInformation:
         square = float(np.sum(self._target * C))
         weight = self.weight(period, state.shape[1])
         D = -weight / square * (C @ self._target @ C)
-        # Derivative of log(error) with respect to the columns X of an actuator: X D / s^2.
-        G = [
-            (own, X @ D[own[:, None], own] / size**2)
-            for (own, X), size in zip(self.columns(state), self.effort, strict=True)
-        ]
+        tau = self._efforts(state)
+        squares = self._mean_squares(tau)
+        # Derivatives of log(error) with respect to the columns X of an actuator (X D / s^2), and to the efforts, on
+        # which the RMS effort s of the motion depends.
+        G, by_effort = [], np.empty_like(tau)
+        for i, (own, X) in enumerate(self.columns(state)):
+            G.append(X @ D[own[:, None], own] / squares[i])
+            by_effort[:, i] = -np.sum(G[i] * X) / squares[i] * tau[:, i] / len(tau)
         gradient = np.empty_like(state)
         for k in range(3):
             for j in range(state.shape[2]):
@@ -182,10 +210,10 @@ class MotionInformation:
                 ahead, back = state.copy(), state.copy()
                 ahead[k, :, j] += step
                 back[k, :, j] -= step
-                gradient[k, :, j] = sum(
-                    np.sum(g * (X - Z), axis=1)
-                    for (_, g), (_, X), (_, Z) in zip(G, self.columns(ahead), self.columns(back), strict=True)
-                ) / (2 * step)
+                change = np.sum(by_effort * (self._efforts(ahead) - self._efforts(back)), axis=1)
+                for g, (_, X), (_, Z) in zip(G, self.columns(ahead), self.columns(back), strict=True):
+                    change += np.sum(g * (X - Z), axis=1)
+                gradient[k, :, j] = change / (2 * step)
         return 0.5 * float(np.log(square)), gradient
 
     def known_parameters(self, state: NDArray[np.float64], period: float, share: float = 0.1) -> int:
@@ -198,7 +226,7 @@ class MotionInformation:
     def condition_number(self, state: NDArray[np.float64]) -> float:
         """Returns the condition number of the base parameters' columns, divided by the efforts and column norms."""
         H = np.zeros((self.num_base, self.num_base))
-        for (own, X), size in zip(self.columns(state), self.effort, strict=True):
+        for (own, X), size in zip(self.columns(state), self.rms_effort(state), strict=True):
             of_base = own < self.num_base
             H[own[of_base][:, None], own[of_base]] += X[:, of_base].T @ X[:, of_base] / size**2
         norms = np.sqrt(np.diag(H))
@@ -211,6 +239,21 @@ class MotionInformation:
         """Returns the gain in log-determinant of the precision over the prior, divided by the number of unknowns."""
         ratio = np.linalg.slogdet(self.precision(state, period))[1] - np.linalg.slogdet(self.prior)[1]
         return float(ratio) / len(self.prior)
+
+
+def _presliding(v: NDArray[np.float64], vd: NDArray[np.float64], travels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the states (m, d) of presliding elements after a reversal of the velocity with constant acceleration.
+
+    After a reversal, an element with the travel d changes from -sign(v) to sign(v) over a distance of 2 d. The arm has
+    moved by v^2 / (2 |vd|) since the reversal.
+
+    Args:
+        v, vd: Velocities and accelerations (m, 1), in units of their standard deviations.
+        travels: Travels (d,) of the elements, in consistent units.
+    """
+    sign = np.where(v < 0, -1.0, 1.0)
+    x = vd * sign - v**2 / (4 * travels)
+    return np.asarray(sign * (1 - (x + np.hypot(x, SMOOTHED_ACCELERATION)) / np.hypot(vd, SMOOTHED_ACCELERATION)))
 
 
 def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -29,7 +29,7 @@ def state(information):
 
 def test_expected_error_is_that_of_simulated_estimates(information, state):
     """Parameters from the prior and measurements with noise give maximum-a-posteriori estimates with this error."""
-    generator, effort = np.random.default_rng(0), information.effort
+    generator, effort = np.random.default_rng(0), information.rms_effort(state)
     deviation = np.linalg.cholesky(np.linalg.inv(information.prior))
     H = information.precision(state, PERIOD)
     weight = information.weight(PERIOD, state.shape[1])
@@ -44,7 +44,7 @@ def test_expected_error_is_that_of_simulated_estimates(information, state):
         squares.append(
             [
                 np.mean((X @ error[own]) ** 2) / size**2
-                for (own, X), size in zip(information.columns(information.states), effort, strict=True)
+                for (own, X), size in zip(information.columns(information.states), information.effort, strict=True)
             ]
         )
     assert np.sqrt(np.mean(squares)) == pytest.approx(information.expected_error(state, PERIOD), rel=0.1)
