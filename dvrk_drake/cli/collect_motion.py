@@ -74,7 +74,7 @@ def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> 
         controller, link, _period = ready_controller(controlled, "hold")
         with closing(link()) as opened:
             q = np.array(opened.next_status(_SILENCE).position)
-        _check_path(arm, q, motion, begin)
+        _check_path(arm, q, motion, begin, controlled.model)
         stopped = stop_on_signals()
     line, speed = LiveLine(sys.stderr), REHEARSAL_SPEED if create is None else 1.0
     has_keys = sys.stdin is not None and sys.stdin.isatty()
@@ -141,12 +141,14 @@ def _check_motion(path: str, motion: PeriodicMotion, arm: Arm) -> None:
         raise CollectionError(f"{path}: {violations[0]}; design a motion within the limits of {arm.name}")
 
 
-def _check_path(arm: Arm, q: NDArray[np.float64], motion: PeriodicMotion, begin: float) -> None:
-    """Checks that the straight path in joint space from q (n,) to the start of the motion has no collision."""
-    from dvrk_drake.analysis.excitation.motion_limits import path_collision
+def _check_path(arm: Arm, q: NDArray[np.float64], motion: PeriodicMotion, begin: float, model: str | None) -> None:
+    """Checks that the arm can move on the straight path in joint space from q (n,) to the start of the motion."""
+    from dvrk_drake.analysis.excitation.motion_limits import path_obstacle
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
 
-    if collision := path_collision(arm, q, motion.evaluate([begin]).q[0], motion.table):
+    loaded = None if model is None else IdentifiedModel.load(model, arm)
+    if obstacle := path_obstacle(arm, q, motion.evaluate([begin]).q[0], motion.table, loaded):
         raise CollectionError(
-            f"{arm.name}: {collision} on the way from its present pose to the start of the motion. Move the arm by "
+            f"{arm.name} cannot move from its present pose to the start of the motion: {obstacle}. Move the arm by "
             "hand to another pose first (dvrk-drake run --mode gravity)"
         )

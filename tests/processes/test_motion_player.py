@@ -108,7 +108,7 @@ def test_long_pause_ends_the_motion(monkeypatch, motion):
     assert player.finished and player.problem is None and player.motion_time < motion.duration
 
 
-def test_stop_brakes_on_the_path_and_next_run_records_the_missing_part(tmp_path, motion):
+def test_missing_part_is_recorded_after_a_stop(tmp_path, motion):
     path, stop = tmp_path / "m.csv", []
     player, controller, sticky = make_player(motion, path, stopped=lambda: bool(stop))
     run_collector(player, controller, sticky, 20.0, lambda: player.motion_time > 1.5)

@@ -144,15 +144,35 @@ def execution_limits(table: float | None) -> MotionLimits:
     )
 
 
-def path_collision(arm: Arm, q_start: ArrayLike, q_end: ArrayLike, table: float | None) -> str:
-    """Returns a message if the straight path in joint space between two poses (n,) has a collision, else "".
+def path_obstacle(
+    arm: Arm, q_start: ArrayLike, q_end: ArrayLike, table: float | None, model: IdentifiedModel | None = None
+) -> str:
+    """Returns why an arm cannot move on the straight path in joint space between two poses (n,), or "".
 
-    The joints move by at most 1 % of their ranges between two checked poses.
+    The joints move by at most 1 % of their ranges between two checked poses. A motor must hold each pose, and overcome
+    its dry friction, with less than the effort of `execution_limits`.
+
+    Args:
+        arm: Arm to move.
+        q_start, q_end: First and last pose (n,) [rad, m].
+        table: Height of a table in the base frame [m], or None.
+        model: Model that predicts the efforts, see `PredictedEffort`.
     """
     start, end = np.asarray(q_start, dtype=np.float64), np.asarray(q_end, dtype=np.float64)
     steps = int(np.ceil(100 * np.max(np.abs(end - start) / (arm.position_upper - arm.position_lower)))) + 1
-    collision = first_collision(arm, start + np.linspace(0, 1, steps + 1)[:, None] * (end - start), table)
-    return collision[1] if collision else ""
+    q = start + np.linspace(0, 1, steps + 1)[:, None] * (end - start)
+    if collision := first_collision(arm, q, table):
+        return collision[1]
+    predicted = PredictedEffort(arm, model)
+    share = (np.abs(predicted.by_drake(q, 0 * q, 0 * q)) + predicted.dry_friction) / arm.effort_limits
+    k, j = np.unravel_index(int(np.argmax(share)), share.shape)
+    if share[k, j] <= execution_limits(table).effort:
+        return ""
+    unit = "m" if arm.prismatic[j] else "rad"
+    return (
+        f"{arm.joint_names[j]} at {q[k, j]:.3g} {unit} needs {100 * share[k, j]:.0f} % of its effort limit to hold the "
+        "arm and to overcome its friction"
+    )
 
 
 def motion_violations(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
+from dvrk_drake.analysis.excitation.random_motion import middle_pose
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, candidate_effects
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, MIN_TORQUE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -298,7 +299,8 @@ class PoseChecker:
     def __init__(self, arm: Arm, limits: MotionLimits) -> None:
         """Constructs the checker for an arm and the limits of its poses."""
         self._arm, self._limits, self._joints = arm, limits, limits.of_arm(arm)
-        self._detector = CollisionDetector(arm, limits.table)
+        self._detector, self._predicted = CollisionDetector(arm, limits.table), PredictedEffort(arm)
+        self._middle = middle_pose(arm, limits, np.random.default_rng(0))
         self._offsets = effort_approach(arm), range_approach(arm)
         self._span = arm.position_upper - arm.position_lower
         self._reachable: set[int] = set()
@@ -334,11 +336,9 @@ class PoseChecker:
         arm, joints, n = self._arm, self._joints, self._arm.num_joints
         value = joints.positions(q, 0 * q)
         outside = np.any((value < joints.lower) | (value > joints.upper), axis=1)
-        predicted = PredictedEffort(arm)
-        effort = np.abs(predicted.by_drake(q, 0 * q, 0 * q)) + predicted.dry_friction
         own = [arm.joint_names.index(name) for name in self._limits.positions]
         reasons = []
-        for pose, is_outside, heavy in zip(q, outside, np.any(effort > joints.effort, axis=1), strict=True):
+        for pose, is_outside in zip(q, outside, strict=True):
             begins = [begin for side in (-1, 1) for begin in self.starts(pose, side)]
             if is_outside:
                 reasons.append("coupled limit")
@@ -349,7 +349,7 @@ class PoseChecker:
                 reasons.append("no room to approach the pose from both sides")
             elif any(np.any((x < joints.lower[:n])[own] | (x > joints.upper[:n])[own]) for x in begins):
                 reasons.append("position limit at the start of an approach")
-            elif heavy:
+            elif not self._can_hold(self._path(self._middle, pose)):
                 reasons.append("effort limit")
             else:
                 reasons.append(self._obstacle(pose))
@@ -367,11 +367,20 @@ class PoseChecker:
         """Returns the poses (n,) at which approaches of `pose` begin, for collections over LCM and by the dVRK."""
         return [offset_pose(self._arm, pose, side * offset) for offset in self._offsets]
 
-    def is_free(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
-        """Returns whether the straight path between two poses (n,) is free of collisions."""
+    def _path(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns poses (m, n) on the straight path between two poses (n,)."""
         steps = int(np.ceil(np.max(np.abs(end - begin) / self._span) / PATH_STEP - 1e-9))
-        shares = np.arange(steps + 1) / max(steps, 1)
-        return not any(self._obstacle(begin + share * (end - begin)) for share in shares)
+        return np.asarray(begin + (np.arange(steps + 1) / max(steps, 1))[:, None] * (end - begin))
+
+    def _can_hold(self, q: NDArray[np.float64]) -> bool:
+        """Returns whether the holding efforts plus the dry friction meet the limits at all poses (m, n)."""
+        effort = np.abs(self._predicted.by_drake(q, 0 * q, 0 * q)) + self._predicted.dry_friction
+        return bool(np.all(effort <= self._joints.effort))
+
+    def is_free(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+        """Returns whether the straight path between two poses (n,) has no collision and meets the effort limits."""
+        path = self._path(begin, end)
+        return self._can_hold(path) and not any(self._obstacle(pose) for pose in path)
 
     def unreachable(self, pool: NDArray[np.float64], chosen: list[int]) -> list[int]:
         """Returns the chosen poses of the pool whose approaches are not free of collisions."""
