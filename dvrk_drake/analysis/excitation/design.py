@@ -90,9 +90,9 @@ def design_excitation(
     """Designs a motion for `identify`: periodic, at rest at both ends, and within all limits.
 
     The motion of each joint is a Fourier series. The coefficients minimise the expected error of efforts that the
-    identified model predicts in random states of the arm (V-optimality), see `MotionInformation`. The solver is SNOPT,
-    started from several random motions. The best motion is contracted towards its centre until `motion_violations`
-    finds nothing.
+    identified model predicts for random motions within the limits (V-optimality), see `MotionInformation`. The solver
+    is SNOPT, started from several random motions. The best motion is contracted towards its centre until
+    `motion_violations` finds nothing.
 
     Args:
         arm: Arm to move.
