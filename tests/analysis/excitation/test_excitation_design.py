@@ -72,7 +72,7 @@ def test_more_information_gives_a_smaller_error(information, state):
     assert information.condition_number(state) < information.condition_number(at_rest)
 
 
-def test_presliding_is_that_of_a_motion_with_constant_acceleration():
+def test_presliding_with_constant_acceleration():
     """The state is compared with that of `ActuatorEffect` for a back-and-forth motion with constant acceleration."""
     vd, travel = 2.0, 0.1
     t = np.arange(-2.0, 1.0, 1e-4)[:, None]

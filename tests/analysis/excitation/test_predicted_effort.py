@@ -72,7 +72,7 @@ def test_heavier_links_leave_less_effort_for_the_motion(arm):
         random_motion(arm, limits, PERIOD, 4, np.random.default_rng(0), heavy)
 
 
-def test_second_motion_adds_more_information_than_the_first_motion_again(arm):
+def test_second_motion_adds_more_information(arm):
     limits, rng = MotionLimits(effort=0.8), np.random.default_rng(3)
     options = {"limits": limits, "duration": PERIOD, "period": PERIOD, "harmonics": 4, "starts": 1}
     first = dvrk.design_excitation(arm, **options)
