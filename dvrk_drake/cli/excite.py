@@ -48,7 +48,8 @@ def excite(
         csv: File for the positions and velocities over time, for other programs.
         rate: Rate of the rows of --csv, 1 to 10000.
         duration: Duration of the motion, rounded up to whole periods.
-        period: Period of the motion. Default: the duration, at most 30 s.
+        period: Period of the motion. Default: the duration divided by the smallest number for which the period is at
+            most 30 s.
         harmonics: Number of harmonics, 2 to 20.
         starts: Number of random motions from which the optimisation starts.
         margin: Share of each position range that is not used, at each end, 0 to 0.4.

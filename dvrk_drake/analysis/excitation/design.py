@@ -97,7 +97,8 @@ def design_excitation(
     Args:
         arm: Arm to move.
         duration: Duration of the motion [s]. It is rounded up to whole periods.
-        period: Period [s]. None: the duration, at most `MAX_PERIOD`.
+        period: Period [s]. None: the duration divided by the smallest number for which the period is at
+            most `MAX_PERIOD`.
         harmonics: Number of harmonics, 2 to 20.
         limits: Limits of the motion. None: the defaults of `MotionLimits`.
         model: Earlier model of the arm. Its parameters and gravity vector replace those of `arm`, for the effort limits
@@ -119,7 +120,7 @@ def design_excitation(
         >>> design.expected_error < design.random_error
         True
     """
-    period = min(duration, MAX_PERIOD) if period is None else period
+    period = duration / max(np.ceil(duration / MAX_PERIOD), 1.0) if period is None else period
     for name, value, lowest, highest in (
         ("period", period, 1.0, 600.0),
         ("duration", duration, period, 36_000.0),

@@ -123,6 +123,7 @@ def test_motion_above_a_table_is_contracted():
     [
         ({"harmonics": 1}, "harmonics is 1; allowed: 2 to 20"),
         ({"duration": 0.5}, "period is 0.5; allowed: 1 to 600"),
+        ({"duration": float("nan")}, "period is nan; allowed: 1 to 600"),
         ({"duration": 3.0, "period": 5.0}, "duration is 3; allowed: 5 to 36000"),
         ({"starts": 0}, "starts is 0"),
         ({"limits": MotionLimits(effort=0.05)}, "the dry friction exceeds 5 % of the effort limit"),
