@@ -90,14 +90,15 @@ def design_excitation(
     """Designs a motion for `identify`: periodic, at rest at both ends, and within all limits.
 
     The motion of each joint is a Fourier series. The coefficients minimise the expected error of efforts that the
-    identified model predicts in random states of the arm (V-optimality), see `MotionInformation`. The solver is SNOPT,
-    started from several random motions. The best motion is contracted towards its centre until `motion_violations`
-    finds nothing.
+    identified model predicts for random motions within the limits (V-optimality), see `MotionInformation`. The solver
+    is SNOPT, started from several random motions. The best motion is contracted towards its centre until
+    `motion_violations` finds nothing.
 
     Args:
         arm: Arm to move.
         duration: Duration of the motion [s]. It is rounded up to whole periods.
-        period: Period [s]. None: the duration, at most `MAX_PERIOD`.
+        period: Period [s]. None: the duration divided by the smallest number for which the period is at
+            most `MAX_PERIOD`.
         harmonics: Number of harmonics, 2 to 20.
         limits: Limits of the motion. None: the defaults of `MotionLimits`.
         model: Earlier model of the arm. Its parameters and gravity vector replace those of `arm`, for the effort limits
@@ -119,7 +120,7 @@ def design_excitation(
         >>> design.expected_error < design.random_error
         True
     """
-    period = min(duration, MAX_PERIOD) if period is None else period
+    period = duration / max(np.ceil(duration / MAX_PERIOD), 1.0) if period is None else period
     for name, value, lowest, highest in (
         ("period", period, 1.0, 600.0),
         ("duration", duration, period, 36_000.0),

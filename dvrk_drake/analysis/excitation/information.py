@@ -38,9 +38,9 @@ _STEP = 1e-5
 class MotionInformation:
     """Linear model of the efforts of an arm, with the priors of `identify`.
 
-    The unknowns are the base parameters, and the viscous friction, the Coulomb friction with several widths and the
-    offset of each actuator, and presliding. The state of presliding is that after a reversal of the velocity with
-    constant acceleration. Cables and springs are not included.
+    The unknowns are the base parameters, and for each actuator the viscous friction, the Coulomb friction with several
+    widths, the presliding friction with several travels, and the offset. The state of presliding is that after a
+    reversal of the velocity with constant acceleration. Cables and springs are not included.
 
     Attributes:
         arm: Arm to identify.
@@ -182,7 +182,7 @@ class MotionInformation:
         return H
 
     def expected_error(self, state: NDArray[np.float64], period: float) -> float:
-        """Returns the expected RMS error of predicted efforts in random states, relative to the RMS efforts [1].
+        """Returns the expected RMS error of predicted efforts in `states`, relative to the RMS efforts [1].
 
         Errors that a larger number of parameters would explain are not included. The square is the criterion of
         V-optimality.

@@ -6,10 +6,11 @@ from command_output import refusal
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.design import contracted
-from dvrk_drake.analysis.excitation.information import MotionInformation
+from dvrk_drake.analysis.excitation.information import MotionInformation, _presliding
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
@@ -71,17 +72,29 @@ def test_more_information_gives_a_smaller_error(information, state):
     assert information.condition_number(state) < information.condition_number(at_rest)
 
 
+def test_presliding_with_constant_acceleration():
+    """The state is compared with that of `ActuatorEffect` for a back-and-forth motion with constant acceleration."""
+    vd, travel = 2.0, 0.1
+    t = np.arange(-2.0, 1.0, 1e-4)[:, None]
+    v = vd * t
+    element = ActuatorEffect("actuator", "presliding", travel).column(vd * t[:, 0] ** 2 / 2, v[:, 0])
+    found = _presliding(v, np.full_like(v, vd), np.array([travel]))[:, 0]
+    sliding = t[:, 0] > -1.5  # the element starts from state 0
+    np.testing.assert_allclose(found[sliding], element[sliding], atol=0.12)
+    assert np.sqrt(np.mean((found - element)[sliding] ** 2)) < 0.03
+
+
 def test_design_meets_limits_and_beats_random_motions(information):
     arm = information.arm
     limits = MotionLimits(margin=0.1, traverse_time=1.5)
-    design = dvrk.design_excitation(arm, duration=12.0, period=PERIOD, harmonics=4, limits=limits, starts=1)
+    design = dvrk.design_excitation(arm, duration=12.0, period=PERIOD, harmonics=6, limits=limits, starts=1)
     assert design.motion.duration == 15.0
     assert motion_violations(design.motion, arm, limits) == []
     own = MotionInformation(arm, limits)
     generator = np.random.default_rng(4)
-    randoms = [own.expected_error(state_of(random_motion(arm, limits, PERIOD, 4, generator), 40), PERIOD) for _ in "ab"]
+    randoms = [own.expected_error(state_of(random_motion(arm, limits, PERIOD, 6, generator), 48), PERIOD) for _ in "ab"]
     assert design.expected_error < 0.75 * min(*randoms, design.random_error)
-    assert design.expected_error == pytest.approx(own.expected_error(state_of(design.motion, 40), PERIOD), rel=0.02)
+    assert design.expected_error == pytest.approx(own.expected_error(state_of(design.motion, 48), PERIOD), rel=0.02)
 
 
 def test_random_motions_meet_nearly_all_limits(information):
@@ -109,6 +122,8 @@ def test_motion_above_a_table_is_contracted():
     ("argument", "message"),
     [
         ({"harmonics": 1}, "harmonics is 1; allowed: 2 to 20"),
+        ({"duration": 0.5}, "period is 0.5; allowed: 1 to 600"),
+        ({"duration": float("nan")}, "period is nan; allowed: 1 to 600"),
         ({"duration": 3.0, "period": 5.0}, "duration is 3; allowed: 5 to 36000"),
         ({"starts": 0}, "starts is 0"),
         ({"limits": MotionLimits(effort=0.05)}, "the dry friction exceeds 5 % of the effort limit"),

@@ -79,7 +79,7 @@ def test_heavier_links_leave_less_effort_for_the_motion(arm):
         random_motion(arm, limits, PERIOD, 4, np.random.default_rng(0), heavy)
 
 
-def test_second_motion_adds_more_than_a_repetition(arm):
+def test_second_motion_adds_more_information(arm):
     limits, rng = MotionLimits(effort=0.8), np.random.default_rng(3)
     options = {"limits": limits, "duration": PERIOD, "period": PERIOD, "harmonics": 4, "starts": 1}
     first = dvrk.design_excitation(arm, **options)
