@@ -1,82 +1,28 @@
 """Command that calibrates a connected arm: a sequence of other commands, each with named files in one folder."""
 
-# This file has no postponed annotations, because load_typed_yaml reads the types at run time.
+from __future__ import annotations
+
 import ctypes
 import shlex
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Realtime, Seconds, Seed, app, whole_number
-from dvrk_drake.cli.support import mounted, print_written
-from dvrk_drake.errors import CollectionError, DvrkDrakeError
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.cli.support import print_written
+from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm as LoadedArm
 
-#: Names of the files in the folder.
-SETTINGS, NOMINAL, STATIC, DYNAMIC = "calibration.yaml", "nominal.yaml", "static.yaml", "model.yaml"
-#: Number of the poses with which the static model is validated.
-TEST_POSES = 10
-#: Options of the motion with which the full dynamics is validated. It has other frequencies than the first motion.
-TEST_MOTION = ("--duration", "20", "--period", "20", "--harmonics", "10", "--starts", "1")
 #: Time after which a signal is sent to the running command, which may have received it from the terminal [s].
 _FORWARD = 0.5
 _SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-
-
-@dataclass
-class CalibrationSettings:
-    """Schema of the settings file of a calibration.
-
-    Attributes:
-        format: Format of the file.
-        arm: Name of the arm, or path of an arm file.
-        poses: Number of static poses.
-        duration: Duration of the motion [s].
-        seed: Seed of the designs.
-        gravity: Gravity vector in the base frame [m/s^2], or an empty list for the vector in the arm file.
-        table: Height of a table in the base frame [m], or None.
-    """
-
-    format: str = "dvrk_drake calibration 1"
-    arm: str = ""
-    poses: int = field(default=40, metadata=within(8, 300))
-    duration: float = field(default=30.0, metadata=within(15.0, 3600.0, "s"))
-    seed: int = field(default=0, metadata=within(0, 1_000_000))
-    gravity: list[float] = field(default_factory=list, metadata=within(-20.0, 20.0, "m/s^2"))
-    table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
-
-    def __post_init__(self) -> None:
-        if fault := number_fault(self):
-            raise CollectionError(f"settings of the calibration: {fault}")
-
-
-@dataclass(frozen=True)
-class Step:
-    """Step of a calibration.
-
-    Attributes:
-        title: Description for the user.
-        words: Command that runs in the folder of the calibration, without the name of the program.
-        done: Function that returns whether the step is complete.
-        moves: Whether the command moves the arm.
-        is_required: Whether the calibration ends if the command fails.
-    """
-
-    title: str
-    words: tuple[str, ...]
-    done: Callable[[], bool]
-    moves: bool = False
-    is_required: bool = True
 
 
 @app.command(group=HARDWARE)
@@ -109,6 +55,8 @@ def calibrate(
             control.
         yes: Move the arm without a question on the terminal.
     """
+    from dvrk_drake.cli.calibration_steps import CalibrationSettings, calibration_steps, prepare_folder
+
     began = time.monotonic()
     folder = Path(output)
     settings = CalibrationSettings(
@@ -119,7 +67,7 @@ def calibrate(
         gravity=list(gravity or ()),
         table=table,
     )
-    loaded = _prepare(folder, settings)
+    loaded = prepare_folder(folder, settings)
     connection = [f"--lcm-url={lcm_url}"] if lcm_url else []
     connection += ["--key", _absolute(key)] if key else []
     connection += ["--realtime"] if realtime else []
@@ -150,134 +98,6 @@ def calibrate(
     _print_result(folder, loaded, settings.arm)
     minutes = (time.monotonic() - began) / 60
     print(f"{minutes:.1f} min in total, of which the arm was controlled for {moving / 60:.1f} min", flush=True)
-
-
-def calibration_steps(folder: Path, settings: CalibrationSettings, arm: "LoadedArm") -> list[Step]:
-    """Returns the steps of a calibration, in order. Their commands run in the folder."""
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.recordings import motion_parts
-    from dvrk_drake.recordings.periodic_motion import PeriodicMotion
-    from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
-
-    common = ["--arm", settings.arm]
-    gravity = ["--gravity", *map(repr, settings.gravity)] if settings.gravity else []
-    table = [] if settings.table is None else ["--table", repr(settings.table)]
-
-    def creates(title: str, output: str, *words: str, is_required: bool = True) -> Step:
-        return Step(title, (*words, output), (folder / output).exists, is_required=is_required)
-
-    def poses(title: str, output: str, count: int, seed: int) -> Step:
-        words = ("excite", *common, *gravity, *table, "--static", str(count), "--seed", str(seed), "--output")
-        return creates(title, output, *words)
-
-    def collect_poses(title: str, name: str, model: str) -> Step:
-        def done() -> bool:
-            measured = CollectionFile(folder / f"{name}.csv", arm, both_sides=True)
-            return bool(measured.finished(load_poses(folder / f"{name}.yaml", arm)).all())
-
-        words = ("collect", *common, "--poses", f"{name}.yaml", "--output", f"{name}.csv", "--model", model)
-        return Step(title, words, done, moves=True)
-
-    def motion(title: str, output: str, seed: int, *options: str) -> Step:
-        words = ("excite", *common, *table, "--model", STATIC, *options, "--seed", str(seed), "--output")
-        return creates(title, output, *words)
-
-    def rehearse(title: str, name: str) -> Step:
-        def done() -> bool:
-            path = folder / f"{name}.yaml"
-            return motion_parts.is_rehearsed(path, arm, PeriodicMotion.load(path, arm))
-
-        words = ("collect", *common, "--motion", f"{name}.yaml", "--rehearse", "--model", STATIC)
-        return Step(title, words, done, moves=True)
-
-    def record(title: str, name: str) -> Step:
-        def done() -> bool:
-            loaded = PeriodicMotion.load(folder / f"{name}.yaml", arm)
-            parts = motion_parts.recorded_parts(folder / f"{name}.csv", arm, loaded)
-            return motion_parts.begin_of_rest(parts, loaded.duration) is None
-
-        words = ("collect", *common, "--motion", f"{name}.yaml", "--output", f"{name}.csv", "--model", STATIC)
-        return Step(title, words, done, moves=True)
-
-    def parts(name: str) -> list[str]:
-        """Returns the files with a recorded motion, beginning with the longest part."""
-        if not (folder / f"{name}.yaml").exists():
-            return [f"{name}.csv"]
-        loaded = PeriodicMotion.load(folder / f"{name}.yaml", arm)
-        recorded = motion_parts.recorded_parts(folder / f"{name}.csv", arm, loaded)
-        useful = sorted(motion_parts.useful(recorded, loaded.duration), key=lambda part: part.begin - part.end)
-        return [part.path.name for part in useful] or [f"{name}.csv"]
-
-    def validate(title: str, recording: str, model: str, report: str) -> Step:
-        def done() -> bool:
-            return (folder / report).exists() and IdentifiedModel.load(folder / model).validation is not None
-
-        words = ("validate", recording, "--model", model, "--save", "--overwrite", "--report", report)
-        return Step(title, words, done)
-
-    gravity_file = "--dvrk-gc" if arm.name.startswith("MTM") else "--dvrk-kinematic-gc"
-    first, second = settings.seed, settings.seed + 1
-    identified = ("identify", *parts("motion"), *common, *gravity, "--report", "model_report.html", "--overwrite")
-    return [
-        poses("Choose static poses", "poses.yaml", settings.poses, first),
-        collect_poses("Collect the static poses", "poses", NOMINAL),
-        creates("Identify a static model", STATIC, "identify", "poses.csv", *common, *gravity, "--output"),
-        poses("Choose other poses", "test_poses.yaml", TEST_POSES, second),
-        collect_poses("Collect the other poses", "test_poses", STATIC),
-        validate("Validate the static model", "test_poses.csv", STATIC, "static_report.html"),
-        motion("Design a motion", "motion.yaml", first, "--duration", repr(settings.duration)),
-        rehearse("Rehearse the motion", "motion"),
-        record("Record the motion", "motion"),
-        creates("Identify the full dynamics", DYNAMIC, *identified, "--output"),
-        motion("Design another motion", "test_motion.yaml", second, *TEST_MOTION),
-        rehearse("Rehearse the other motion", "test_motion"),
-        record("Record the other motion", "test_motion"),
-        validate("Validate the full dynamics", parts("test_motion")[0], DYNAMIC, "report.html"),
-        creates("Export the full dynamics", "model.sdf", "export", "--model", DYNAMIC, "--sdf"),
-        creates(
-            "Export the gravity compensation",
-            "gravity.json",
-            *("export", "--model", STATIC, gravity_file),
-            is_required=False,
-        ),
-    ]
-
-
-def _prepare(folder: Path, settings: CalibrationSettings) -> "LoadedArm":
-    """Creates the folder with the settings and the nominal model, or checks an existing folder. Returns the arm.
-
-    Raises:
-        DvrkDrakeError: The folder cannot be used, or contains a calibration with other settings.
-    """
-    import yaml
-
-    import dvrk_drake as dvrk
-    from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.models.typed_yaml import load_typed_yaml
-
-    gravity = settings.gravity
-    arm = mounted(dvrk.load_arm(settings.arm), (gravity[0], gravity[1], gravity[2]) if gravity else None)
-    path = folder / SETTINGS
-    if path.exists():
-        found = load_typed_yaml(CalibrationSettings, path, CollectionError, "settings of a calibration")
-        for name, value in asdict(settings).items():
-            if value != (earlier := getattr(found, name)):
-                raise CollectionError(
-                    f"{path}: {name} is {earlier}, but {value} was given; give the same options, or another folder"
-                )
-        return arm
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        is_used = any(folder.iterdir())
-    except OSError as error:
-        raise CollectionError(f"{folder}: the folder cannot be created: {error.strerror}") from error
-    if is_used:
-        raise CollectionError(f"{folder}: the folder is not empty and has no calibration; give a new folder")
-    springs = arm.effects.cables + arm.effects.springs
-    dvrk.IdentifiedModel.from_arm(arm, springs).save(folder / NOMINAL)
-    with atomic_write(path) as stream:
-        yaml.safe_dump(asdict(settings), stream, sort_keys=False)
-    return arm
 
 
 def _absolute(path: str) -> str:
@@ -311,8 +131,9 @@ def _end_with_parent() -> None:
     ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
-def _print_result(folder: Path, arm: "LoadedArm", name: str) -> None:
+def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
     """Prints the verdicts of both models, and the commands that use them."""
+    from dvrk_drake.cli.calibration_steps import DYNAMIC, STATIC
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
 
     for file, what in ((STATIC, "holding torques of other poses"), (DYNAMIC, "efforts of another motion")):

@@ -12,12 +12,13 @@ from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of, whole_number
 from dvrk_drake.cli.collect_motion import collect_motion
-from dvrk_drake.cli.lcm import ControlledArm, ready_controller
+from dvrk_drake.cli.lcm import ControlledArm, checked_start, ready_controller
 from dvrk_drake.cli.support import (
     check_output,
     check_ros_options,
     interrupt_ends_process,
     load_key,
+    load_model,
     print_notes,
     print_written,
     quiet_drake,
@@ -251,6 +252,10 @@ def _visit(
     traverse_time: float,
     _: RosCollection,
 ) -> None:
+    import numpy as np
+
+    from dvrk_drake.models.approach import effort_approach
+    from dvrk_drake.models.coupled_limits import offset_pose
     from dvrk_drake.processes.collector import CollectionSettings, Collector
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
@@ -264,6 +269,10 @@ def _visit(
         return
     with interrupt_ends_process():
         controller, link, _period = ready_controller(controlled, "hold")
+        first = poses[int(np.argmin(output.finished(poses)))]
+        if both_sides:
+            first = offset_pose(arm, first, -effort_approach(arm))
+        checked_start(load_model(controlled.model, controlled.arm), link, first)
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=line.report)

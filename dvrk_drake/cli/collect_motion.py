@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import sys
-from contextlib import closing
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.lcm import ControlledArm, ready_controller
+from dvrk_drake.cli.lcm import ControlledArm, checked_start, ready_controller
 from dvrk_drake.cli.support import check_output, interrupt_ends_process, print_written
 from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.recordings.motion_parts import MotionPartFile
     from dvrk_drake.recordings.periodic_motion import PeriodicMotion
-
-#: Longest time until a status of the arm arrives [s].
-_SILENCE = 1.0
 
 
 def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> None:
@@ -36,8 +30,7 @@ def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> 
             cannot be controlled or does not follow.
         KeyboardInterrupt: A signal ended the motion. The arm holds its pose.
     """
-    import numpy as np
-
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
@@ -69,12 +62,11 @@ def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> 
         def create() -> MotionPartFile:
             return motion_parts.MotionPartFile(part_path, arm, motion)
 
-    _check_motion(path, motion, arm)
+    model = IdentifiedModel.from_arm(arm) if controlled.model is None else IdentifiedModel.load(controlled.model, arm)
+    _check_motion(path, motion, arm, model)
     with interrupt_ends_process():
         controller, link, _period = ready_controller(controlled, "hold")
-        with closing(link()) as opened:
-            q = np.array(opened.next_status(_SILENCE).position)
-        _check_path(arm, q, motion, begin, controlled.model)
+        q = checked_start(model, link, motion.evaluate([begin]).q[0], motion.table)
         stopped = stop_on_signals()
     line, speed = LiveLine(sys.stderr), REHEARSAL_SPEED if create is None else 1.0
     has_keys = sys.stdin is not None and sys.stdin.isatty()
@@ -133,22 +125,9 @@ def _print_next(output: str, name: str, arm: Arm, motion: PeriodicMotion) -> Non
     print(f"Next: dvrk-drake identify {files} --arm {name} --output model.yaml", flush=True)
 
 
-def _check_motion(path: str, motion: PeriodicMotion, arm: Arm) -> None:
+def _check_motion(path: str, motion: PeriodicMotion, arm: Arm, model: IdentifiedModel) -> None:
     """Checks the motion with the limits of the arm and of its guard, independently of the limits of its design."""
     from dvrk_drake.analysis.excitation.motion_limits import execution_limits, motion_violations
 
-    if violations := motion_violations(motion, arm, execution_limits(motion.table)):
+    if violations := motion_violations(motion, arm, execution_limits(motion.table), model):
         raise CollectionError(f"{path}: {violations[0]}; design a motion within the limits of {arm.name}")
-
-
-def _check_path(arm: Arm, q: NDArray[np.float64], motion: PeriodicMotion, begin: float, model: str | None) -> None:
-    """Checks that the arm can move on the straight path in joint space from q (n,) to the start of the motion."""
-    from dvrk_drake.analysis.excitation.motion_limits import path_obstacle
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-
-    loaded = None if model is None else IdentifiedModel.load(model, arm)
-    if obstacle := path_obstacle(arm, q, motion.evaluate([begin]).q[0], motion.table, loaded):
-        raise CollectionError(
-            f"{arm.name} cannot move from its present pose to the start of the motion: {obstacle}. Move the arm by "
-            "hand to another pose first (dvrk-drake run --mode gravity)"
-        )

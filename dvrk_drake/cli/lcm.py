@@ -15,12 +15,18 @@ from dvrk_drake.cli.support import interrupt_ends_process, load_key, print_warni
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_schema import Gains
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
+
+#: Longest time until a status of the arm arrives [s].
+_SILENCE = 1.0
 
 
 @Parameter(name="*")
@@ -230,6 +236,39 @@ def ready_controller(
             print_warning(warning)
     settle_memory()
     return controller, lambda: ArmLink(arm, url, key=key, before=status), period
+
+
+def checked_start(
+    model: IdentifiedModel, link: Callable[[], ArmLink], q_end: NDArray[np.float64], table: float | None = None
+) -> NDArray[np.float64]:
+    """Checks the straight path in joint space from the present pose of an arm to the first pose of a collection.
+
+    Args:
+        model: Model of the arm that predicts the efforts.
+        link: Function that opens the link to the arm.
+        q_end: First pose (n,) [rad, m].
+        table: Height of a table in the base frame [m], or None.
+
+    Returns:
+        Present pose (n,) [rad, m].
+
+    Raises:
+        CollectionError: The links would collide on the path, or the motors cannot hold the arm.
+        ControllerError: The arm sends no status.
+    """
+    import numpy as np
+
+    from dvrk_drake.analysis.excitation.motion_limits import path_obstacle
+    from dvrk_drake.errors import CollectionError
+
+    with closing(link()) as opened:
+        q = np.array(opened.next_status(_SILENCE).position)
+    if obstacle := path_obstacle(model.arm, q, q_end, table, model):
+        raise CollectionError(
+            f"{model.arm.name} cannot move from its present pose to the first pose: {obstacle}. Move the arm by hand "
+            "to another pose first (dvrk-drake run --mode gravity)"
+        )
+    return q
 
 
 def model_warning(path: str, model: IdentifiedModel) -> str:

@@ -101,7 +101,7 @@ def ran(monkeypatch):
     return commands
 
 
-def test_interrupted_steps_are_repeated_and_complete_steps_are_not(tmp_path, ran, capsys):
+def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
     command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8"]
     assert main(command) == 0
     once, count = list(ran), len(ran)

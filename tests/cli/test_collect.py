@@ -25,7 +25,8 @@ def simulated(monkeypatch):
     def ready(options, mode):
         controller = ArmController(arm, IdentifiedModel.from_arm(arm), mode, PERIOD)
         what.arms.append(StickyArm(arm, IdentifiedModel.from_arm(arm), np.zeros(7), near_poses()[0]))
-        return controller, lambda: None, PERIOD
+        opened = SimpleNamespace(next_status=lambda _: what.arms[-1].status(), close=lambda: None)
+        return controller, lambda: opened, PERIOD
 
     def control(link, controller, stopped, report, on_status):
         sticky = what.arms[-1]

@@ -164,7 +164,7 @@ def path_obstacle(
     if collision := first_collision(arm, q, table):
         return collision[1]
     predicted = PredictedEffort(arm, model)
-    share = (np.abs(predicted.by_drake(q, 0 * q, 0 * q)) + predicted.dry_friction) / arm.effort_limits
+    share = (np.abs(predicted.holding(q)) + predicted.dry_friction) / arm.effort_limits
     k, j = np.unravel_index(int(np.argmax(share)), share.shape)
     if share[k, j] <= execution_limits(table).effort:
         return ""

@@ -67,6 +67,12 @@ class PredictedEffort:
         """
         return self.regressor.torque(q, v, vd, self.parameters) + self._correction(q, v)
 
+    def holding(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the joint efforts (m, n) that hold the arm at poses q (m, n) [N m, N], without dry friction."""
+        if self._known.dynamics is None:
+            return np.asarray(self._known.static_model.torque(q, self._known.theta))
+        return self.without_dry_friction(q, np.zeros_like(q), np.zeros_like(q))
+
     def by_drake(self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the same efforts as `without_dry_friction`, computed with Drake's inverse dynamics."""
         if self.model is None or self.model.dynamics is None:

@@ -374,7 +374,7 @@ class PoseChecker:
 
     def _can_hold(self, q: NDArray[np.float64]) -> bool:
         """Returns whether the holding efforts plus the dry friction meet the limits at all poses (m, n)."""
-        effort = np.abs(self._predicted.by_drake(q, 0 * q, 0 * q)) + self._predicted.dry_friction
+        effort = np.abs(self._predicted.holding(q)) + self._predicted.dry_friction
         return bool(np.all(effort <= self._joints.effort))
 
     def is_free(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> bool:

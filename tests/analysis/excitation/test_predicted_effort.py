@@ -1,5 +1,6 @@
 """Efforts that a model predicts, and designs of motions after an earlier model."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -63,7 +64,11 @@ def test_without_model_the_springs_of_the_arm_file_are_included(arm, motion):
     q = motion[1][::50]
     rest = np.zeros_like(q)
     springs = dvrk.IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs)
-    np.testing.assert_allclose(PredictedEffort(arm).by_drake(q, rest, rest), springs.holding_torque(q), atol=1e-11)
+    of_files = PredictedEffort(arm)
+    np.testing.assert_allclose(of_files.by_drake(q, rest, rest), springs.holding_torque(q), atol=1e-11)
+    np.testing.assert_allclose(of_files.holding(q), springs.holding_torque(q), atol=1e-11)
+    dynamic = PredictedEffort(arm, dvrk.IdentifiedModel.from_arm(arm, dynamics=True))
+    np.testing.assert_allclose(dynamic.holding(q), dynamic.by_drake(q, rest, rest), atol=1e-11)
 
 
 def test_heavier_links_leave_less_effort_for_the_motion(arm):
@@ -93,7 +98,11 @@ def test_second_motion_adds_more_information(arm):
     information = MotionInformation(arm.with_gravity(model.arm.gravity), limits, model)
     again = state_of(first.motion, 60)
     assert second.expected_error < information.expected_error(again, PERIOD)
-    assert information.expected_error(again, PERIOD) < MotionInformation(arm, limits).expected_error(again, PERIOD)
+    unknown = deepcopy(model)
+    for parameter in unknown.dynamics.base_parameters:
+        parameter.standard_error = 1e6
+    without = MotionInformation(information.arm, limits, unknown).expected_error(again, PERIOD)
+    assert information.expected_error(again, PERIOD) < without
     assert second.known_parameters > first.known_parameters
 
 
