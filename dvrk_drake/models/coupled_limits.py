@@ -13,6 +13,10 @@ from dvrk_drake.models.schema_fault import number_fault
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
+#: Length of an approach, as a fraction of the range of the joint. Dry friction is elastic at first, so a short approach
+#: does not reverse it completely. Random poses have at least a tenth of the range on both sides.
+APPROACH = 0.08
+
 
 def coupled_limit_fault(arm: Arm, limit: CoupledLimit) -> str:
     """Returns a message on the first fault of a coupled limit, with the accepted values, or "" if there is none."""
@@ -54,6 +58,16 @@ def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
     if not lower < upper:
         return f"{key} is [{lower:g}, {upper:g}]; allowed: [lower, upper] with lower < upper"
     return widths.fault(f"{key}: upper - lower", upper - lower)
+
+
+def approach_offset(arm: Arm) -> NDArray[np.float64]:
+    """Returns the offset (n,) of the pose at which the approach of a static pose begins [rad, m].
+
+    The offset is subtracted for the approach from below and added for the approach from above, see `offset_pose`. The
+    offsets of all joints have the same sign, because this reverses the dry friction of actuators that are coupled to
+    several joints most completely.
+    """
+    return np.asarray(APPROACH * (arm.position_upper - arm.position_lower))
 
 
 def offset_pose(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -152,8 +152,9 @@ class ArmMover:
         while not self._controller.ramped:
             yield
 
-    def _move_to(self, q_end: NDArray[np.float64]) -> Steps:
-        trajectory = CubicTrajectory.rest_to_rest(self._desired[: self._arm.num_joints], q_end, self._speed)
+    def _move_to(self, q_end: NDArray[np.float64], share: float = 1.0) -> Steps:
+        """Moves the arm to a pose (n,) on a straight line in joint space, with a share of the usual speed."""
+        trajectory = CubicTrajectory.rest_to_rest(self._desired[: self._arm.num_joints], q_end, share * self._speed)
         yield from self._follow(trajectory)
 
     def _follow(self, trajectory: CubicTrajectory) -> Steps:

@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError
-from dvrk_drake.models.approach import effort_approach
-from dvrk_drake.models.coupled_limits import offset_pose
+from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_mover import SETTLE, ArmMover, Steps
 from dvrk_drake.recordings.pose_file import CollectionFile
 
+#: Speed of an approach as a fraction of the speed of other motions. A fast approach would end with an overshoot, which
+#: changes the friction at the pose.
+APPROACH_SPEED = 0.4
 #: Time over which measurements are averaged [s].
 MEASURE = 0.25
 
@@ -76,7 +78,7 @@ class Collector(ArmMover):
         self.done = output.finished(poses)
         self._poses, self._output, self._settings = poses, output, settings
         super().__init__(controller, settings.traverse_time, stopped=stopped, report=report)
-        self._approach = effort_approach(self._arm)
+        self._approach = approach_offset(self._arm)
         # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
 
@@ -107,7 +109,7 @@ class Collector(ArmMover):
             self._activity = f"going to pose {k + 1}"
             if side:
                 yield from self._move_to(offset_pose(self._arm, pose, side * self._approach))
-            yield from self._move_to(pose)
+            yield from self._move_to(pose, APPROACH_SPEED if side else 1.0)
             self._activity = f"settling at pose {k + 1}"
             if not (yield from self._settle()):
                 self.unsettled.append(k + 1)

@@ -19,9 +19,8 @@ from dvrk_drake.analysis.static.effect_selection import StaticProblem, candidate
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, MIN_TORQUE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
-from dvrk_drake.models.approach import effort_approach, range_approach
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.coupled_limits import offset_pose
+from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
 from dvrk_drake.models.files import refuse_existing
 from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.progress import Progress, step_progress
@@ -301,7 +300,7 @@ class PoseChecker:
         self._arm, self._limits, self._joints = arm, limits, limits.of_arm(arm)
         self._detector, self._predicted = CollisionDetector(arm, limits.table), PredictedEffort(arm)
         self._middle = middle_pose(arm, limits, np.random.default_rng(0))
-        self._offsets = effort_approach(arm), range_approach(arm)
+        self._offset = approach_offset(arm)
         self._span = arm.position_upper - arm.position_lower
         self._reachable: set[int] = set()
 
@@ -339,13 +338,10 @@ class PoseChecker:
         own = [arm.joint_names.index(name) for name in self._limits.positions]
         reasons = []
         for pose, is_outside in zip(q, outside, strict=True):
-            begins = [begin for side in (-1, 1) for begin in self.starts(pose, side)]
+            begins = [self.start(pose, side) for side in (-1, 1)]
             if is_outside:
                 reasons.append("coupled limit")
-            elif any(
-                np.any(np.abs(begin - pose) < MIN_APPROACH * offset)
-                for begin, offset in zip(begins, 2 * self._offsets, strict=True)
-            ):
+            elif any(np.any(np.abs(begin - pose) < MIN_APPROACH * self._offset) for begin in begins):
                 reasons.append("no room to approach the pose from both sides")
             elif any(np.any((x < joints.lower[:n])[own] | (x > joints.upper[:n])[own]) for x in begins):
                 reasons.append("position limit at the start of an approach")
@@ -363,9 +359,9 @@ class PoseChecker:
                 return "tip position"
         return self._detector.collision(pose)
 
-    def starts(self, pose: NDArray[np.float64], side: int) -> list[NDArray[np.float64]]:
-        """Returns the poses (n,) at which approaches of `pose` begin, for collections over LCM and by the dVRK."""
-        return [offset_pose(self._arm, pose, side * offset) for offset in self._offsets]
+    def start(self, pose: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+        """Returns the pose (n,) at which the approach of `pose` from below (-1) or above (1) begins."""
+        return offset_pose(self._arm, pose, side * self._offset)
 
     def _path(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns poses (m, n) on the straight path between two poses (n,)."""
@@ -388,7 +384,7 @@ class PoseChecker:
         for k in chosen:
             if k in self._reachable:
                 continue
-            if all(self.is_free(start, pool[k]) for side in (-1, 1) for start in self.starts(pool[k], side)):
+            if all(self.is_free(self.start(pool[k], side), pool[k]) for side in (-1, 1)):
                 self._reachable.add(k)
             else:
                 found.append(k)
@@ -396,7 +392,7 @@ class PoseChecker:
 
     def can_follow(self, pose: NDArray[np.float64], following: NDArray[np.float64]) -> bool:
         """Returns whether the paths from a pose (n,) to the next pose and to its approaches are free of collisions."""
-        return all(self.is_free(pose, goal) for goal in (following, *self.starts(following, -1)))
+        return all(self.is_free(pose, goal) for goal in (following, self.start(following, -1)))
 
     def travel(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the travel (m, m) from each pose to the first approach of each other pose.
@@ -404,7 +400,7 @@ class PoseChecker:
         The unit is the position range of the joint that needs the longest time, because the speed of each joint in a
         collection is proportional to its range.
         """
-        goals = np.array([self.starts(pose, -1)[-1] for pose in poses])
+        goals = np.array([self.start(pose, -1) for pose in poses])
         return np.asarray(np.max(np.abs(poses[:, None] - goals) / self._span, axis=2))
 
 

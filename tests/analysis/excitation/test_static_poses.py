@@ -19,8 +19,7 @@ from dvrk_drake.analysis.excitation.static_poses import (
 )
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
-from dvrk_drake.models.approach import effort_approach, range_approach
-from dvrk_drake.models.coupled_limits import offset_pose
+from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, approaches
 from dvrk_drake.recordings.pose_file import load_poses
 
@@ -85,11 +84,10 @@ def test_poses_and_approaches_meet_the_limits(information, design):
     value = design.poses @ joints.A.T
     assert np.all((value >= joints.lower) & (value <= joints.upper))
     for pose in design.poses:
-        for offset in (effort_approach(arm), range_approach(arm)):
-            for side in (-1, 1):
-                begin = offset_pose(arm, pose, side * offset)
-                assert not arm.limit_violations(begin, 1e-9)
-                assert np.all(side * (begin - pose) >= MIN_APPROACH * offset - 1e-12)
+        for side in (-1, 1):
+            begin = offset_pose(arm, pose, side * approach_offset(arm))
+            assert not arm.limit_violations(begin, 1e-9)
+            assert np.all(side * (begin - pose) >= MIN_APPROACH * approach_offset(arm) - 1e-12)
     assert first_collision(arm, design.poses) is None
 
 
