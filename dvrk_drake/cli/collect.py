@@ -254,8 +254,8 @@ def _visit(
 ) -> None:
     import numpy as np
 
-    from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
-    from dvrk_drake.processes.collector import CollectionSettings, Collector
+    from dvrk_drake.models.coupled_limits import offset_pose
+    from dvrk_drake.processes.collector import CollectionSettings, Collector, short_approach_offset
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
@@ -270,7 +270,7 @@ def _visit(
         controller, link, _period = ready_controller(controlled, "hold")
         first = poses[int(np.argmin(output.finished(poses)))]
         if both_sides:
-            first = offset_pose(arm, first, -approach_offset(arm))
+            first = offset_pose(arm, first, -short_approach_offset(arm))
         checked_start(load_model(controlled.model, controlled.arm), link, first)
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)

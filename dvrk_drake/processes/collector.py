@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError
-from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_mover import SETTLE, ArmMover, Steps
 from dvrk_drake.recordings.pose_file import CollectionFile
 
-#: Speed of an approach as a fraction of the speed of other motions. A fast approach would end with an overshoot, which
-#: changes the friction at the pose.
-APPROACH_SPEED = 0.4
+#: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
+#: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
+#: the approach. After a longer approach, the integrator of the controller may hold the arm with any part of the friction.
+APPROACH = 0.3
 #: Time over which measurements are averaged [s].
 MEASURE = 0.25
 
@@ -39,6 +41,11 @@ class CollectionSettings:
     def __post_init__(self) -> None:
         if fault := number_fault(self):
             raise CollectionError(f"collection settings: {fault}")
+
+
+def short_approach_offset(arm: Arm) -> NDArray[np.float64]:
+    """Returns the offset (n,) of the pose at which the approach of a static pose begins [rad, m]."""
+    return np.asarray(APPROACH * arm.effort_limits / np.asarray(arm.gains.kp))
 
 
 class Collector(ArmMover):
@@ -78,7 +85,7 @@ class Collector(ArmMover):
         self.done = output.finished(poses)
         self._poses, self._output, self._settings = poses, output, settings
         super().__init__(controller, settings.traverse_time, stopped=stopped, report=report)
-        self._approach = approach_offset(self._arm)
+        self._approach = short_approach_offset(self._arm)
         # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
 
@@ -109,7 +116,7 @@ class Collector(ArmMover):
             self._activity = f"going to pose {k + 1}"
             if side:
                 yield from self._move_to(offset_pose(self._arm, pose, side * self._approach))
-            yield from self._move_to(pose, APPROACH_SPEED if side else 1.0)
+            yield from self._move_to(pose)
             self._activity = f"settling at pose {k + 1}"
             if not (yield from self._settle()):
                 self.unsettled.append(k + 1)

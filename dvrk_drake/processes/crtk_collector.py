@@ -23,7 +23,7 @@ from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, REST, REST_TIME, SETTLE, Steps
-from dvrk_drake.processes.collector import APPROACH_SPEED, MEASURE, CollectionSettings
+from dvrk_drake.processes.collector import MEASURE, CollectionSettings
 from dvrk_drake.processes.crtk_monitor import CrtkMonitor, unit
 from dvrk_drake.processes.teacher import RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
@@ -38,6 +38,9 @@ GOAL_PERIOD = 0.1
 #: Time without progress towards the goal after which a motion is stopped [s]. Smallest progress, as a fraction of the
 #: range of the joint.
 STALL, _PROGRESS = 2.0, 0.005
+#: Speed of an approach as a fraction of the speed of other motions. A fast approach would end with an overshoot, which
+#: changes the friction at the pose.
+_APPROACH_SPEED = 0.4
 #: Time for which the arm must be at rest at the start of an approach [s].
 APPROACH_REST = 0.2
 #: Distance [rad, m] outside the limits that is accepted at the start, because the limits of two arms differ.
@@ -310,4 +313,4 @@ def _motions(
     """Returns (goal, time at rest [s], fraction of the speed) of the motions to `pose` through `begin`."""
     if begin is None:
         return [(pose, REST_TIME, 1.0)]
-    return [(begin, APPROACH_REST, 1.0), (pose, REST_TIME, APPROACH_SPEED)]
+    return [(begin, APPROACH_REST, 1.0), (pose, REST_TIME, _APPROACH_SPEED)]

@@ -113,13 +113,13 @@ class GuardedArm(StickyArm):
         self.guard.step(1000 * self.ticks, 1000 * self.ticks, self.q, self.v, self.effort)
 
 
-def make_collector(path, poses, friction, both_sides=True, *, traverse_time=1.0, arm_type=StickyArm, **options):
+def make_collector(path, poses, friction, both_sides=True, *, arm_type=StickyArm, **options):
     arm = load_arm("mtml")
     model = IdentifiedModel.from_arm(arm)
     controller = ArmController(arm, model, "hold", PERIOD)
     sticky = arm_type(arm, model, friction, poses[0] * 0.9)
     output = CollectionFile(path, arm, both_sides)
-    settings = CollectionSettings(traverse_time, both_sides)
+    settings = CollectionSettings(1.0, both_sides)
     return Collector(poses, controller, output, settings, **{"writer": Disk()} | options), controller, sticky
 
 
