@@ -5,7 +5,7 @@
 CALIBRATION is a folder of `dvrk-drake calibrate`. The arm is released at random poses and moves freely for 10 s. A
 release passes if no joint is ever further than 15 mrad (1.5 mm for the insertion) from its release pose. Without an
 approach, the arm is released at rest. With an approach, it first moves to the pose by 0.2 rad (20 mm) in all joints,
-which loads the friction.
+which loads the friction. The models are static.yaml and model.yaml of the calibration, and the exact model.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from timing import print_table
@@ -28,21 +29,25 @@ def main() -> None:
     parser.add_argument("--releases", type=int, default=200, help="number of releases; default: %(default)s")
     parser.add_argument("--seed", type=int, default=12345, help="seed of the poses; default: %(default)s")
     options = parser.parse_args()
-    path = options.calibration / "static.yaml"
-    model = dvrk.IdentifiedModel.load(path)
-    arm = model.arm
+    arm = dvrk.IdentifiedModel.load(options.calibration / "static.yaml").arm
     poses = arm.sample_poses(options.releases, np.random.default_rng(options.seed), margin=0.05)
     rows = {}
-    with ProcessPoolExecutor() as executor:
-        for what, with_approach in (("at rest", False), ("after an approach", True)):
-            cases = [
-                Release(arm.name.lower(), arm, ("all",), str(path), pose, with_approach=with_approach, seed=k)
-                for k, pose in enumerate(poses)
-            ]
-            drifts = Drifts(arm, release_all(cases, executor))
-            share = drifts.largest / arm.per_joint(*BAND)
-            rows[what] = [f"{drifts.num_held} of {len(cases)}"]
-            rows[what] += [f"{15 * x:.1f}" for x in share.max(axis=0)]
+    with ProcessPoolExecutor() as executor, TemporaryDirectory() as folder:
+        exact = Path(folder) / "exact.yaml"
+        dvrk.IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs).save(exact)
+        models = {name: str(options.calibration / f"{name}.yaml") for name in ("static", "model")}
+        for name, path in (models | {"exact": str(exact)}).items():
+            for what, with_approach in (("at rest", False), ("after an approach", True)):
+                cases = [
+                    Release(arm.name.lower(), arm, ("all",), path, pose, with_approach=with_approach, seed=k)
+                    for k, pose in enumerate(poses)
+                ]
+                drifts = Drifts(arm, release_all(cases, executor))
+                share = drifts.largest / arm.per_joint(*BAND)
+                rows[f"{name}, {what}"] = [
+                    f"{drifts.num_held} of {len(cases)}",
+                    *(f"{15 * x:.1f}" for x in share.max(axis=0)),
+                ]
     headings = [
         "within 15 mrad",
         *(f"{name} [{'0.1 mm' if p else 'mrad'}]" for name, p in zip(arm.joint_names, arm.prismatic, strict=True)),

@@ -19,7 +19,7 @@ from dvrk_drake.recordings.pose_file import CollectionFile
 
 #: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
 #: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
-#: the approach. After a longer approach, the integrator of the controller may hold the arm with any part of the friction.
+#: the approach. After a longer approach, the controller's integrator may hold the arm with any part of the friction.
 APPROACH = 0.3
 #: Time over which measurements are averaged [s].
 MEASURE = 0.25
