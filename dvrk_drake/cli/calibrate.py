@@ -7,6 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Realtime, Seconds, Seed, app, whole_number
-from dvrk_drake.cli.support import print_written
+from dvrk_drake.cli.support import load_key, print_warning, print_written
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
@@ -53,14 +54,16 @@ def calibrate(
         table: Height of a table in the base frame [m].
         reset: Print and clear a fault of the arm before it moves. If the watchdog of the guard holds the arm, resume
             control.
-        yes: Move the arm without a question on the terminal.
+        yes: Move the arm without a question. Required if there is no terminal.
     """
     from dvrk_drake.cli.calibration_steps import CalibrationSettings, calibration_steps, prepare_folder
+    from dvrk_drake.models.arm_files import known_arms
 
+    load_key(key)  # rejects an invalid file before the first step
     began = time.monotonic()
     folder = Path(output)
     settings = CalibrationSettings(
-        arm=_absolute(arm),
+        arm=arm.lower() if arm.lower() in known_arms() else _absolute(arm),
         poses=poses,
         duration=duration,
         seed=seed,
@@ -84,8 +87,8 @@ def calibrate(
             words += connection + (["--reset"] if reset else [])
             reset = False
         print(f"{header}: dvrk-drake {shlex.join(words)}", flush=True)
-        if step.moves and not yes and sys.stdin is not None and sys.stdin.isatty():
-            input(f"Clear the workspace of {loaded.name}. Enter starts the motion, Ctrl-C ends the command. ")
+        if step.moves and not yes:
+            _confirm(loaded.name)
         started = time.monotonic()
         code = _run(words, folder)
         moving += step.moves * (time.monotonic() - started)
@@ -100,9 +103,26 @@ def calibrate(
     print(f"{minutes:.1f} min in total, of which the arm was controlled for {moving / 60:.1f} min", flush=True)
 
 
+def _confirm(name: str) -> None:
+    """Asks the operator before a motion.
+
+    Raises:
+        DvrkDrakeError: There is no terminal.
+        KeyboardInterrupt: The input ended.
+    """
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise DvrkDrakeError(f"{name} would move without a question, because there is no terminal; add --yes")
+    # Keys that were pressed before the question do not answer it.
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    try:
+        input(f"Clear the workspace of {name}. Enter starts the motion, Ctrl-C ends the command. ")
+    except EOFError:
+        raise KeyboardInterrupt from None
+
+
 def _absolute(path: str) -> str:
     """Returns the absolute path of a file, because the commands run in another folder. Other names are unchanged."""
-    return str(Path(path).resolve()) if Path(path).exists() else path
+    return str(Path(path).resolve()) if Path(path).is_file() else path
 
 
 def _run(words: list[str], folder: Path) -> int:
@@ -110,6 +130,7 @@ def _run(words: list[str], folder: Path) -> int:
     command = [sys.executable, "-m", "dvrk_drake.cli", *words]
     process = subprocess.Popen(command, cwd=folder, preexec_fn=_end_with_parent)  # noqa: PLW1509  no other thread runs
     received: list[int] = []
+    num_sent = 0
     handlers = {number: signal.signal(number, lambda n, _: received.append(n)) for number in _SIGNALS}
     try:
         while True:
@@ -118,8 +139,9 @@ def _run(words: list[str], folder: Path) -> int:
                 break
             except subprocess.TimeoutExpired:
                 # A terminal sends Ctrl-C to both processes. Other senders may have sent it only to this one.
-                while received:
-                    process.send_signal(received.pop())
+                for number in received[num_sent:]:
+                    process.send_signal(number)
+                num_sent = len(received)
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
@@ -136,6 +158,7 @@ def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
     from dvrk_drake.cli.calibration_steps import DYNAMIC, STATIC
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
 
+    is_usable = True
     for file, what in ((STATIC, "holding torques of other poses"), (DYNAMIC, "efforts of another motion")):
         validation = IdentifiedModel.load(folder / file).validation
         assert validation is not None
@@ -144,6 +167,7 @@ def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
             joints.setdefault(validation.verdicts[joint], []).append(joint)
         verdicts = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in joints.items())
         print(f"Verdicts for {what}: {verdicts}", flush=True)
+        is_usable &= "do not use" not in joints
     for file, what in (
         ("report.html", "errors and verdict of the full dynamics"),
         ("static_report.html", "errors and verdict of the static model"),
@@ -153,6 +177,9 @@ def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
     ):
         if (folder / file).exists():
             print_written(folder / file, what)
+    if not is_usable:
+        print_warning("a joint failed the validation; look at the reports before you use the models")
+        return
     print(
         f"Next: dvrk-drake run --arm {name} --model {folder / STATIC} --friction-model {folder / DYNAMIC} "
         f"--friction-ratio 0.3\nIn the driver's configuration of the arm: model: {(folder / STATIC).resolve()}",

@@ -128,7 +128,9 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
         def done() -> bool:
             return (folder / report).exists() and IdentifiedModel.load(folder / model).validation is not None
 
-        words = ("validate", recording, "--model", model, "--save", "--overwrite", "--report", report)
+        # The operator decides whether the arm follows a motion with a model that failed the validation.
+        required = ("--require", "usable") if model == STATIC else ()
+        words = ("validate", recording, "--model", model, "--save", "--overwrite", "--report", report, *required)
         return Step(title, words, done)
 
     gravity_file = "--dvrk-gc" if arm.name.startswith("MTM") else "--dvrk-kinematic-gc"
@@ -167,24 +169,27 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
     """
     gravity = settings.gravity
     arm = mounted(load_arm(settings.arm), (gravity[0], gravity[1], gravity[2]) if gravity else None)
+    nominal = IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs)
     path = folder / SETTINGS
     if path.exists():
         found = load_typed_yaml(CalibrationSettings, path, CollectionError, "settings of a calibration")
+        if found.format != settings.format:
+            raise CollectionError(f'{path}: format is "{found.format}"; allowed: "{settings.format}"')
         for name, value in asdict(settings).items():
             if value != (earlier := getattr(found, name)):
                 raise CollectionError(
                     f"{path}: {name} is {earlier}, but {value} was given; give the same options, or another folder"
                 )
-        return arm
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        is_used = any(folder.iterdir())
-    except OSError as error:
-        raise CollectionError(f"{folder}: the folder cannot be created: {error.strerror}") from error
-    if is_used:
-        raise CollectionError(f"{folder}: the folder is not empty and has no calibration; give a new folder")
-    springs = arm.effects.cables + arm.effects.springs
-    IdentifiedModel.from_arm(arm, springs).save(folder / NOMINAL)
-    with atomic_write(path) as stream:
-        yaml.safe_dump(asdict(settings), stream, sort_keys=False)
+    else:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            is_used = any(folder.iterdir())
+        except OSError as error:
+            raise CollectionError(f"{folder}: the folder cannot be created: {error.strerror}") from error
+        if is_used:
+            raise CollectionError(f"{folder}: the folder is not empty and has no calibration; give a new folder")
+        with atomic_write(path) as stream:
+            yaml.safe_dump(asdict(settings), stream, sort_keys=False)
+    if not (folder / NOMINAL).exists():
+        nominal.save(folder / NOMINAL)
     return arm

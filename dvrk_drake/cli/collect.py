@@ -172,7 +172,7 @@ def collect(
             "--traverse-time": traverse_time != _TRAVERSE_TIME,
         }
         if wrong := [name for name, is_given in given.items() if is_given]:
-            raise CollectionError(f"{', '.join(wrong)} requires --poses, but --motion was given")
+            raise CollectionError(f"{', '.join(wrong)} cannot be used with --motion, only with --poses")
         collect_motion(controlled, motion, None if rehearse else output)
         return
     assert poses is not None

@@ -6,7 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.lcm import ControlledArm, checked_start, ready_controller
-from dvrk_drake.cli.support import check_output, interrupt_ends_process, print_written
+from dvrk_drake.cli.support import check_output, interrupt_ends_process, print_written, quiet_drake
 from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
@@ -43,7 +43,10 @@ def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> 
     arm = load_arm(controlled.arm)
     motion = PeriodicMotion.load(path, arm)
     begin, end, create = 0.0, motion.period, None
-    if output is not None:
+    quiet_drake()
+    if output is None:
+        check_output(str(motion_parts.rehearsal_path(path)), overwrite=True)
+    else:
         check_output(output, path, controlled.model or "", overwrite=True)
         parts = motion_parts.recorded_parts(output, arm, motion)
         rest = motion_parts.begin_of_rest(parts, motion.duration)
@@ -104,9 +107,9 @@ def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> 
             print_written(part_path, f"{begin:.1f} to {player.motion_time:.1f} s of {motion.duration:g} s")
     if player.problem is not None:
         raise player.problem
+    if stopped():
+        raise KeyboardInterrupt
     if player.motion_time < end:
-        if stopped():
-            raise KeyboardInterrupt
         raise CollectionError(f"{path}: the motion ended early, at {player.motion_time:.1f} s; run the command again")
     if output is not None:
         _print_next(output, controlled.arm, arm, motion)
@@ -129,5 +132,5 @@ def _check_motion(path: str, motion: PeriodicMotion, arm: Arm, model: Identified
     """Checks the motion with the limits of the arm and of its guard, independently of the limits of its design."""
     from dvrk_drake.analysis.excitation.motion_limits import execution_limits, motion_violations
 
-    if violations := motion_violations(motion, arm, execution_limits(motion.table), model):
+    if violations := motion_violations(motion, model.arm, execution_limits(motion.table), model):
         raise CollectionError(f"{path}: {violations[0]}; design a motion within the limits of {arm.name}")

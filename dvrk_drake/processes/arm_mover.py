@@ -30,6 +30,10 @@ MAX_TRACKING_ERROR = 0.1
 Steps = Generator[None, None, None]
 
 
+class TrackingError(CollectionError):
+    """Error for a joint that does not follow its target."""
+
+
 class ArmMover:
     """Computes the desired state of a controller in mode "hold" for each status, until its task is finished.
 
@@ -128,10 +132,10 @@ class ArmMover:
             reason = takeover_reason(status, self._last_applied, self._answers)
             raise CollectionError(f"the guard of {self._arm.name} holds the arm: {reason}")
         error = self._tracking_error
-        if error.max() > 1:
+        if not error.max() <= 1:  # also for NaN
             j = int(np.argmax(error))
             unit = "m" if self._arm.prismatic[j] else "rad"
-            raise CollectionError(
+            raise TrackingError(
                 f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g} {unit}, its "
                 f"target is {self._desired[j]:.3g} {unit}. Check for an obstacle, then validate the model."
             )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, SETTLE, ArmMover, Steps
+from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, SETTLE, ArmMover, Steps, TrackingError
 from dvrk_drake.recordings.motion_parts import MotionPartFile
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
@@ -25,6 +25,9 @@ _RAMP = 0.5
 _CHECKED = 0.03
 #: Longest pause [s]. A longer pause ends the command, and the guard holds the arm.
 MAX_PAUSE = 60.0
+#: Time that is removed from the end of the recording after a tracking error, because an obstacle may have exerted
+#: forces on the arm [s].
+_REMOVED = 3.0
 #: Number of rows that are written at once.
 _BLOCK = 100
 
@@ -104,6 +107,8 @@ class MotionPlayer(ArmMover):
         self._writer.shutdown()
         self._flush()
         if self._output is not None:
+            if isinstance(self.problem, TrackingError):
+                self._output.remove_end(_REMOVED)
             self._output.close()
 
     def describe(self) -> str:
@@ -118,7 +123,7 @@ class MotionPlayer(ArmMover):
     def _task(self) -> Steps:
         yield from self._begin()
         span = self._arm.position_upper - self._arm.position_lower
-        if np.any(np.abs(self._q - self._q_checked) > _CHECKED * span):
+        if not np.all(np.abs(self._q - self._q_checked) <= _CHECKED * span):  # also for NaN
             raise CollectionError(f"{self._arm.name} moved before the control started. Run the command again")
         self._activity = "going to the start of the motion"
         yield from self._move_to(self._motion.evaluate([self.motion_time]).q[0])
@@ -130,6 +135,7 @@ class MotionPlayer(ArmMover):
             self._output = creating.result()
             self._is_recording = True
         self._is_playing = True
+        self._enter()  # ignores the key before the motion
         yield from self._play()
         yield from self._come_to_rest()
 

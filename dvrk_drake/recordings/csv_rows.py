@@ -317,6 +317,16 @@ class GrowingFile:
                 f"{self._path} cannot be written: no space left. The file ends with its last complete row."
             )
 
+    @property
+    def size(self) -> int:
+        """Size of the file [bytes]."""
+        return self._file.tell()
+
+    def truncate(self, size: int) -> None:
+        """Removes all rows after the first `size` bytes."""
+        self._file.truncate(size)
+        self._file.seek(size)
+
     def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
         """Closes the file. `progress` is not called, because the file is already complete."""
         self._file.close()

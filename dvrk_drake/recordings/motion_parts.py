@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Iterable
@@ -11,13 +12,13 @@ from typing import NamedTuple
 
 import yaml
 
-from dvrk_drake.errors import CollectionError
+from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.files import atomic_write, open_input
 from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite, read_bytes
+from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite
 from dvrk_drake.recordings.lcm_log_reader import measurements
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 from dvrk_drake.recordings.recording import column_names
@@ -26,6 +27,8 @@ from dvrk_drake.recordings.recording import column_names
 MIN_PART = 12.0
 #: Time by which a new part overlaps the previous part [s]. The first second of a part begins at rest and is slower.
 OVERLAP = 2.0
+#: Number of bytes that are read from both ends of a part. A row has at most 1000 bytes.
+_ENDS = 10_000
 
 
 class MotionPart(NamedTuple):
@@ -58,25 +61,39 @@ class MotionPartFile:
             RecordingError: The file exists or cannot be written.
         """
         self._end = f",{arm.name},{motion.digest()}\n"
-        self._first_utime: int | None = None
+        self._first_utime, self._last_utime = 0, 0
         self._file = GrowingFile(path)
         self._file.append((",".join(_header(arm)) + "\n").encode())
+        self._blocks: list[tuple[int, int]] = []
 
     def append(self, rows: Iterable[tuple[lcmt_dvrk_status, float]]) -> None:
         """Writes rows of statuses and times of the motion [s].
 
+        Repeated statuses, statuses with a number that is not finite, and statuses of an arm without power are omitted.
+
         Raises:
             RecordingError: The rows cannot be written; the previous rows are complete.
         """
-        lines = []
+        lines: list[str] = []
         for status, motion_time in rows:
-            if self._first_utime is None:
-                self._first_utime = status.utime
-            numbers = (1e-6 * (status.utime - self._first_utime), *measurements(status))
+            measured = measurements(status)
+            is_off = status.guard_state == lcmt_dvrk_status.STATE_OFF
+            if is_off or status.utime <= self._last_utime or not all(map(math.isfinite, measured)):
+                continue
+            if not lines:
+                self._blocks.append((status.utime, self._file.size))
+            self._first_utime, self._last_utime = self._first_utime or status.utime, status.utime
+            numbers = (1e-6 * (status.utime - self._first_utime), *measured)
             origin = status.utime, status.sequence, status.guard_state
             lines.append(",".join([*map(repr, numbers), *map(str, origin), repr(motion_time)]) + self._end)
         if lines:
             self._file.append("".join(lines).encode())
+
+    def remove_end(self, seconds: float) -> None:
+        """Removes the rows of the last `seconds`, in whole blocks of `append`."""
+        late = [size for utime, size in self._blocks if utime > self._last_utime - 1e6 * seconds]
+        if late:
+            self._file.truncate(late[0])
 
     def close(self) -> None:
         """Closes the file."""
@@ -110,13 +127,20 @@ def next_part(output: str | Path, parts: list[MotionPart]) -> Path:
 
 
 def _read_part(path: Path, arm: Arm, motion: PeriodicMotion) -> MotionPart:
-    lines = read_bytes(path).decode(errors="replace").split("\n")[:-1]  # without an incomplete last row
+    with open_input(path, RecordingError) as file:
+        start = file.read(_ENDS)
+        file.seek(max(os.fstat(file.fileno()).st_size - _ENDS, 0))
+        end = file.read(_ENDS)
+    # Without an incomplete last row.
+    lines = [*start.decode(errors="replace").split("\n")[:2], *end.decode(errors="replace").split("\n")[-2:-1]]
     header = _header(arm)
-    if not lines or lines[0].split(",") != header:
+    if b"\n" not in start and ",".join(header).startswith(start.decode(errors="replace")):
+        return MotionPart(path, 0.0, 0.0)
+    if lines[0].split(",") != header:
         raise CollectionError(
             f"{path} already exists and is not a motion of {arm.name} recorded by collect. Choose another output file."
         )
-    if len(lines) == 1:
+    if b"\n" not in start[start.index(b"\n") + 1 :]:
         return MotionPart(path, 0.0, 0.0)
     column, times = header.index("motion_time"), []
     for line in (lines[1], lines[-1]):
@@ -200,4 +224,5 @@ def is_rehearsed(motion_path: str | Path, arm: Arm, motion: PeriodicMotion) -> b
     if not os.path.lexists(path):
         return False
     rehearsal = load_typed_yaml(Rehearsal, path, CollectionError, "a rehearsal")
-    return (rehearsal.arm, rehearsal.motion) == (arm.name, motion.digest())
+    is_complete = rehearsal.format == Rehearsal.format and len(rehearsal.tracking_error) == arm.num_joints
+    return is_complete and rehearsal.speed > 0 and (rehearsal.arm, rehearsal.motion) == (arm.name, motion.digest())

@@ -108,7 +108,7 @@ class PeriodicMotion:
 
     format: str = "dvrk_drake motion 1"
     arm: str = ""
-    period: float = field(default=10.0, metadata=within(0.1, 1e4, "s"))
+    period: float = field(default=10.0, metadata=within(0.1, 600.0, "s"))
     repetitions: int = field(default=1, metadata=within(1, 10_000))
     table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
     center: list[float] = field(default_factory=list, metadata=within(-100.0, 100.0, "rad or m"))

@@ -32,7 +32,7 @@ def record_part(path, motion, begin, end):
     for k, motion_time in enumerate((begin, end)):
         status = lcmt_dvrk_status()
         status.utime = 1_000_000 + round(1e6 * motion_time)
-        status.sequence = k
+        status.sequence, status.guard_state = k, status.STATE_EFFORT
         status.position = status.velocity = status.effort_measured = [0.0] * ARM.num_joints
         rows.append((status, motion_time))
     file.append(rows)
@@ -60,7 +60,7 @@ def substitute(words, folder):
             path = folder / option(words, "--motion")
             motion = PeriodicMotion.load(path, ARM)
             if "--rehearse" in words:
-                Rehearsal(arm=ARM.name, motion=motion.digest(), speed=0.2).save(path)
+                Rehearsal(arm=ARM.name, motion=motion.digest(), speed=0.2, tracking_error=[0.0] * 7).save(path)
             else:
                 record_part(folder / option(words, "--output"), motion, 0.0, 20.0)
                 record_part(folder / option(words, "--output").replace(".csv", "_2.csv"), motion, 18.0, motion.duration)
@@ -102,7 +102,7 @@ def ran(monkeypatch):
 
 
 def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
-    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8"]
+    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]
     assert main(command) == 0
     once, count = list(ran), len(ran)
     assert count == 16
@@ -110,7 +110,7 @@ def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
     assert main(command) == 0 and len(ran) == count  # nothing to do
     assert "[1/16] Choose static poses: done" in capsys.readouterr().out
 
-    interrupted = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "d"), "--poses", "8"]
+    interrupted = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "d"), "--poses", "8", "--yes"]
     ran.clear()
     for step in range(count):
         ran.interrupt_at = 2 * step
@@ -126,17 +126,33 @@ def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
 
 
 def test_all_parts_of_a_motion_are_identified(tmp_path, ran):
-    assert main(["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8"]) == 0
+    assert main(["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]) == 0
     dynamic = next(words for words in ran if words[0] == "identify" and "model.yaml" in words)
     assert dynamic[1:3] == ["motion.csv", "motion_2.csv"]
 
 
 def test_only_the_next_motion_resets_a_fault(tmp_path, ran):
-    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--reset", "--realtime"]
+    command = [
+        "calibrate",
+        "--arm",
+        "psm",
+        "--output",
+        str(tmp_path / "c"),
+        "--poses",
+        "8",
+        "--yes",
+        "--reset",
+        "--realtime",
+    ]
     assert main(command) == 0
     moving = [words for words in ran if words[0] == "collect"]
     assert ["--reset" in words for words in moving] == [True] + 5 * [False]
     assert all("--realtime" in words for words in moving)
+
+
+def test_without_terminal_an_arm_moves_only_with_yes(tmp_path, ran, capsys):
+    line = refused(capsys, "calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8")
+    assert "no terminal; add --yes" in line and len(ran) == 1
 
 
 def test_failed_step_ends_the_calibration(tmp_path, monkeypatch, capsys):
@@ -160,7 +176,7 @@ def test_invalid_settings_give_one_line(tmp_path, capsys, options, message):
 
 
 def test_folder_of_another_calibration_is_refused(tmp_path, ran, capsys):
-    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses"]
+    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--yes", "--poses"]
     assert main([*command, "8"]) == 0
     assert "poses is 8, but 9 was given" in refused(capsys, *command, "9")
     (tmp_path / "d").mkdir()

@@ -175,6 +175,51 @@ def test_ends_when_arm_is_blocked(motion):
     assert player.finished and "does not follow" in str(player.problem)
 
 
+def test_last_seconds_before_a_tracking_error_are_removed(tmp_path, motion, monkeypatch):
+    monkeypatch.setattr(motion_player, "_REMOVED", 0.5)
+    path = tmp_path / "m.csv"
+    player, controller, sticky = make_player(motion, path)
+    run_collector(player, controller, sticky, 20.0, lambda: player.motion_time > 2.0)
+    sticky.q = sticky.q + np.array([0, 0, 0, 0, 0, 0, 5.0])
+    run_collector(player, controller, sticky, 10.0)
+    failed_at = player.motion_time
+    player.close()
+    assert "does not follow" in str(player.problem)
+    (part,) = recorded_parts(path, ARM, motion)
+    assert failed_at - 0.8 < part.end < failed_at - 0.4
+    assert path.read_bytes().endswith(f"{motion.digest()}\n".encode())
+
+
+def test_repeated_and_invalid_statuses_are_not_recorded(tmp_path, motion):
+    statuses = [make_player(motion)[2].status() for _ in range(5)]
+    for k, status in enumerate(statuses):
+        status.utime = 1_000_000 + 1000 * k
+    statuses[1].utime = statuses[0].utime
+    statuses[2].effort_measured = [float("nan")] * 7
+    statuses[3].guard_state = statuses[3].STATE_OFF
+    file = MotionPartFile(tmp_path / "m.csv", ARM, motion)
+    file.append([(status, 0.1 * k) for k, status in enumerate(statuses)])
+    file.close()
+    assert read_recording(tmp_path / "m.csv", ARM).t.tolist() == [0.0, pytest.approx(0.004)]
+
+
+def test_interrupted_header_is_an_empty_part(tmp_path, motion):
+    path = tmp_path / "m.csv"
+    for content in (b"", b"t,q1"):
+        path.write_bytes(content)
+        (part,) = recorded_parts(path, ARM, motion)
+        assert part.end == 0.0
+
+
+def test_ends_when_position_is_not_finite(motion):
+    player, controller, sticky = make_player(motion)
+    run_collector(player, controller, sticky, 20.0, lambda: player.motion_time > 0.2)
+    status = sticky.status()
+    status.position = [float("nan")] * 7
+    player.update(status, 0.0)
+    assert player.finished and "does not follow" in str(player.problem)
+
+
 def test_ends_when_arm_moved_after_the_check(motion):
     player, controller, sticky = make_player(motion)
     player._q_checked = player._q_checked + 0.06

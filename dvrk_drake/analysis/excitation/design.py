@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -230,6 +230,10 @@ class _Problem:
         return motion, information.expected_error(states_at(values, found), self.period), random_error
 
 
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _solve(problem: _Problem) -> tuple[PeriodicMotion, float, float]:
     return problem.solve()
 
@@ -240,8 +244,10 @@ def _in_parallel(
     if len(problems) == 1:
         yield problems[0].solve()
         return
-    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as executor:
-        yield from executor.map(_solve, problems)
+    # The end of the block terminates the workers, also after Ctrl-C, which only this process handles.
+    processes = min(len(problems), multiprocessing.cpu_count())
+    with multiprocessing.get_context("spawn").Pool(processes, _ignore_interrupts) as pool:
+        yield from pool.imap(_solve, problems)
 
 
 def _coefficients(motion: PeriodicMotion, basis: FourierBasis) -> NDArray[np.float64]:
