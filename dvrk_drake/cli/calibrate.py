@@ -50,9 +50,9 @@ def calibrate(
     Args:
         output: Folder for all files. An existing calibration in this folder is continued.
         poses: Number of static poses, 8 to 300.
-        duration: Duration of the motion, at least 15 s.
+        duration: Duration of the motion, 15 to 3600 s.
         table: Height of a table in the base frame [m].
-        reset: Print and clear a fault of the arm before it moves. If the watchdog of the guard holds the arm, resume
+        reset: Print and clear a fault of the arm before its first motion. If the watchdog of the guard holds the arm, resume
             control.
         yes: Move the arm without a question. Required if there is no terminal.
     """

@@ -144,9 +144,9 @@ def collect(
     traverse_time: Seconds = _TRAVERSE_TIME,
     ros: RosCollection = _ROS,
 ) -> None:
-    """Collect static poses or a motion, and the efforts, over LCM; static poses also over ROS 2.
+    """Record static poses or a motion of an arm, with the efforts. A motion requires LCM.
 
-    After an interruption, run the same command again to continue. Enter pauses a motion, and a collection with --ros;
+    After an interruption, run the same command again to continue. Enter pauses a motion, or a collection with --ros.
     Ctrl-C ends the command. In all cases, the arm holds its pose. With --ros, the messages of each run are also written
     to a new bag beside the CSV: POSES_1.mcap, POSES_2.mcap, ...
 
