@@ -52,8 +52,8 @@ def calibrate(
         poses: Number of static poses, 8 to 300.
         duration: Duration of the motion, 15 to 3600 s.
         table: Height of a table in the base frame [m].
-        reset: Print and clear a fault of the arm before its first motion. If the watchdog of the guard holds the arm, resume
-            control.
+        reset: Print and clear a fault of the arm before its first motion. If the watchdog of the guard holds the arm,
+            resume control.
         yes: Move the arm without a question. Required if there is no terminal.
     """
     from dvrk_drake.cli.calibration_steps import CalibrationSettings, calibration_steps, prepare_folder
