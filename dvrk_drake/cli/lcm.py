@@ -275,8 +275,6 @@ def model_warning(path: str, model: IdentifiedModel) -> str:
     """Returns a warning if the model was not validated or a joint failed the validation, otherwise ""."""
     from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
 
-    if model.provenance.method == "nominal":
-        return ""  # has the parameters of the arm's files, as the model that is used without --model
     if model.validation is None:
         bad = unfit(cross_validated_verdicts(model), "usable")
         verdict = f"; verdict by cross-validation: {', '.join(bad)}" if bad else ""

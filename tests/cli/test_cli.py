@@ -342,7 +342,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.processes import arm_controller, control, simulated_arm
 
-def compiles(*arguments):
+def compiles(*arguments, **options):
     try:
         os.kill(os.getpid(), signal.SIGINT)
         signal.sigtimedwait([], 0)  # lets Python call the handler
