@@ -34,7 +34,7 @@ def main() -> None:
     rows = {}
     with ProcessPoolExecutor() as executor, TemporaryDirectory() as folder:
         exact = Path(folder) / "exact.yaml"
-        dvrk.IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs).save(exact)
+        dvrk.IdentifiedModel.from_arm(arm, arm.effects.position_dependent).save(exact)
         models = {name: str(options.calibration / f"{name}.yaml") for name in ("static", "model")}
         for name, path in (models | {"exact": str(exact)}).items():
             for what, with_approach in (("at rest", False), ("after an approach", True)):

@@ -169,7 +169,6 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
     """
     gravity = settings.gravity
     arm = mounted(load_arm(settings.arm), (gravity[0], gravity[1], gravity[2]) if gravity else None)
-    nominal = IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs)
     path = folder / SETTINGS
     if path.exists():
         found = load_typed_yaml(CalibrationSettings, path, CollectionError, "settings of a calibration")
@@ -191,5 +190,5 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
         with atomic_write(path) as stream:
             yaml.safe_dump(asdict(settings), stream, sort_keys=False)
     if not (folder / NOMINAL).exists():
-        nominal.save(folder / NOMINAL)
+        IdentifiedModel.from_arm(arm, arm.effects.position_dependent).save(folder / NOMINAL)
     return arm

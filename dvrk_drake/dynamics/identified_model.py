@@ -216,7 +216,7 @@ class IdentifiedModel(_Identified):
 
         Args:
             arm: Arm whose SDF specifies the inertias.
-            effects: Position-dependent effects, e.g. `arm.effects.cables + arm.effects.springs`. Not allowed together
+            effects: Position-dependent effects, e.g. `arm.effects.position_dependent`. Not allowed together
                 with `dynamics`.
             dynamics: True to include the full dynamics, with the rotors and with the friction, cables and springs of
                 `arm.effects`.

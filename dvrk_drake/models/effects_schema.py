@@ -128,6 +128,11 @@ class ArmEffects:
     effort: EffortEffect | None = None
     delay: DelayEffect | None = None
 
+    @property
+    def position_dependent(self) -> list[DriveEffect]:
+        """Cables and springs, whose torques also act at rest."""
+        return [*self.cables, *self.springs]
+
     def only(self, names: Sequence[str]) -> "ArmEffects":
         """Returns these effects with only the named groups. The name "all" selects all groups.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
 
 import numpy as np
@@ -34,7 +35,7 @@ class TrackingError(CollectionError):
     """Error for a joint that does not follow its target."""
 
 
-class ArmMover:
+class ArmMover(ABC):
     """Computes the desired state of a controller in mode "hold" for each status, until its task is finished.
 
     The task is the generator `_task` of a subclass, which advances by one step per status. The task also ends if
@@ -112,6 +113,7 @@ class ArmMover:
             self.problem, self.finished = error, True
         return self._desired
 
+    @abstractmethod
     def close(self) -> None:
         """Closes the files of the task."""
 
@@ -119,8 +121,9 @@ class ArmMover:
         """Returns a short description of the progress."""
         return self._activity
 
+    @abstractmethod
     def _task(self) -> Steps:
-        raise NotImplementedError
+        """Generator of the task. It sets the desired state and yields once per status."""
 
     @property
     def _tracking_error(self) -> NDArray[np.float64]:

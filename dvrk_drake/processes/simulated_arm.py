@@ -58,7 +58,7 @@ def load_driver(path: str | Path) -> DvrkDriver:
 
 def nominal_model(arm: Arm, effects: ArmEffects | None) -> IdentifiedModel:
     """Returns the model of the SDF, with the springs and cables of the simulated effects."""
-    return IdentifiedModel.from_arm(arm, effects.cables + effects.springs if effects else ())
+    return IdentifiedModel.from_arm(arm, effects.position_dependent if effects else ())
 
 
 def start_pose(arm: Arm, pose: Sequence[float] | None = None, effects: ArmEffects | None = None) -> NDArray[np.float64]:

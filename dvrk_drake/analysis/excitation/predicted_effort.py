@@ -34,8 +34,7 @@ class PredictedEffort:
     @cached_property
     def _known(self) -> IdentifiedModel:
         """The model, or a model without dynamics of the arm's files."""
-        springs = self.arm.effects.cables + self.arm.effects.springs
-        return self.model or IdentifiedModel.from_arm(self.arm, springs)
+        return self.model or IdentifiedModel.from_arm(self.arm, self.arm.effects.position_dependent)
 
     @cached_property
     def regressor(self) -> DynamicRegressor:
