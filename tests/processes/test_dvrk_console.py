@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dvrk_console import start_console
-from ros_publisher import DOMAIN_FILE
+from ros_publisher import DOMAIN_FILE, unused_domain
 from waiting import wait_until
 
 
@@ -15,7 +15,7 @@ from waiting import wait_until
 def domain(monkeypatch):
     """Number of a ROS domain on the loopback interface that no other test process uses."""
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
-    number = 1 + os.getpid() % 231
+    number = unused_domain()
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     return number
 

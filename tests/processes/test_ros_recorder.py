@@ -8,7 +8,7 @@ from unittest.mock import ANY
 
 import numpy as np
 import pytest
-from ros_publisher import DOMAIN_FILE, PERIOD, START, rows
+from ros_publisher import DOMAIN_FILE, PERIOD, START, rows, unused_domain
 from rosbags.highlevel import AnyReader
 from waiting import TIMEOUT
 
@@ -18,7 +18,7 @@ from dvrk_drake.processes import ros_recorder as module
 from dvrk_drake.processes.ros_recorder import RosRecorder
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.ros import discovery
-from dvrk_drake.systems.ros.open_domain import MAX_DOMAIN, domain_number
+from dvrk_drake.systems.ros.open_domain import domain_number
 
 messages_module = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
 JointState, Header, Time = messages_module.JointState, messages_module.Header, messages_module.Time
@@ -32,7 +32,7 @@ TOPIC, JAW = "/PSM1/measured_js", "/PSM1/jaw/measured_js"
 def publisher(request, monkeypatch):
     """Starts a publisher in a domain of its own, and returns the number of the domain."""
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
-    domain = 1 + os.getpid() % (MAX_DOMAIN - 1)
+    domain = unused_domain()
     script = os.path.join(os.path.dirname(__file__), "../support/ros_publisher.py")
     process = subprocess.Popen([sys.executable, script, str(domain), request.param], stdout=subprocess.PIPE, text=True)
     try:
