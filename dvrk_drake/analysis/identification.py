@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
+from dvrk_drake.analysis.offsets_at_rest import with_offsets_at_rest
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
@@ -41,9 +43,12 @@ def identify(
     all motions. Offsets and friction may differ between the motions, and the model contains their means. The
     cross-validated errors are those of each motion with a model of the other motions.
 
+    Motions and one recording of poses give one dynamic model with the offsets at rest of the poses
+    (`with_offsets_at_rest`).
+
     Args:
         recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates. Or
-            several motions.
+            several motions, also with one recording of poses.
         arm: Arm that was recorded, with the gravity direction of its mounting, see `Arm.with_gravity`.
         method: Method for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
         low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
@@ -99,28 +104,44 @@ def identify(
 def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progress | None) -> DynamicIdentification:
     if not recordings:
         raise RecordingError("no recordings were given; a model requires at least one")
-    warnings: list[Finding] = []
+    motions: list[tuple[str, Recording]] = []
+    static: list[tuple[str, Recording]] = []
     for i, recording in enumerate(recordings):
         name = recording.source or f"recording {i + 1}"
-        if not find_poses(recording, arm).moves:
+        found = find_poses(recording, arm)
+        if not found.moves and (static or (i == len(recordings) - 1 and not motions)):
             raise RecordingError(
                 f"{name}: contains static poses, or is sampled too slowly for a motion; several recordings can be "
-                "combined only if all of them are motions"
+                "combined only if all of them, or all but one, are motions"
             )
-        for k, other in enumerate(recordings[:i]):
+        for other_name, other in motions if found.moves else ():
             if _num_common_rows(recording, other) > MAX_COMMON_ROWS * min(len(recording), len(other)):
                 raise RecordingError(
-                    f"{name}: contains the same efforts as {other.source or f'recording {k + 1}'}; give different "
-                    "recordings, because each of them is predicted from the others"
+                    f"{name}: contains the same efforts as {other_name}; give different recordings, because each of "
+                    "them is predicted from the others"
                 )
+        (motions if found.moves else static).append((name, found.recording))
+    warnings: list[Finding] = []
+    for name, recording in motions + static:
         report = require_usable(recording, arm, progress, channels=True)
         warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in report.warnings]
+    share = step_progress(progress, "identifying")
     try:
-        result = identify_dynamic(recordings, arm, step_progress(progress, "identifying"))
+        result = identify_dynamic([motion for _, motion in motions], arm, lambda done: share(0.95 * done))
+        for _, recording in static:
+            poses = identify_static(recording, arm)
+            model = with_offsets_at_rest(result.model, poses)
+            result = replace(result, model=model, num_rows=result.num_rows + len(recording), note=_note(model))
+        share(1.0)
     except DvrkDrakeError as error:
         error.findings = tuple(warnings)
         raise
     return replace(result, warnings=(*warnings, *_unexplained(result)))
+
+
+def _note(model: IdentifiedModel) -> str:
+    offsets = ", ".join(f"{e.coordinate.removeprefix('actuator.')} {e.coefficient:+.4f}" for e in model.effects)
+    return f"Offsets at rest from the static poses [N m; N]: {offsets or 'none'}."
 
 
 def _num_common_rows(a: Recording, b: Recording) -> int:

@@ -135,7 +135,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
 
     gravity_file = "--dvrk-gc" if arm.name.startswith("MTM") else "--dvrk-kinematic-gc"
     first, second = settings.seed, settings.seed + 1
-    identified = ("identify", *parts("motion"), *common, *gravity, "--report", "model_report.html", "--overwrite")
+    identified = ("identify", *parts("motion"), "poses.csv", *common, *gravity, "--report", "model_report.html", "--overwrite")
     return [
         poses("Choose static poses", "poses.yaml", settings.poses, first),
         collect_poses("Collect the static poses", "poses", NOMINAL),
@@ -155,7 +155,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
         creates(
             "Export the gravity compensation",
             "gravity.json",
-            *("export", "--model", STATIC, gravity_file),
+            *("export", "--model", DYNAMIC, gravity_file),
             is_required=False,
         ),
     ]

@@ -67,13 +67,14 @@ def identify(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Identify a model from a recording, or from several motions.
+    """Identify a model from a recording, or from several.
 
     A motion determines the full dynamics, including friction. Static poses determine only the holding torque.
     Several motions give one model. Offsets and friction may differ between them, for example from day to day.
+    Static poses in addition to motions determine the offsets at rest.
 
     Args:
-        others: More motions of the same arm.
+        others: More motions of the same arm, or static poses.
         method: Method for static poses: robust regression, or the least squares of the paper (Rutfield et al., 2015).
     """
     from dvrk_drake.reports.identification import print_identification

@@ -192,8 +192,9 @@ class IdentifiedModel(_Identified):
             contain all joints, the arm has locked joints, and the model is valid only for their positions.
         base_parameters: Base parameters in the order of `gravity_parameters(arm).base`. For a model identified from a
             motion, the base parameters are computed from the links in `dynamics`.
-        effects: Position-dependent effects of a model identified from poses. The list is empty if the model has
-            `dynamics`, because `dynamics` contains all effects.
+        effects: Position-dependent effects of a model identified from poses. If the model has `dynamics`, the list
+            contains the offsets of the actuators at rest that static poses determine. `dynamics` contains all other
+            effects.
         joints: Statistics of the fit of each joint.
         provenance: Origin of the model.
         dynamics: Full dynamics of a model identified from a motion, or None if the model contains only holding torques.
@@ -323,17 +324,27 @@ class IdentifiedModel(_Identified):
                 raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
         if self.dynamics is not None:
             DynamicModel(self.arm, self.dynamics)
-            if self.effects:
-                raise ModelError("effects must be empty in a model with dynamics; use dynamics.effects")
+            offsets = [(f"actuator.{name}", "offset") for name in self.arm.joint_names]
+            for i, effect in enumerate(self.effects):
+                if (effect.coordinate, effect.kind) not in offsets:
+                    raise ModelError(
+                        f"effects[{i}] is {ActuatorEffect.of(effect)}; allowed in a model with dynamics: offsets of "
+                        "actuators (other effects belong into dynamics.effects)"
+                    )
             if not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
                 raise ModelError("gravity must equal dynamics.gravity in a model with dynamics")
 
     @property
     def holding_effects(self) -> list[DriveEffect]:
-        """Effects that have the same torque at rest and in motion (see `DynamicModel.holding_effects`)."""
+        """Effects of the holding torque: those of the dynamics (`DynamicModel.holding_effects`), then `effects`.
+
+        An offset in `effects` replaces that of the dynamics.
+        """
         if self.dynamics is None:
             return self.effects
-        return [self.dynamics.effects[i] for i in self.dynamic_model.holding_effects]
+        replaced = {(e.coordinate, e.kind) for e in self.effects}
+        of_motion = (self.dynamics.effects[i] for i in self.dynamic_model.holding_effects)
+        return [*(e for e in of_motion if (e.coordinate, e.kind) not in replaced), *self.effects]
 
     @property
     def theta(self) -> NDArray[np.float64]:

@@ -128,7 +128,7 @@ def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
 def test_all_parts_of_a_motion_are_identified(tmp_path, ran):
     assert main(["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]) == 0
     dynamic = next(words for words in ran if words[0] == "identify" and "model.yaml" in words)
-    assert dynamic[1:3] == ["motion.csv", "motion_2.csv"]
+    assert dynamic[1:4] == ["motion.csv", "motion_2.csv", "poses.csv"]
 
 
 def test_only_the_next_motion_resets_a_fault(tmp_path, ran):

@@ -68,9 +68,7 @@ class PredictedEffort:
 
     def holding(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the joint efforts (m, n) that hold the arm at poses q (m, n) [N m, N], without dry friction."""
-        if self._known.dynamics is None:
-            return np.asarray(self._known.static_model.torque(q, self._known.theta))
-        return self.without_dry_friction(q, np.zeros_like(q), np.zeros_like(q))
+        return np.asarray(self._known.static_model.torque(q, self._known.theta))
 
     def by_drake(self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the same efforts as `without_dry_friction`, computed with Drake's inverse dynamics."""

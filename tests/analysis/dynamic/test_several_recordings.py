@@ -10,7 +10,9 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.dynamic.dynamic_identification import thinned
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.offsets_at_rest import with_offsets_at_rest
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
@@ -133,11 +135,51 @@ def test_command_prints_the_error_of_each_recording(days, tmp_path, capsys, monk
     )
 
 
+def still(truth, offsets, seed):
+    """Returns poses with holding torques of the true model, and with offsets (n,) of the actuators at rest."""
+    q = ARM.sample_poses(30, np.random.default_rng(seed))
+    effort = truth.rigid_body_effort(q, 0 * q, 0 * q) + offsets
+    return dvrk.Recording(q=q, tau=ARM.transmission.pull_back_effort(effort), source=f"poses{seed}.csv")
+
+
+def test_offsets_at_rest_are_those_of_the_poses(days, tmp_path):
+    """The offset of the insertion at rest differs from the offset in the motion; all other offsets are 0 at rest."""
+    truth, effort, recordings = days
+    offsets = np.zeros(7)
+    offsets[2] = 2.0 * effort[2]
+    result = dvrk.identify([still(truth, offsets, 0), recordings[0]], ARM)
+    other = still(truth, offsets, 1)
+    result.model.save(tmp_path / "model.yaml")
+    model = dvrk.IdentifiedModel.load(tmp_path / "model.yaml")
+    error = ARM.transmission.inverse.pull_back_effort(model.holding_torque(other.q) - other.tau)
+    assert np.all(np.abs(error.mean(axis=0)) < 0.06 * effort)
+    found = {e.coordinate: e.coefficient for e in model.effects}
+    assert found["actuator.insertion"] == pytest.approx(offsets[2], abs=0.1 * effort[2])
+    assert "insertion +" in result.note
+    # The effort in motions is that of the motion.
+    alone = dvrk.identify(recordings[0], ARM).model
+    assert model.dynamics.effects == alone.dynamics.effects and not alone.effects
+
+
+def test_friction_at_rest_is_no_offset(days):
+    """The sign of the remaining friction is random, so its mean is not significant."""
+    truth, effort, recordings = days
+    alone = dvrk.identify(recordings[0], ARM)
+    friction = 0.3 * effort * np.random.default_rng(2).choice([-1.0, 1.0], (30, 7))
+    level = still(truth, 0.0, 0)
+    in_motion = ARM.transmission.inverse.pull_back_effort(alone.model.holding_torque(level.q) - level.tau).mean(axis=0)
+    assert np.max(np.abs(in_motion) / effort) > 0.1  # with the offset of the motion
+    poses = identify_static(still(truth, friction, 0), ARM)
+    model = with_offsets_at_rest(alone.model, poses)
+    error = ARM.transmission.inverse.pull_back_effort(model.holding_torque(level.q) - level.tau).mean(axis=0)
+    assert np.all(np.abs(error) < 0.2 * effort)
+
+
 def test_rejected_lists(days):
-    poses = ARM.sample_poses(40, np.random.default_rng(0))
-    still = dvrk.Recording(q=poses, tau=dvrk.IdentifiedModel.from_arm(ARM).holding_torque(poses), source="poses.csv")
-    with pytest.raises(RecordingError, match=r"poses\.csv: contains static poses, or is sampled too slowly"):
-        dvrk.identify([days[2][0], still], ARM)
+    poses = [still(days[0], 0.0, seed) for seed in (0, 1)]
+    for recordings in ([days[2][0], *poses], poses):
+        with pytest.raises(RecordingError, match=r"poses1\.csv: contains static poses, or is sampled too slowly"):
+            dvrk.identify(recordings, ARM)
     first = days[2][0]
     part = dataclasses.replace(
         first, t=first.t[500:2000], q=first.q[500:2000] + 1e-6, qd=None, tau=first.tau[500:2000], source="part.csv"
