@@ -170,6 +170,7 @@ def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
         is_usable &= "do not use" not in joints
     for file, what in (
         ("report.html", "errors and verdict of the full dynamics"),
+        ("holding_report.html", "errors and verdict of its holding torques at other poses"),
         ("static_report.html", "errors and verdict of the static model"),
         ("model_report.html", "parameters of the full dynamics"),
         ("model.sdf", "full dynamics for Drake"),
@@ -180,8 +181,9 @@ def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
     if not is_usable:
         print_warning("a joint failed the validation; look at the reports before you use the models")
         return
+    model = folder / DYNAMIC
     print(
-        f"Next: dvrk-drake run --arm {name} --model {folder / STATIC} --friction-model {folder / DYNAMIC} "
-        f"--friction-ratio 0.3\nIn the driver's configuration of the arm: model: {(folder / STATIC).resolve()}",
+        f"Next: dvrk-drake run --arm {name} --model {model} --friction-model {model} --friction-ratio 0.3\n"
+        f"In the driver's configuration of the arm: model: {model.resolve()}",
         flush=True,
     )

@@ -135,7 +135,8 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
 
     gravity_file = "--dvrk-gc" if arm.name.startswith("MTM") else "--dvrk-kinematic-gc"
     first, second = settings.seed, settings.seed + 1
-    identified = ("identify", *parts("motion"), "poses.csv", *common, *gravity, "--report", "model_report.html", "--overwrite")
+    recorded = (*parts("motion"), "poses.csv")
+    identified = ("identify", *recorded, *common, *gravity, "--report", "model_report.html", "--overwrite")
     return [
         poses("Choose static poses", "poses.yaml", settings.poses, first),
         collect_poses("Collect the static poses", "poses", NOMINAL),
@@ -151,6 +152,11 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
         rehearse("Rehearse the other motion", "test_motion"),
         record("Record the other motion", "test_motion"),
         validate("Validate the full dynamics", parts("test_motion")[0], DYNAMIC, "report.html"),
+        creates(
+            "Validate the holding torques of the full dynamics",
+            "holding_report.html",
+            *("validate", "test_poses.csv", "--model", DYNAMIC, "--require", "usable", "--report"),
+        ),
         creates("Export the full dynamics", "model.sdf", "export", "--model", DYNAMIC, "--sdf"),
         creates(
             "Export the gravity compensation",

@@ -105,10 +105,10 @@ def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
     command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]
     assert main(command) == 0
     once, count = list(ran), len(ran)
-    assert count == 16
-    assert "16/16] Export the gravity compensation" in capsys.readouterr().out
+    assert count == 17
+    assert "17/17] Export the gravity compensation" in capsys.readouterr().out
     assert main(command) == 0 and len(ran) == count  # nothing to do
-    assert "[1/16] Choose static poses: done" in capsys.readouterr().out
+    assert "[1/17] Choose static poses: done" in capsys.readouterr().out
 
     interrupted = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "d"), "--poses", "8", "--yes"]
     ran.clear()
