@@ -5,7 +5,8 @@
 CALIBRATION is a folder of `dvrk-drake calibrate`. The arm is released at random poses and moves freely for 10 s. A
 release passes if no joint is ever further than 15 mrad (1.5 mm for the insertion) from its release pose. Without an
 approach, the arm is released at rest. With an approach, it first moves to the pose by 0.2 rad (20 mm) in all joints,
-which loads the friction. The models are static.yaml and model.yaml of the calibration, and the exact model.
+which loads the friction. The models are static.yaml and model.yaml of the calibration, and the exact model. Poses at
+which the exact holding effort exceeds the limit of a motor are omitted, because no model can hold the arm there.
 """
 
 from __future__ import annotations
@@ -27,16 +28,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("calibration", type=Path, help="folder of a calibration")
     parser.add_argument("--releases", type=int, default=200, help="number of releases; default: %(default)s")
+    parser.add_argument("--models", nargs="+", default=["static", "model", "exact"], help="models; default: all")
     parser.add_argument("--seed", type=int, default=12345, help="seed of the poses; default: %(default)s")
     options = parser.parse_args()
     arm = dvrk.IdentifiedModel.load(options.calibration / "static.yaml").arm
-    poses = arm.sample_poses(options.releases, np.random.default_rng(options.seed), margin=0.05)
+    true = dvrk.IdentifiedModel.from_arm(arm, arm.effects.position_dependent)
+    sampled = arm.sample_poses(4 * options.releases, np.random.default_rng(options.seed), margin=0.05)
+    can_hold = np.all(np.abs(true.holding_torque(sampled)) <= arm.effort_limits, axis=1)
+    poses = sampled[can_hold][: options.releases]
+    print(f"{100 * np.mean(~can_hold):.0f} % of the poses are omitted, because a motor is too weak")
     rows = {}
     with ProcessPoolExecutor() as executor, TemporaryDirectory() as folder:
         exact = Path(folder) / "exact.yaml"
-        dvrk.IdentifiedModel.from_arm(arm, arm.effects.position_dependent).save(exact)
-        models = {name: str(options.calibration / f"{name}.yaml") for name in ("static", "model")}
-        for name, path in (models | {"exact": str(exact)}).items():
+        true.save(exact)
+        for name in options.models:
+            path = str(exact if name == "exact" else options.calibration / f"{name}.yaml")
             for what, with_approach in (("at rest", False), ("after an approach", True)):
                 cases = [
                     Release(arm.name.lower(), arm, ("all",), path, pose, with_approach=with_approach, seed=k)

@@ -33,8 +33,10 @@ LINK_DEVIATION = 0.3
 MIN_ROTOR_DEVIATION, MIN_ROTOR_SHARE = 3e-6, 0.1
 #: Prior standard deviations of the torque of an effect, as shares of the RMS effort. The prior means are 0. The first
 #: applies to friction, which is a sum of several effects. The second applies to springs and cables that the arm file
-#: lists, because they may balance gravity. The third applies to all other effects.
-FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
+#: lists, because they may balance gravity. The third applies to the second harmonic of a cable with a first harmonic,
+#: which is a correction; a wide prior would let it diverge outside the range of the motion. The fourth applies to all
+#: other effects.
+FRICTION_DEVIATION, KNOWN_DEVIATION, HARMONIC_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.1, 0.3
 #: Prior standard deviation of the torque of a `RecordingEffect`, as a share of the RMS effort.
 RECORDING_DEVIATION = 0.02
 #: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
@@ -134,6 +136,7 @@ class DynamicProblem:
             for i in range(len(self.efforts))
         )
         deviation = np.full(self.num_effects, EFFECT_DEVIATION)
+        mandatory = {(e.coordinate, e.kind, e.scale) for e in self.columns.effects[: self.num_mandatory]}
         for k, effect in enumerate(self.columns.effects):
             if isinstance(effect, RecordingEffect):
                 rows = float(np.mean(self.recording == effect.recording))
@@ -141,7 +144,9 @@ class DynamicProblem:
             elif effect.dissipative:
                 deviation[k] = FRICTION_DEVIATION
             elif k < self.num_mandatory and effect.kind in POSITION_KINDS and effect.kind != "offset":
-                deviation[k] = KNOWN_DEVIATION
+                is_second = effect.kind.startswith("cable") and effect.scale > 1
+                first = (effect.coordinate, effect.kind, 1.0)
+                deviation[k] = HARMONIC_DEVIATION if is_second and first in mandatory else KNOWN_DEVIATION
         return np.asarray(size) / deviation**2 + 1e-9
 
     @property
