@@ -178,8 +178,6 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
     path = folder / SETTINGS
     if path.exists():
         found = load_typed_yaml(CalibrationSettings, path, CollectionError, "settings of a calibration")
-        if found.format != settings.format:
-            raise CollectionError(f'{path}: format is "{found.format}"; allowed: "{settings.format}"')
         for name, value in asdict(settings).items():
             if value != (earlier := getattr(found, name)):
                 raise CollectionError(

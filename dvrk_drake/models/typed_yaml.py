@@ -40,7 +40,8 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
     """Returns the content of the file at `path` as an object of the schema.
 
     Args:
-        schema: Dataclass, see `schema_fault`. A `FileFormat` in its metadata is checked first.
+        schema: Dataclass, see `schema_fault`. A `FileFormat` in its metadata, or the default of its field `format`, is
+            checked first.
         path: Path of the file.
         error: Type of error to raise.
         what: Kind of file that is expected, for messages, e.g. "a gains file".
@@ -59,6 +60,9 @@ def typed_content(schema: type[Schema], content: Any, where: str, error: type[Dv
             expected.major_of(content["format"])
         except ValueError as cause:
             raise error(f"{where}: {cause}") from cause
+    fixed = getattr(schema, "format", None)
+    if fixed and isinstance(content, dict) and content.get("format", fixed) != fixed:
+        raise error(f'{where}: format is "{content["format"]}"; allowed: "{fixed}"')
     content = with_current_keys(schema, content, where)
     if fault := schema_fault(schema, content, what):
         raise error(f"{where}: {fault}")

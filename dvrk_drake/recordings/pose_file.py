@@ -43,8 +43,6 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
             f"{path}: the pose file does not exist. Create it with excite --static, collect --random or --teach."
         )
     content = load_typed_yaml(PoseFile, path, CollectionError, "a pose file")
-    if content.format != PoseFile.format:
-        raise CollectionError(f'{path}: format is "{content.format}"; allowed: "{PoseFile.format}"')
     if content.arm.lower() != arm.name.lower():
         raise CollectionError(f'{path}: arm is "{content.arm}", but the selected arm is {arm.name}')
     if not content.poses:

@@ -73,7 +73,9 @@ def test_file_contains_the_motion(motion, tmp_path):
     [
         ({"arm": "MTML"}, 'arm is "MTML", but the selected arm is PSM'),
         ({"format": "dvrk_drake motion 2"}, 'format is "dvrk_drake motion 2"; allowed: "dvrk_drake motion 1"'),
+        ({"format": "dvrk_drake poses 1", "poses": []}, 'format is "dvrk_drake poses 1"; allowed'),
         ({"period": 0}, "period"),
+        ({"period": ...}, "period is missing"),
         ({"center": [0.0] * 6}, "must have 7 elements each"),
         ({"sine": [[0.1, 0.2]] * 7}, "the same number of coefficients"),
         ({"sine": [[0.1] * 5] * 7}, "does not begin at rest"),
@@ -83,7 +85,8 @@ def test_file_contains_the_motion(motion, tmp_path):
 def test_wrong_files_are_rejected(motion, tmp_path, change, message):
     path = tmp_path / "motion.yaml"
     motion.save(path)
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    content = yaml.safe_load(path.read_text()) | change
+    path.write_text(yaml.safe_dump({key: value for key, value in content.items() if value is not ...}))
     with pytest.raises(ExcitationError) as error:
         PeriodicMotion.load(path, ARM)
     assert message in str(error.value) and str(path) in str(error.value)

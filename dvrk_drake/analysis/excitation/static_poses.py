@@ -112,9 +112,9 @@ def design_poses(
 
     Example:
         >>> import dvrk_drake as dvrk
-        >>> design = dvrk.design_poses(dvrk.load_arm("mtml"), 20)
+        >>> design = dvrk.design_poses(dvrk.load_arm("mtml"), 8)
         >>> design.poses.shape
-        (20, 7)
+        (8, 7)
         >>> design.expected_error < design.random_error
         True
         >>> design.save("poses.yaml")

