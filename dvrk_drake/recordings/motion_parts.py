@@ -109,7 +109,8 @@ def recorded_parts(output: str | Path, arm: Arm, motion: PeriodicMotion) -> list
         motion: Motion of the arm.
 
     Raises:
-        CollectionError: The file name does not end in .csv, or a file is not a recording of this motion by `collect`.
+        CollectionError: The file name does not end in .csv, a file is not a recording of this motion by `collect`, or
+            an earlier part is missing.
         RecordingError: A file cannot be read.
     """
     if Path(output).suffix != ".csv":
@@ -117,6 +118,9 @@ def recorded_parts(output: str | Path, arm: Arm, motion: PeriodicMotion) -> list
     parts: list[MotionPart] = []
     while os.path.lexists(path := next_part(output, parts)):
         parts.append(_read_part(path, arm, motion))
+    later = path.with_name(f"{Path(output).stem}_{len(parts) + 2}.csv")
+    if os.path.lexists(later):
+        raise CollectionError(f"{later} exists, but {path} does not. Delete {later}, or choose another output file.")
     return parts
 
 

@@ -133,6 +133,9 @@ def test_missing_part_is_recorded_after_a_stop(tmp_path, motion):
     second = read_recording(tmp_path / "m_2.csv", ARM)
     assert np.abs(np.array(second.qd)[0]).max() < 0.02
     assert distance_from_path(motion, second.q).max() < 0.01
+    path.unlink()  # a new first part would be joined to the old second part
+    with pytest.raises(CollectionError, match=r"m_2\.csv exists, but .*m\.csv does not"):
+        recorded_parts(path, ARM, motion)
 
 
 def test_short_part_is_recorded_again(tmp_path, motion):
