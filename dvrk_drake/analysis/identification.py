@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
-from dvrk_drake.analysis.offsets_at_rest import with_offsets_at_rest
+from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm import Arm
@@ -43,8 +44,8 @@ def identify(
     all motions. Offsets and friction may differ between the motions, and the model contains their means. The
     cross-validated errors are those of each motion with a model of the other motions.
 
-    Motions and one recording of poses give one dynamic model with the offsets at rest of the poses
-    (`with_offsets_at_rest`).
+    Motions and one recording of poses give one dynamic model. The poses correct its holding torques
+    (`with_effects_at_rest`).
 
     Args:
         recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates. Or
@@ -130,7 +131,7 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
         result = identify_dynamic([motion for _, motion in motions], arm, lambda done: share(0.95 * done))
         for _, recording in static:
             poses = identify_static(recording, arm)
-            model = with_offsets_at_rest(result.model, poses)
+            model = with_effects_at_rest(result.model, poses)
             result = replace(result, model=model, num_rows=result.num_rows + len(recording), note=_note(model))
         share(1.0)
     except DvrkDrakeError as error:
@@ -140,8 +141,8 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
 
 
 def _note(model: IdentifiedModel) -> str:
-    offsets = ", ".join(f"{e.coordinate.removeprefix('actuator.')} {e.coefficient:+.4f}" for e in model.effects)
-    return f"Offsets at rest from the static poses [N m; N]: {offsets or 'none'}."
+    effects = ", ".join(f"{ActuatorEffect.of(e)} {e.coefficient:+.4f}" for e in model.effects)
+    return f"Corrections of the holding torque from the static poses [N m; N]: {effects or 'none'}."
 
 
 def _num_common_rows(a: Recording, b: Recording) -> int:

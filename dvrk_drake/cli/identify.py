@@ -71,7 +71,7 @@ def identify(
 
     A motion determines the full dynamics, including friction. Static poses determine only the holding torque.
     Several motions give one model. Offsets and friction may differ between them, for example from day to day.
-    Static poses in addition to motions determine the offsets at rest.
+    Static poses in addition to motions correct the holding torque.
 
     Args:
         others: More motions of the same arm, or static poses.

@@ -193,7 +193,7 @@ class IdentifiedModel(_Identified):
         base_parameters: Base parameters in the order of `gravity_parameters(arm).base`. For a model identified from a
             motion, the base parameters are computed from the links in `dynamics`.
         effects: Position-dependent effects of a model identified from poses. If the model has `dynamics`, the list
-            contains the offsets of the actuators at rest that static poses determine. `dynamics` contains all other
+            contains the offsets and springs that only act at rest, from static poses. `dynamics` contains all other
             effects.
         joints: Statistics of the fit of each joint.
         provenance: Origin of the model.
@@ -324,12 +324,11 @@ class IdentifiedModel(_Identified):
                 raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
         if self.dynamics is not None:
             DynamicModel(self.arm, self.dynamics)
-            offsets = [(f"actuator.{name}", "offset") for name in self.arm.joint_names]
             for i, effect in enumerate(self.effects):
-                if (effect.coordinate, effect.kind) not in offsets:
+                if effect.kind not in ("offset", "spring"):
                     raise ModelError(
-                        f"effects[{i}] is {ActuatorEffect.of(effect)}; allowed in a model with dynamics: offsets of "
-                        "actuators (other effects belong into dynamics.effects)"
+                        f"effects[{i}] is {ActuatorEffect.of(effect)}; allowed in a model with dynamics: offset and "
+                        "spring (other effects belong into dynamics.effects)"
                     )
             if not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
                 raise ModelError("gravity must equal dynamics.gravity in a model with dynamics")
@@ -338,13 +337,13 @@ class IdentifiedModel(_Identified):
     def holding_effects(self) -> list[DriveEffect]:
         """Effects of the holding torque: those of the dynamics (`DynamicModel.holding_effects`), then `effects`.
 
-        An offset in `effects` replaces that of the dynamics.
+        An offset in `effects` replaces that of the dynamics, and a spring is added.
         """
         if self.dynamics is None:
             return self.effects
-        replaced = {(e.coordinate, e.kind) for e in self.effects}
+        replaced = {e.coordinate for e in self.effects if e.kind == "offset"}
         of_motion = (self.dynamics.effects[i] for i in self.dynamic_model.holding_effects)
-        return [*(e for e in of_motion if (e.coordinate, e.kind) not in replaced), *self.effects]
+        return [*(e for e in of_motion if e.kind != "offset" or e.coordinate not in replaced), *self.effects]
 
     @property
     def theta(self) -> NDArray[np.float64]:

@@ -90,9 +90,9 @@ def test_loaded_model_is_equal_and_conflicts_are_rejected(case, tmp_path):
     loaded = IdentifiedModel.load(tmp_path / "model.yaml")
     np.testing.assert_allclose(loaded.holding_torque(q), model.holding_torque(q), atol=1e-12)
     assert all(e.coefficient != 0 and e.standard_error > 0 for e in model.holding_effects)
-    spring = next(e for e in model.holding_effects if e.kind != "offset")
-    with pytest.raises(ModelError, match="allowed in a model with dynamics: offsets of actuators"):
-        dataclasses.replace(model, effects=[spring]).check()
+    cable = next(e for e in model.holding_effects if e.kind == "cable sine")
+    with pytest.raises(ModelError, match="allowed in a model with dynamics: offset and spring"):
+        dataclasses.replace(model, effects=[cable]).check()
     with pytest.raises(ModelError, match=r"gravity must equal dynamics\.gravity"):
         dynamics = dataclasses.replace(model.dynamics, gravity=[float(-g) for g in model.arm.gravity])
         dataclasses.replace(model, dynamics=dynamics).check()

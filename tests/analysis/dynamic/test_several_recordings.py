@@ -1,6 +1,7 @@
 """Identification of one model from several motions of a simulated arm whose friction and offsets change."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.dynamic.dynamic_identification import thinned
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.offsets_at_rest import with_offsets_at_rest
+from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.errors import RecordingError
@@ -142,7 +144,7 @@ def still(truth, offsets, seed):
     return dvrk.Recording(q=q, tau=ARM.transmission.pull_back_effort(effort), source=f"poses{seed}.csv")
 
 
-def test_offsets_at_rest_are_those_of_the_poses(days, tmp_path):
+def test_effects_at_rest_are_those_of_the_poses(days, tmp_path):
     """The offset of the insertion at rest differs from the offset in the motion; all other offsets are 0 at rest."""
     truth, effort, recordings = days
     offsets = np.zeros(7)
@@ -155,7 +157,7 @@ def test_offsets_at_rest_are_those_of_the_poses(days, tmp_path):
     assert np.all(np.abs(error.mean(axis=0)) < 0.06 * effort)
     found = {e.coordinate: e.coefficient for e in model.effects}
     assert found["actuator.insertion"] == pytest.approx(offsets[2], abs=0.1 * effort[2])
-    assert "insertion +" in result.note
+    assert "actuator.insertion offset +" in result.note
     # The effort in motions is that of the motion.
     alone = dvrk.identify(recordings[0], ARM).model
     assert model.dynamics.effects == alone.dynamics.effects and not alone.effects
@@ -170,9 +172,26 @@ def test_friction_at_rest_is_no_offset(days):
     in_motion = ARM.transmission.inverse.pull_back_effort(alone.model.holding_torque(level.q) - level.tau).mean(axis=0)
     assert np.max(np.abs(in_motion) / effort) > 0.1  # with the offset of the motion
     poses = identify_static(still(truth, friction, 0), ARM)
-    model = with_offsets_at_rest(alone.model, poses)
+    model = with_effects_at_rest(alone.model, poses)
     error = ARM.transmission.inverse.pull_back_effort(model.holding_torque(level.q) - level.tau).mean(axis=0)
     assert np.all(np.abs(error) < 0.2 * effort)
+
+
+def test_hysteresis_between_poses_is_no_spring(days):
+    """Friction along the path between the poses is highly correlated with the position, like a spring."""
+    truth, effort, recordings = days
+    level = still(truth, 0.0, 0)
+    x = ARM.transmission.position(level.q)[:, 1]
+    path = np.concatenate([np.linspace(a, b, 51)[1:] for a, b in itertools.pairwise(x)])
+    effect = ActuatorEffect("actuator.pitch", "presliding", 0.5 * np.ptp(x))
+    friction = np.zeros((30, 7))
+    friction[1:, 1] = 0.1 * effort[1] * effect.column(path, np.gradient(path))[49::50]
+    assert np.corrcoef(friction[:, 1], x)[0, 1] > 0.6
+    alone = dvrk.identify(recordings[0], ARM).model
+    corrected = with_effects_at_rest(alone, identify_static(still(truth, friction, 0), ARM))
+    assert not [e for e in corrected.effects if e.coordinate == "actuator.pitch" and e.kind == "spring"]
+    error = ARM.transmission.inverse.pull_back_effort(corrected.holding_torque(level.q) - level.tau)
+    assert np.sqrt(np.mean(error[:, 1] ** 2)) < 0.04 * effort[1]
 
 
 def test_rejected_lists(days):

@@ -1,0 +1,164 @@
+"""Corrects the holding torque of a model that was identified from motions, with static poses of the same arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from dvrk_drake.analysis.dynamic.estimates import DRY_KINDS
+from dvrk_drake.analysis.static.static_identification import StaticIdentification
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.effects_schema import DriveEffect
+
+#: Smallest coefficient of a correction in standard errors, and its smallest RMS effort as a share of the dry friction.
+#: If a pose is approached from both sides by a short distance, about 12 % of the dry friction remains in the
+#: measurement.
+MIN_RATIO, MIN_FRICTION_SHARE = 3.0, 0.15
+#: Smallest range of a coordinate at the poses for a spring, as a share of its range in the workspace.
+MIN_SPRING_RANGE = 0.3
+#: Number of iterations of the fit, which estimate the variances of the errors.
+_ITERATIONS = 4
+#: Travels of the hysteresis between poses, as shares of the range of the coordinate in the workspace.
+TRAVELS = (0.03, 0.1, 0.2, 0.4)
+
+
+def with_effects_at_rest(model: IdentifiedModel, poses: StaticIdentification) -> IdentifiedModel:
+    """Returns a model with dynamics whose holding torques are corrected by static poses.
+
+    The corrections are offsets of actuators and springs along coordinates, which a motion does not determine at rest:
+
+    - The offset of an actuator in a motion can be caused by an error of the gravity model or by direction-dependent
+      friction (`DynamicModel.holding_effects`).
+    - Presliding friction whose travel is as wide as the motion acts like a spring.
+
+    The efforts at the poses contain hysteresis: friction with a wide travel is not reversed by the short approach of a
+    pose, and depends on the previous poses. It is estimated together with the corrections, from the order of the poses,
+    and is not part of the model. The prior standard deviation of an effect is the dry friction. That of a correction is
+    the RMS residual if this residual is larger. Corrections that are not significant (`MIN_RATIO`) are removed one
+    after the other. The poses change no other parameter.
+
+    Args:
+        model: Model with dynamics.
+        poses: Poses of the same arm in the order of the measurement, with their usable measurements.
+    """
+    arm, q = model.arm, poses.recording.q
+    to_actuator = arm.transmission.inverse
+    residual = to_actuator.pull_back_effort(poses.recording.measured_effort() - model.holding_torque(q))
+    usable = np.array([np.all(poses.usable[:, column != 0], axis=1) for column in to_actuator.matrix.T]).T
+    selected = _candidates(model, q, residual)
+    fit = _fit(selected, residual, usable)
+    while np.min(ratios := fit.ratios(selected), initial=np.inf) < MIN_RATIO:
+        del selected[int(np.argmin(ratios))]
+        fit = _fit(selected, residual, usable)
+    known = {e.coordinate: e.coefficient for e in model.holding_effects if e.kind == "offset"}
+    effects = [
+        DriveEffect(
+            c.effect.coordinate,
+            c.effect.kind,
+            c.effect.scale,
+            float(value + (known.get(c.effect.coordinate, 0.0) if c.effect.kind == "offset" else 0.0)),
+            standard_error=float(error),
+        )
+        for c, value, error in zip(selected, fit.coefficients, fit.standard_errors, strict=True)
+        if c.effect.kind != "presliding"
+    ]
+    source = poses.recording
+    provenance = replace(
+        model.provenance,
+        recording=f"{model.provenance.recording}, {source.source}",
+        sha256=f"{model.provenance.sha256} {source.sha256}",
+        poses=model.provenance.poses + len(source),
+    )
+    return replace(model, effects=effects, provenance=provenance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Candidate effect.
+
+    Attributes:
+        effect: Effect.
+        efforts: Efforts (m, n) of the actuators for a coefficient of 1.
+        deviation: Prior standard deviation of the coefficient.
+        least: Smallest absolute coefficient of a correction.
+    """
+
+    effect: ActuatorEffect
+    efforts: NDArray[np.float64]
+    deviation: float
+    least: float
+
+
+def _candidates(model: IdentifiedModel, q: NDArray[np.float64], residual: NDArray[np.float64]) -> list[_Candidate]:
+    arm = model.arm
+    rows = arm.effect_coordinates
+    of_motion = [e for e in model.dynamic_model.section.effects if e.kind in DRY_KINDS]
+    dry = np.sum([np.abs(rows[e.coordinate] * e.coefficient) for e in of_motion], axis=0) * np.ones(arm.num_joints)
+    largest = np.sqrt(np.mean(residual**2, axis=0))
+    workspace = arm.sample_poses(200, np.random.default_rng(0))
+
+    def candidate(effect: ActuatorEffect, shape: NDArray[np.float64]) -> _Candidate:
+        row = rows[effect.coordinate]
+        size = np.sqrt(np.mean(shape**2)) * np.abs(row)
+        acts = size > 0
+        friction = float(np.min(np.maximum(dry, 1e-9)[acts] / size[acts], initial=np.inf))
+        error = float(np.max(largest[acts] / size[acts], initial=0.0))
+        deviation = friction if effect.kind == "presliding" else max(friction, error)
+        return _Candidate(effect, np.outer(shape, row), deviation, MIN_FRICTION_SHARE * friction)
+
+    candidates = [candidate(ActuatorEffect(f"actuator.{j}", "offset"), np.ones(len(q))) for j in arm.joint_names]
+    for name in distinct_coordinates(arm):
+        x, possible = position_along(arm, name, q), position_along(arm, name, workspace)
+        if np.ptp(x) > MIN_SPRING_RANGE * np.ptp(possible):
+            spring = spring_over(name, possible)
+            candidates.append(candidate(spring, spring.column(x, np.zeros_like(x))))
+            for travel in TRAVELS:
+                effect = ActuatorEffect(name, "presliding", travel * float(np.ptp(possible)))
+                candidates.append(candidate(effect, _hysteresis(x, effect.scale)))
+    return candidates
+
+
+def _hysteresis(x: NDArray[np.float64], travel: float) -> NDArray[np.float64]:
+    """Returns the share (m,) of presliding friction at positions x (m,) that a coordinate reaches one after another."""
+    share = np.zeros(len(x))
+    for k in range(1, len(x)):
+        share[k] = np.clip(share[k - 1] + (x[k] - x[k - 1]) / travel, -1.0, 1.0)
+    return share
+
+
+class _Fit(NamedTuple):
+    """Coefficients (k,) and their standard errors."""
+
+    coefficients: NDArray[np.float64]
+    standard_errors: NDArray[np.float64]
+
+    def ratios(self, candidates: list[_Candidate]) -> NDArray[np.float64]:
+        """Returns the absolute coefficients in standard errors (k,): 0 for small corrections, inf for friction."""
+        size, least = np.abs(self.coefficients), np.array([c.least for c in candidates])
+        is_friction = np.array([c.effect.kind == "presliding" for c in candidates], dtype=bool)
+        return np.where(is_friction, np.inf, np.where(size > least, size / self.standard_errors, 0.0))
+
+
+def _fit(candidates: list[_Candidate], residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> _Fit:
+    """Returns the weighted least-squares fit. The weights are the reciprocal variances of the actuators' errors."""
+    X = np.array([c.efforts for c in candidates]).reshape(len(candidates), *residual.shape)
+    deviation = np.array([c.deviation for c in candidates])
+    lower = np.where([c.effect.kind == "presliding" for c in candidates], 0.0, -np.inf)
+    error, coefficients, inverse = residual, np.zeros(len(X)), np.zeros((len(X), len(X)))
+    for _ in range(_ITERATIONS):
+        variance = np.sum(np.where(usable, error, 0.0) ** 2, axis=0) / np.maximum(usable.sum(axis=0) - 2, 1)
+        W = usable / np.maximum(variance, 1e-18)
+        # In units of the prior deviations, the normal matrix has no eigenvalue below 1.
+        scaled = X * deviation[:, None, None]
+        H = np.einsum("kmn,mn,lmn->kl", scaled, W, scaled) + np.eye(len(X))
+        b = np.einsum("kmn,mn,mn->k", scaled, W, residual)
+        R = np.linalg.cholesky(H).T
+        coefficients = deviation * lsq_linear(R, np.linalg.solve(R.T, b), bounds=(lower, np.inf)).x
+        inverse = np.linalg.inv(H) * np.outer(deviation, deviation)
+        error = residual - np.tensordot(coefficients, X, axes=1)
+    return _Fit(coefficients, np.sqrt(np.diag(inverse)))
