@@ -42,6 +42,7 @@ def parameter_tables(model: IdentifiedModel) -> list[Block]:
         _links(section, regressor),
         _rotors(section, regressor),
         *_effects(arm, section.effects),
+        *_effects(arm, model.effects, "offsets and springs of the holding torque only, from the static poses"),
         _all_link_parameters(section, regressor),
     ]
 
@@ -176,7 +177,11 @@ def _rotors(section: DynamicSection, regressor: DynamicRegressor) -> Table:
     return Table(("actuator", *_HEADER, "unit"), rows, caption="Rotor inertia of each actuator, at the joint")
 
 
-def _effects(arm: Arm, effects: list[DriveEffect]) -> list[Block]:
+def _effects(
+    arm: Arm,
+    effects: list[DriveEffect],
+    what: str = "friction, cable and spring effects of the drives, drawn in Friction and cable curves",
+) -> list[Block]:
     if not effects:
         return []
     rows = []
@@ -195,7 +200,7 @@ def _effects(arm: Arm, effects: list[DriveEffect]) -> list[Block]:
             )
         )
     header = ("coordinate", "effect", "scale", "estimate", "95 % interval", "unit")
-    caption = f"{len(rows)} friction, cable and spring effects of the drives, drawn in Friction and cable curves"
+    caption = f"{len(rows)} {what}"
     scales = {e.kind: EFFECT_KINDS[e.kind].scale for e in effects}
     note = "".join(f"{kind}: the scale is the {text}. " for kind, text in sorted(scales.items()) if text)
     return [Table(header, rows, caption=caption, note=note, collapsed=len(rows) > 12)]
