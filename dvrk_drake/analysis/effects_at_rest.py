@@ -19,6 +19,9 @@ from dvrk_drake.models.effects_schema import DriveEffect
 #: If a pose is approached from both sides by a short distance, about 12 % of the dry friction remains in the
 #: measurement.
 MIN_RATIO, MIN_FRICTION_SHARE = 3.0, 0.15
+#: Smallest number of poses for corrections. The errors of a gravity model depend on the posture, so fewer poses can
+#: increase the errors at other poses.
+MIN_NUM_POSES = 20
 #: Smallest range of a coordinate at the poses for a spring, as a share of its range in the workspace.
 MIN_SPRING_RANGE = 0.3
 #: Number of iterations of the fit, which estimate the variances of the errors.
@@ -40,7 +43,7 @@ def with_effects_at_rest(model: IdentifiedModel, poses: StaticIdentification) ->
     pose, and depends on the previous poses. It is estimated together with the corrections, from the order of the poses,
     and is not part of the model. The prior standard deviation of an effect is the dry friction. That of a correction is
     the RMS residual if this residual is larger. Corrections that are not significant (`MIN_RATIO`) are removed one
-    after the other. The poses change no other parameter.
+    after the other. With fewer than `MIN_NUM_POSES` poses, there is no correction. The poses change no other parameter.
 
     Args:
         model: Model with dynamics.
@@ -50,7 +53,7 @@ def with_effects_at_rest(model: IdentifiedModel, poses: StaticIdentification) ->
     to_actuator = arm.transmission.inverse
     residual = to_actuator.pull_back_effort(poses.recording.measured_effort() - model.holding_torque(q))
     usable = np.array([np.all(poses.usable[:, column != 0], axis=1) for column in to_actuator.matrix.T]).T
-    selected = _candidates(model, q, residual)
+    selected = _candidates(model, q, residual) if len(q) >= MIN_NUM_POSES else []
     fit = _fit(selected, residual, usable)
     while np.min(ratios := fit.ratios(selected), initial=np.inf) < MIN_RATIO:
         del selected[int(np.argmin(ratios))]
@@ -146,7 +149,9 @@ class _Fit(NamedTuple):
 
 def _fit(candidates: list[_Candidate], residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> _Fit:
     """Returns the weighted least-squares fit. The weights are the reciprocal variances of the actuators' errors."""
-    X = np.array([c.efforts for c in candidates]).reshape(len(candidates), *residual.shape)
+    if not candidates:
+        return _Fit(np.empty(0), np.empty(0))
+    X = np.array([c.efforts for c in candidates])
     deviation = np.array([c.deviation for c in candidates])
     lower = np.where([c.effect.kind == "presliding" for c in candidates], 0.0, -np.inf)
     error, coefficients, inverse = residual, np.zeros(len(X)), np.zeros((len(X), len(X)))

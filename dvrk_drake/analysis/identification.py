@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
-from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
+from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
@@ -132,7 +132,7 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
         for _, recording in static:
             poses = identify_static(recording, arm)
             model = with_effects_at_rest(result.model, poses)
-            result = replace(result, model=model, num_rows=result.num_rows + len(recording), note=_note(model))
+            result = replace(result, model=model, note=_note(model, len(poses.recording)))
         share(1.0)
     except DvrkDrakeError as error:
         error.findings = tuple(warnings)
@@ -140,9 +140,10 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
     return replace(result, warnings=(*warnings, *_unexplained(result)))
 
 
-def _note(model: IdentifiedModel) -> str:
+def _note(model: IdentifiedModel, num_poses: int) -> str:
     effects = ", ".join(f"{ActuatorEffect.of(e)} {e.coefficient:+.4f}" for e in model.effects)
-    return f"Corrections of the holding torque from the static poses [N m; N]: {effects or 'none'}."
+    few = f" ({MIN_NUM_POSES} poses are required)" if num_poses < MIN_NUM_POSES else ""
+    return f"Corrections of the holding torque from {num_poses} static poses [N m; N]: {effects or 'none'}{few}."
 
 
 def _num_common_rows(a: Recording, b: Recording) -> int:

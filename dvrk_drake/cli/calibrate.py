@@ -98,6 +98,8 @@ def calibrate(
             raise DvrkDrakeError(
                 f"{step.title} failed; the line above states the reason. The same command continues the calibration"
             )
+        if code:
+            print_warning(f"{step.title} failed; the line above states the reason. The calibration continues")
     _print_result(folder, loaded, settings.arm)
     minutes = (time.monotonic() - began) / 60
     print(f"{minutes:.1f} min in total, of which the arm was controlled for {moving / 60:.1f} min", flush=True)
@@ -166,7 +168,7 @@ def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
         for joint in arm.joint_names:
             joints.setdefault(validation.verdicts[joint], []).append(joint)
         verdicts = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in joints.items())
-        print(f"Verdicts for {what}: {verdicts}", flush=True)
+        print(f"Verdicts on {file} for {what}: {verdicts}", flush=True)
         is_usable &= "do not use" not in joints
     for file, what in (
         ("report.html", "errors and verdict of the full dynamics"),

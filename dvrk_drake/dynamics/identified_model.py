@@ -330,6 +330,9 @@ class IdentifiedModel(_Identified):
                         f"effects[{i}] is {ActuatorEffect.of(effect)}; allowed in a model with dynamics: offset and "
                         "spring (other effects belong into dynamics.effects)"
                     )
+                same = [e for e in self.effects[:i] if (e.coordinate, e.kind) == (effect.coordinate, effect.kind)]
+                if same:
+                    raise ModelError(f"effects[{i}]: {effect.coordinate} has two effects of the kind {effect.kind}")
             if not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
                 raise ModelError("gravity must equal dynamics.gravity in a model with dynamics")
 

@@ -93,6 +93,9 @@ def test_loaded_model_is_equal_and_conflicts_are_rejected(case, tmp_path):
     cable = next(e for e in model.holding_effects if e.kind == "cable sine")
     with pytest.raises(ModelError, match="allowed in a model with dynamics: offset and spring"):
         dataclasses.replace(model, effects=[cable]).check()
+    offset = DriveEffect(cable.coordinate, "offset", 0.0, 0.1)
+    with pytest.raises(ModelError, match="has two effects of the kind offset"):
+        dataclasses.replace(model, effects=[offset, offset]).check()
     with pytest.raises(ModelError, match=r"gravity must equal dynamics\.gravity"):
         dynamics = dataclasses.replace(model.dynamics, gravity=[float(-g) for g in model.arm.gravity])
         dataclasses.replace(model, dynamics=dynamics).check()

@@ -194,6 +194,25 @@ def test_hysteresis_between_poses_is_no_spring(days):
     assert np.sqrt(np.mean(error[:, 1] ** 2)) < 0.04 * effort[1]
 
 
+def test_poses_of_a_correct_model_change_nothing(days):
+    """Within a small range, there are no candidates for springs and hysteresis, and no offset is significant."""
+    truth = dvrk.IdentifiedModel.from_arm(ARM, dynamics=True)
+    q = ARM.sample_poses(30, np.random.default_rng(0)).mean(axis=0) + 1e-2 * np.random.default_rng(1).normal(
+        size=(30, 7)
+    )
+    noise = 1e-3 * ARM.effort_limits * np.random.default_rng(2).normal(size=(30, 7))
+    poses = identify_static(dvrk.Recording(q=q, tau=truth.holding_torque(q) + noise, source="poses.csv"), ARM)
+    assert with_effects_at_rest(truth, poses).effects == []
+
+
+def test_few_poses_change_nothing(days):
+    truth, effort, recordings = days
+    poses = still(truth, 0.5 * effort, 0)
+    few = dataclasses.replace(poses, q=poses.q[:19], tau=poses.tau[:19])
+    result = dvrk.identify([recordings[0], few], ARM)
+    assert result.model.effects == [] and "none (20 poses are required)" in result.note
+
+
 def test_rejected_lists(days):
     poses = [still(days[0], 0.0, seed) for seed in (0, 1)]
     for recordings in ([days[2][0], *poses], poses):
