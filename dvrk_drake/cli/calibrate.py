@@ -70,6 +70,8 @@ def calibrate(
         gravity=list(gravity or ()),
         table=table,
     )
+    if not yes and (sys.stdin is None or not sys.stdin.isatty()):
+        raise DvrkDrakeError(f"{arm} would move without a question, because there is no terminal; add --yes")
     loaded = prepare_folder(folder, settings)
     connection = [f"--lcm-url={lcm_url}"] if lcm_url else []
     connection += ["--key", _absolute(key)] if key else []
@@ -109,11 +111,8 @@ def _confirm(name: str) -> None:
     """Asks the operator before a motion.
 
     Raises:
-        DvrkDrakeError: There is no terminal.
         KeyboardInterrupt: The input ended.
     """
-    if sys.stdin is None or not sys.stdin.isatty():
-        raise DvrkDrakeError(f"{name} would move without a question, because there is no terminal; add --yes")
     # Keys that were pressed before the question do not answer it.
     termios.tcflush(sys.stdin, termios.TCIFLUSH)
     try:
