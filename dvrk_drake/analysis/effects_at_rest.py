@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from dvrk_drake.analysis.dynamic.estimates import DRY_KINDS
-from dvrk_drake.analysis.static.static_identification import StaticIdentification
+from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -24,6 +24,8 @@ MIN_RATIO, MIN_FRICTION_SHARE = 3.0, 0.15
 MIN_NUM_POSES = 20
 #: Smallest range of a coordinate at the poses for a spring, as a share of its range in the workspace.
 MIN_SPRING_RANGE = 0.3
+#: Number of held-out blocks of successive poses. A correction must reduce the errors in these blocks.
+_BLOCKS = 5
 #: Number of iterations of the fit, which estimate the variances of the errors.
 _ITERATIONS = 4
 #: Travels of the hysteresis between poses, as shares of the range of the coordinate in the workspace.
@@ -41,23 +43,30 @@ def with_effects_at_rest(model: IdentifiedModel, poses: StaticIdentification) ->
 
     The efforts at the poses contain hysteresis: friction with a wide travel is not reversed by the short approach of a
     pose, and depends on the previous poses. It is estimated together with the corrections, from the order of the poses,
-    and is not part of the model. The prior standard deviation of an effect is the dry friction. That of a correction is
-    the RMS residual if this residual is larger. Corrections that are not significant (`MIN_RATIO`) are removed one
-    after the other. With fewer than `MIN_NUM_POSES` poses, there is no correction. The poses change no other parameter.
+    and is not part of the model. The prior standard deviations are the dry friction for the hysteresis, and the RMS
+    residual for a correction. Corrections are removed one after the other if they are not significant (`MIN_RATIO`), or
+    do not reduce the error at held-out poses. With fewer than `MIN_NUM_POSES` poses, there is no correction. The poses
+    change no other parameter.
 
     Args:
         model: Model with dynamics.
         poses: Poses of the same arm in the order of the measurement, with their usable measurements.
     """
-    arm, q = model.arm, poses.recording.q
+    model, q = replace(model, effects=[]), poses.recording.q
+    arm = model.arm
     to_actuator = arm.transmission.inverse
     residual = to_actuator.pull_back_effort(poses.recording.measured_effort() - model.holding_torque(q))
     usable = np.array([np.all(poses.usable[:, column != 0], axis=1) for column in to_actuator.matrix.T]).T
     selected = _candidates(model, q, residual) if len(q) >= MIN_NUM_POSES else []
-    fit = _fit(selected, residual, usable)
-    while np.min(ratios := fit.ratios(selected), initial=np.inf) < MIN_RATIO:
+    while np.min(ratios := _fit(selected, residual, usable).ratios(selected), initial=np.inf) < MIN_RATIO:
         del selected[int(np.argmin(ratios))]
-        fit = _fit(selected, residual, usable)
+    while corrections := [k for k, c in enumerate(selected) if c.effect.kind != "presliding"]:
+        error = _held_out_error(selected, residual, usable)
+        without = [_held_out_error(selected[:k] + selected[k + 1 :], residual, usable) for k in corrections]
+        if min(without) > error:
+            break
+        del selected[corrections[int(np.argmin(without))]]
+    fit = _fit(selected, residual, usable)
     known = {e.coordinate: e.coefficient for e in model.holding_effects if e.kind == "offset"}
     effects = [
         DriveEffect(
@@ -102,7 +111,7 @@ def _candidates(model: IdentifiedModel, q: NDArray[np.float64], residual: NDArra
     rows = arm.effect_coordinates
     of_motion = [e for e in model.dynamic_model.section.effects if e.kind in DRY_KINDS]
     dry = np.sum([np.abs(rows[e.coordinate] * e.coefficient) for e in of_motion], axis=0) * np.ones(arm.num_joints)
-    largest = np.sqrt(np.mean(residual**2, axis=0))
+    largest = np.sqrt(np.mean(residual**2, axis=0)) + 1e-9
     workspace = arm.sample_poses(200, np.random.default_rng(0))
 
     def candidate(effect: ActuatorEffect, shape: NDArray[np.float64]) -> _Candidate:
@@ -110,13 +119,16 @@ def _candidates(model: IdentifiedModel, q: NDArray[np.float64], residual: NDArra
         size = np.sqrt(np.mean(shape**2)) * np.abs(row)
         acts = size > 0
         friction = float(np.min(np.maximum(dry, 1e-9)[acts] / size[acts], initial=np.inf))
-        error = float(np.max(largest[acts] / size[acts], initial=0.0))
-        deviation = friction if effect.kind == "presliding" else max(friction, error)
+        if effect.kind == "presliding":
+            return _Candidate(effect, np.outer(shape, row), friction / len(TRAVELS), 0.0)
+        deviation = float(np.min(largest[acts] / size[acts]))
         return _Candidate(effect, np.outer(shape, row), deviation, MIN_FRICTION_SHARE * friction)
 
-    candidates = [candidate(ActuatorEffect(f"actuator.{j}", "offset"), np.ones(len(q))) for j in arm.joint_names]
+    candidates = []
     for name in distinct_coordinates(arm):
         x, possible = position_along(arm, name, q), position_along(arm, name, workspace)
+        if name.startswith("actuator.") and np.ptp(x) > MIN_MOTION * np.ptp(possible):
+            candidates.append(candidate(ActuatorEffect(name, "offset"), np.ones(len(q))))
         if np.ptp(x) > MIN_SPRING_RANGE * np.ptp(possible):
             spring = spring_over(name, possible)
             candidates.append(candidate(spring, spring.column(x, np.zeros_like(x))))
@@ -167,3 +179,16 @@ def _fit(candidates: list[_Candidate], residual: NDArray[np.float64], usable: ND
         inverse = np.linalg.inv(H) * np.outer(deviation, deviation)
         error = residual - np.tensordot(coefficients, X, axes=1)
     return _Fit(coefficients, np.sqrt(np.diag(inverse)))
+
+
+def _held_out_error(candidates: list[_Candidate], residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
+    """Returns the mean squared error in held-out blocks of successive poses, relative to the residual."""
+    block = np.arange(len(residual)) * _BLOCKS // len(residual)
+    error = residual.copy()
+    for k in range(_BLOCKS):
+        own = block == k
+        training = [replace(c, efforts=c.efforts[~own]) for c in candidates]
+        fit = _fit(training, residual[~own], usable[~own])
+        error[own] -= sum((x * c.efforts[own] for x, c in zip(fit.coefficients, candidates, strict=True)), 0.0)
+    squares = [np.sum(np.where(usable, x, 0.0) ** 2, axis=0) for x in (error, residual)]
+    return float(np.sum(squares[0] / np.maximum(squares[1], 1e-18)))

@@ -111,9 +111,10 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
         name = recording.source or f"recording {i + 1}"
         found = find_poses(recording, arm)
         if not found.moves and (static or (i == len(recordings) - 1 and not motions)):
+            also = f", and so does {static[0][0]}" if static else ""
             raise RecordingError(
-                f"{name}: contains static poses, or is sampled too slowly for a motion; several recordings can be "
-                "combined only if all of them, or all but one, are motions"
+                f"{name}: contains static poses, or is sampled too slowly for a motion{also}; several recordings can "
+                "be combined only if all of them, or all but one, are motions"
             )
         for other_name, other in motions if found.moves else ():
             if _num_common_rows(recording, other) > MAX_COMMON_ROWS * min(len(recording), len(other)):

@@ -11,6 +11,7 @@ Layouts without a header, for an arm with n joints:
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from pathlib import Path
 
@@ -49,14 +50,17 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         if is_headerless := 2 * sum(map(is_number, cells)) >= len(cells):
             blocks = _layout(path, where, len(cells), arm, n)
             header = [f"{prefix}{i + 1} (column {n * k + i + 1})" for k, prefix in enumerate(blocks) for i in range(n)]
+            first = [(line, cells)]
         else:
             header, blocks = cells, _columns_of_blocks(where, cells, arm, n)
+            first = list(itertools.islice(reader, 1))
+            _check_arm(path, header, first, arm)
         found = read_numbers(
             reader,
             header,
             blocks,
             skip_invalid=options.skip_invalid,
-            first=[(line, cells)] if is_headerless else [],
+            first=first,
             header_name="the first row" if is_headerless else "the header",
         )
         sha256 = reader.sha256()
@@ -82,6 +86,14 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         notes=(*time_notes, *found.notes),
     )
     return options.with_coordinates(recording, "wpi" if is_wpi else "joint")
+
+
+def _check_arm(path: Path, header: list[str], first: list[tuple[int, list[str]]], arm: Arm | None) -> None:
+    """Raises RecordingError if the column `arm` of the first row names another arm. `collect` writes this column."""
+    for line, cells in first if arm is not None and "arm" in header else ():
+        name = cells[header.index("arm")].strip() if len(cells) == len(header) else ""
+        if name and arm is not None and name.lower() != arm.name.lower():
+            raise RecordingError(f"{path}, line {line}: the row is of {name[:30]}, but the selected arm is {arm.name}")
 
 
 def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict[str, list[int]]:

@@ -7,6 +7,7 @@ import pytest
 import scipy.io
 from public_files import assert_refused, team_array, wpi_rows, write_mat, write_text, write_wpi
 
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.reading import detect_format, read_recording
@@ -82,3 +83,12 @@ def test_poses_of_a_collection_have_no_note(tmp_path):
     file.close()
     recording = read_recording(tmp_path / "poses.csv")
     assert recording.t is None and recording.notes == ()
+
+
+def test_row_of_another_arm_is_rejected(tmp_path):
+    arm, path = load_arm("mtmr"), tmp_path / "poses.csv"
+    names = [f"{block}{i}" for block in ("q", "tau") for i in range(1, 8)]
+    path.write_text(",".join([*names, "arm"]) + "\n" + 2 * (14 * "0," + "MTML\n"))
+    with pytest.raises(RecordingError, match=r"poses\.csv, line 2: the row is of MTML, but the selected arm is MTMR"):
+        read_recording(path, arm)
+    assert len(read_recording(path, load_arm("mtml"))) == len(read_recording(path)) == 2

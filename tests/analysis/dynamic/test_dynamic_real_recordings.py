@@ -134,7 +134,8 @@ def test_poses_reduce_the_errors_at_other_poses(case, shared_data):
     alone, both = (
         np.sqrt(np.mean((m.holding_torque(other.q) - other.measured_effort()) ** 2, axis=0)) for m in (model, corrected)
     )
-    assert np.all(both[:5] < [0.4, 0.8, 0.6, 0.5, 1.02] * alone[:5])
+    # The outer yaw does not move in the poses, so it is not corrected.
+    assert np.all(both[:5] < [1.02, 0.8, 0.6, 0.5, 1.02] * alone[:5])
 
 
 @pytest.fixture(scope="module")
