@@ -328,7 +328,7 @@ class IdentifiedModel(_Identified):
                 if effect.kind not in ("offset", "spring"):
                     raise ModelError(
                         f"effects[{i}] is {ActuatorEffect.of(effect)}; allowed in a model with dynamics: offset and "
-                        "spring (other effects belong into dynamics.effects)"
+                        "spring. All other effects are in dynamics.effects"
                     )
                 same = [e for e in self.effects[:i] if (e.coordinate, e.kind) == (effect.coordinate, effect.kind)]
                 if same:
