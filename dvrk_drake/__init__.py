@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dvrk_drake.export.model_export import export_model
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.models.environment import Environment
     from dvrk_drake.recordings.periodic_motion import PeriodicMotion
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording, write_recording
@@ -41,6 +42,7 @@ _MODULES = {
     "Arm": "models.arm",
     "ArmStation": "systems.arm_station",
     "DvrkDrakeError": "errors",
+    "Environment": "models.environment",
     "GravityPidController": "systems.gravity_pid_controller",
     "IdentifiedModel": "dynamics.identified_model",
     "MotionLimits": "analysis.excitation.motion_limits",
@@ -72,6 +74,7 @@ __all__ = [
     "Arm",
     "ArmStation",
     "DvrkDrakeError",
+    "Environment",
     "GravityPidController",
     "IdentifiedModel",
     "MotionLimits",

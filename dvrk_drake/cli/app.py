@@ -86,6 +86,16 @@ Gravity = Annotated[
         "the arm file.",
     ),
 ]
+Table = Annotated[
+    float | None, Parameter(metavar="Z", help="Height of a table in the base frame [m]. The arm must not touch it.")
+]
+EnvironmentFile = Annotated[
+    str | None,
+    Parameter(
+        metavar="FILE.dmd.yaml",
+        help="Drake model directives of fixed objects in the base frame that the arm must not touch, e.g. another arm.",
+    ),
+]
 Locked = Annotated[
     list[str] | None,
     Parameter(

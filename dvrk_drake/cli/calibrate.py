@@ -14,8 +14,21 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Realtime, Seconds, Seed, app, whole_number
-from dvrk_drake.cli.support import load_key, print_warning, print_written
+from dvrk_drake.cli.app import (
+    HARDWARE,
+    Arm,
+    EnvironmentFile,
+    Gravity,
+    Key,
+    LcmUrl,
+    Realtime,
+    Seconds,
+    Seed,
+    Table,
+    app,
+    whole_number,
+)
+from dvrk_drake.cli.support import load_environment, load_key, print_warning, print_written
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
@@ -35,7 +48,8 @@ def calibrate(
     duration: Seconds = 30.0,
     seed: Seed = 0,
     gravity: Gravity = None,
-    table: Annotated[float | None, Parameter(metavar="Z")] = None,
+    table: Table = None,
+    environment: EnvironmentFile = None,
     lcm_url: LcmUrl = "",
     key: Key = None,
     realtime: Realtime = False,
@@ -51,7 +65,6 @@ def calibrate(
         output: Folder for all files. An existing calibration in this folder is continued.
         poses: Number of static poses, 8 to 300.
         duration: Duration of the motion, 15 to 3600 s.
-        table: Height of a table in the base frame [m].
         reset: Print and clear a fault of the arm before its first motion. If the watchdog of the guard holds the arm,
             resume control.
         yes: Move the arm without a question. Required if there is no terminal.
@@ -68,7 +81,7 @@ def calibrate(
         duration=duration,
         seed=seed,
         gravity=list(gravity or ()),
-        table=table,
+        environment=load_environment(table, environment),
     )
     if not yes and (sys.stdin is None or not sys.stdin.isatty()):
         raise DvrkDrakeError(f"{arm} would move without a question, because there is no terminal; add --yes")

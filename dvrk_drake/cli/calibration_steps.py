@@ -12,6 +12,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
@@ -21,6 +22,7 @@ from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 
 #: Names of the files in the folder.
 SETTINGS, NOMINAL, STATIC, DYNAMIC = "calibration.yaml", "nominal.yaml", "static.yaml", "model.yaml"
+ENVIRONMENT = "environment.dmd.yaml"
 #: Number of the poses with which the static model is validated.
 TEST_POSES = 10
 #: Options of the motion with which the full dynamics is validated. It has other frequencies than the first motion.
@@ -38,7 +40,7 @@ class CalibrationSettings:
         duration: Duration of the motion [s].
         seed: Seed of the designs.
         gravity: Gravity vector in the base frame [m/s^2], or an empty list for the vector in the arm file.
-        table: Height of a table in the base frame [m], or None.
+        environment: Fixed objects around the arm.
     """
 
     format: str = "dvrk_drake calibration 1"
@@ -47,7 +49,7 @@ class CalibrationSettings:
     duration: float = field(default=30.0, metadata=within(15.0, 3600.0, "s"))
     seed: int = field(default=0, metadata=within(0, 1_000_000))
     gravity: list[float] = field(default_factory=list, metadata=within(-20.0, 20.0, "m/s^2"))
-    table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
+    environment: Environment = field(default_factory=Environment)
 
     def __post_init__(self) -> None:
         if fault := number_fault(self):
@@ -77,13 +79,15 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
     """Returns the steps of a calibration, in order. Their commands run in the folder."""
     common = ["--arm", settings.arm]
     gravity = ["--gravity", *map(repr, settings.gravity)] if settings.gravity else []
-    table = [] if settings.table is None else ["--table", repr(settings.table)]
+    around = settings.environment
+    environment = [] if around.table is None else ["--table", repr(around.table)]
+    environment += ["--environment", ENVIRONMENT] if around.directives else []
 
     def creates(title: str, output: str, *words: str, is_required: bool = True) -> Step:
         return Step(title, (*words, output), (folder / output).exists, is_required=is_required)
 
     def poses(title: str, output: str, count: int, seed: int) -> Step:
-        words = ("excite", *common, *gravity, *table, "--static", str(count), "--seed", str(seed), "--output")
+        words = ("excite", *common, *gravity, *environment, "--static", str(count), "--seed", str(seed), "--output")
         return creates(title, output, *words)
 
     def collect_poses(title: str, name: str, model: str) -> Step:
@@ -95,7 +99,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
         return Step(title, words, done, moves=True)
 
     def motion(title: str, output: str, seed: int, *options: str) -> Step:
-        words = ("excite", *common, *table, "--model", STATIC, *options, "--seed", str(seed), "--output")
+        words = ("excite", *common, *environment, "--model", STATIC, *options, "--seed", str(seed), "--output")
         return creates(title, output, *words)
 
     def rehearse(title: str, name: str) -> Step:
@@ -178,8 +182,8 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
     path = folder / SETTINGS
     if path.exists():
         found = load_typed_yaml(CalibrationSettings, path, CollectionError, "settings of a calibration")
-        for name, value in asdict(settings).items():
-            if value != (earlier := getattr(found, name)):
+        for name in asdict(settings):
+            if (value := getattr(settings, name)) != (earlier := getattr(found, name)):
                 raise CollectionError(
                     f"{path}: {name} is {earlier}, but {value} was given; give the same options, or another folder"
                 )
@@ -193,6 +197,9 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
             raise CollectionError(f"{folder}: the folder is not empty and has no calibration; give a new folder")
         with atomic_write(path) as stream:
             yaml.safe_dump(asdict(settings), stream, sort_keys=False)
+    if settings.environment.directives and not (folder / ENVIRONMENT).exists():
+        with atomic_write(folder / ENVIRONMENT) as stream:
+            stream.write(settings.environment.directives)
     if not (folder / NOMINAL).exists():
         IdentifiedModel.from_arm(arm, arm.effects.position_dependent).save(folder / NOMINAL)
     return arm

@@ -69,7 +69,7 @@ def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> 
     _check_motion(path, motion, arm, model)
     with interrupt_ends_process():
         controller, link, _period = ready_controller(controlled, "hold")
-        q = checked_start(model, link, motion.evaluate([begin]).q[0], motion.table)
+        q = checked_start(model, link, motion.evaluate([begin]).q[0], motion.environment)
         stopped = stop_on_signals()
     line, speed = LiveLine(sys.stderr), REHEARSAL_SPEED if create is None else 1.0
     has_keys = sys.stdin is not None and sys.stdin.isatty()
@@ -132,5 +132,5 @@ def _check_motion(path: str, motion: PeriodicMotion, arm: Arm, model: Identified
     """Checks the motion with the limits of the arm and of its guard, independently of the limits of its design."""
     from dvrk_drake.analysis.excitation.motion_limits import execution_limits, motion_violations
 
-    if violations := motion_violations(motion, model.arm, execution_limits(motion.table), model):
+    if violations := motion_violations(motion, model.arm, execution_limits(motion.environment), model):
         raise CollectionError(f"{path}: {violations[0]}; design a motion within the limits of {arm.name}")

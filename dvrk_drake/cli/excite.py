@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import IDENTIFY, Arm, Gravity, Overwrite, Seconds, Seed, app, whole_number
-from dvrk_drake.cli.support import Steps, check_output, mounted, print_written, quiet_drake
+from dvrk_drake.cli.app import (
+    IDENTIFY,
+    Arm,
+    EnvironmentFile,
+    Gravity,
+    Overwrite,
+    Seconds,
+    Seed,
+    Table,
+    app,
+    whole_number,
+)
+from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written, quiet_drake
 from dvrk_drake.errors import ExcitationError
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.environment import Environment
 
 #: Default rate of the rows of --csv [Hz].
 DEFAULT_RATE = 200.0
@@ -34,7 +48,8 @@ def excite(
     traverse_time: Seconds | None = None,
     effort: Annotated[float, Parameter(metavar="SHARE")] = 0.8,
     position: Annotated[list[str] | None, Parameter(metavar="JOINT=LOWER:UPPER ..", consume_multiple=True)] = None,
-    table: Annotated[float | None, Parameter(metavar="Z")] = None,
+    table: Table = None,
+    environment: EnvironmentFile = None,
     gravity: Gravity = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -60,7 +75,6 @@ def excite(
             Default: 1.
         effort: Largest predicted effort, as a share of the effort limits, 0.05 to 1.
         position: Additional position limits [rad, m], e.g. insertion=0.05:0.2.
-        table: Height of a table in the base frame [m].
     """
     import numpy as np
 
@@ -81,7 +95,8 @@ def excite(
         if given := [f"--{name}" for name, value in of_motion.items() if value is not None]:
             raise ExcitationError(f"{' and '.join(given)} cannot be used with --static")
         check_output(output, overwrite=overwrite)
-        _select_poses(arm, output, static, seed, margin, effort, _positions(position or []), table, gravity)
+        around = load_environment(table, environment)
+        _select_poses(arm, output, static, seed, margin, effort, _positions(position or []), around, gravity)
         return
     if csv is None and rate is not None:
         raise ExcitationError("--rate requires --csv")
@@ -96,7 +111,7 @@ def excite(
         traverse_time=1.0 if traverse_time is None else traverse_time,
         effort=effort,
         positions=_positions(position or []),
-        table=table,
+        environment=load_environment(table, environment),
     )
     if model is not None and gravity is not None:
         raise ExcitationError("--gravity cannot be used with --model, because the model contains the gravity vector")
@@ -145,7 +160,7 @@ def _select_poses(
     margin: float | None,
     effort: float,
     positions: dict[str, tuple[float, float]],
-    table: float | None,
+    environment: Environment,
     gravity: tuple[float, float, float] | None,
 ) -> None:
     """Selects static poses, writes the pose file and prints the expected errors."""
@@ -153,7 +168,7 @@ def _select_poses(
     from dvrk_drake.reports.terminal_tables import make_console, print_answer
 
     limits = dvrk.MotionLimits(
-        margin=MARGIN if margin is None else margin, effort=effort, positions=positions, table=table
+        margin=MARGIN if margin is None else margin, effort=effort, positions=positions, environment=environment
     )
     quiet_drake()
     arm = mounted(dvrk.load_arm(name), gravity, None)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_schema import Gains
+    from dvrk_drake.models.environment import Environment
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
@@ -239,7 +240,10 @@ def ready_controller(
 
 
 def checked_start(
-    model: IdentifiedModel, link: Callable[[], ArmLink], q_end: NDArray[np.float64], table: float | None = None
+    model: IdentifiedModel,
+    link: Callable[[], ArmLink],
+    q_end: NDArray[np.float64],
+    environment: Environment,
 ) -> NDArray[np.float64]:
     """Checks the straight path in joint space from the present pose of an arm to the first pose of a collection.
 
@@ -247,7 +251,7 @@ def checked_start(
         model: Model of the arm that predicts the efforts.
         link: Function that opens the link to the arm.
         q_end: First pose (n,) [rad, m].
-        table: Height of a table in the base frame [m], or None.
+        environment: Fixed objects around the arm.
 
     Returns:
         Present pose (n,) [rad, m].
@@ -263,7 +267,7 @@ def checked_start(
 
     with closing(link()) as opened:
         q = np.array(opened.next_status(_SILENCE).position)
-    if obstacle := path_obstacle(model.arm, q, q_end, table, model):
+    if obstacle := path_obstacle(model.arm, q, q_end, environment, model):
         raise CollectionError(
             f"{model.arm.name} cannot move from its present pose to the first pose: {obstacle}. Move the arm by hand "
             "to another pose first (dvrk-drake run --mode gravity)"

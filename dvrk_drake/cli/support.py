@@ -30,7 +30,8 @@ from rich.progress import (
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import leave
-from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
+from dvrk_drake.errors import ArmError, DvrkDrakeError, ExcitationError, ModelError
+from dvrk_drake.models.files import read_text_input
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.check.findings import Finding
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
+    from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.lcm_messages import MessageKey
 
 
@@ -258,6 +260,20 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
     """Prints notes on a recording on stderr, one line per note."""
     for note in notes:
         print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
+
+
+def load_environment(table: float | None, path: str | None) -> Environment:
+    """Returns the fixed objects given with --table and --environment.
+
+    Raises:
+        ExcitationError: The file cannot be read, or Drake cannot load it.
+    """
+    from dvrk_drake.models.environment import Environment
+
+    try:
+        return Environment(table, "" if path is None else read_text_input(path, ExcitationError))
+    except ExcitationError as error:
+        raise ExcitationError(f"{path or '--table'}: {error}") from error
 
 
 def mounted(arm: Arm, gravity: Sequence[float] | None, locked: Sequence[str] | None = None) -> Arm:

@@ -237,6 +237,12 @@ def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray
     return np.asarray(arm.transmission.position(q) @ arm.effect_coordinates[coordinate])
 
 
+def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), for a coefficient of 1."""
+    x = position_along(arm, effect.coordinate, q)
+    return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
+
+
 def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
     """Returns a spring effect whose linear range is 1 % larger than the largest |x| of positions x (m,) [rad, m]."""
     return ActuatorEffect(coordinate, "spring", float(f"{1.01 * np.abs(x).max():.3g}"))

@@ -85,32 +85,28 @@ def compile_function(
     return numba.njit(numba.void(*kinds, out), fastmath=False)(namespace[name])
 
 
-def compile_batch(function: Callable[..., None], num_arguments: int, shape: tuple[int, ...]) -> Callable:
-    """Compiles a loop that calls `function` for each row of its first argument.
+def compile_batch(
+    function: Callable[..., None], shape: tuple[int, ...]
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Compiles a loop that calls `function` for each row of its argument.
 
     Args:
-        function: Compiled function with an output array of the given shape as its last argument.
-        num_arguments: Number of arguments without the output array.
+        function: Compiled function f(row, out) with an output array of the given shape.
         shape: Shape of the output array.
 
     Returns:
-        Function f(rows, *other_arguments) for rows (m, k), which returns an array (m, *shape).
+        Function of rows (m, k), which returns an array (m, *shape).
     """
-    others = ", ".join(f"a{i}" for i in range(1, num_arguments))
-    call = f"rows[i], {others + ', ' if others else ''}out[i]"
-    source = (
-        f"def batch(rows, {others}{', ' if others else ''}out):\n"
-        "    for i in range(rows.shape[0]):\n"
-        f"        function({call})\n"
-    )
-    namespace: dict[str, Any] = {"function": function}
-    exec(source, namespace)
-    loop = numba.njit(namespace["batch"])
 
-    def evaluate(rows: NDArray[np.float64], *arguments: object) -> NDArray[np.float64]:
+    @numba.njit
+    def loop(rows: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        for i in range(rows.shape[0]):
+            function(rows[i], out[i])
+
+    def evaluate(rows: NDArray[np.float64]) -> NDArray[np.float64]:
         rows = np.ascontiguousarray(rows, dtype=np.float64)
         out = np.empty((len(rows), *shape))
-        loop(rows, *arguments, out)
+        loop(rows, out)
         return out
 
     return evaluate

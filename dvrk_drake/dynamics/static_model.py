@@ -11,9 +11,12 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.dynamics import codegen
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_column, joint_row
 from dvrk_drake.dynamics.gravity_regressor import GRAVITY, SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm
+
+#: Number of poses whose regressor is computed at a time for a torque, which limits the memory.
+_ROWS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +25,7 @@ class StaticModel:
 
     The parameters theta are the b base parameters [kg m, kg], then one coefficient per effect in the unit of its kind.
     Each function is compiled at its first use, because a controller does not need the regressor and identification does
-    not need the torque.
+    not need the torque. The regressor of the links is compiled once per arm, for all effects.
 
     Attributes:
         gravity: Symbolic gravity torque.
@@ -39,22 +42,9 @@ class StaticModel:
         The arguments are C-contiguous float64 arrays (n,) [rad, m], (b + e,) and (n,) [N m, N].
         """
         theta = sympy.symbols(f"theta0:{self.num_parameters}")
-        terms = codegen.share_terms(sympy.Array(list(self._symbolic_regressor * sympy.Matrix(theta))))
+        total = symbolic_regressor(self.gravity, self.effects) * sympy.Matrix(theta)
+        terms = codegen.share_terms(sympy.Array(list(total)))
         return codegen.compile_function("torque", [("q", self.gravity.q), ("theta", theta)], terms)
-
-    @cached_property
-    def _symbolic_regressor(self) -> sympy.Matrix:
-        return symbolic_regressor(self.gravity, self.effects)
-
-    @cached_property
-    def _regressor_batch(self) -> Callable[..., NDArray[np.float64]]:
-        terms = codegen.share_terms(self._symbolic_regressor)
-        regressor = codegen.compile_function("regressor", [("q", self.gravity.q)], terms)
-        return codegen.compile_batch(regressor, 1, self._symbolic_regressor.shape)
-
-    @cached_property
-    def _torque_batch(self) -> Callable[..., NDArray[np.float64]]:
-        return codegen.compile_batch(self.torque_into, 2, (self.gravity.arm.num_joints,))
 
     @property
     def num_parameters(self) -> int:
@@ -63,14 +53,27 @@ class StaticModel:
 
     def regressor(self, q: ArrayLike) -> NDArray[np.float64]:
         """Returns Y with tau = Y theta: (n, p) for one pose q (n,), (m, n, p) for m poses (m, n)."""
-        q = np.asarray(q, dtype=np.float64)
-        return self._regressor_batch(q) if q.ndim == 2 else self._regressor_batch(q[None])[0]
+        poses = np.atleast_2d(np.asarray(q, dtype=np.float64))
+        of_links = _compiled_link_regressor(self.gravity)(poses)
+        columns = [effect_column(self.gravity.arm, effect, poses)[..., None] for effect in self.effects]
+        Y = np.concatenate([of_links, *columns], axis=2) if columns else of_links
+        return Y if np.ndim(q) == 2 else Y[0]
 
     def torque(self, q: ArrayLike, theta: ArrayLike) -> NDArray[np.float64]:
         """Returns the holding torque [N m or N]: (n,) for one pose q (n,), (m, n) for m poses (m, n)."""
-        q = np.asarray(q, dtype=np.float64)
-        theta = np.ascontiguousarray(theta, dtype=np.float64)
-        return self._torque_batch(q, theta) if q.ndim == 2 else self._torque_batch(q[None], theta)[0]
+        poses, theta = np.atleast_2d(np.asarray(q, dtype=np.float64)), np.asarray(theta, dtype=np.float64)
+        tau = np.empty(poses.shape)
+        for begin in range(0, len(poses), _ROWS):
+            tau[begin : begin + _ROWS] = self.regressor(poses[begin : begin + _ROWS]) @ theta
+        return tau if np.ndim(q) == 2 else tau[0]
+
+
+@cache
+def _compiled_link_regressor(gravity: SymbolicGravity) -> Callable[..., NDArray[np.float64]]:
+    """Compiles a function that returns the regressor (m, n, b) of the base parameters at poses (m, n)."""
+    symbolic = symbolic_regressor(gravity, ())
+    function = codegen.compile_function("regressor", [("q", gravity.q)], codegen.share_terms(symbolic))
+    return codegen.compile_batch(function, symbolic.shape)
 
 
 def symbolic_regressor(gravity: SymbolicGravity, effects: tuple[ActuatorEffect, ...]) -> sympy.Matrix:

@@ -134,10 +134,12 @@ def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex 
     return np.array([joint.position_start() for joint in joints])
 
 
-def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: ArrayLike) -> None:
+def set_arm_positions(
+    plant: MultibodyPlant, context: Context, arm: Arm, q: ArrayLike, instance: ModelInstanceIndex | None = None
+) -> None:
     """Sets the positions of all joints, including those of the linkage, from the independent joint positions q (n,)."""
     q_plant = plant.GetPositions(context)
-    q_plant[tree_selector(plant, arm)] = arm.linkage.position(q)
+    q_plant[tree_selector(plant, arm, instance)] = arm.linkage.position(q)
     plant.SetPositions(context, q_plant)
 
 

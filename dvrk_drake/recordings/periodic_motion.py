@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write, refuse_existing
 from dvrk_drake.models.schema_fault import missing_key, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
@@ -91,7 +92,7 @@ class PeriodicMotion:
         arm: Name of the arm.
         period: Period [s].
         repetitions: Number of periods.
-        table: Height of the table in the base frame that the motion avoids [m], or None.
+        environment: Fixed objects that the motion avoids.
         center: Mean positions (n,) [rad, m].
         sine, cosine: Coefficients (n, h) [rad, m].
 
@@ -110,7 +111,7 @@ class PeriodicMotion:
     arm: str = ""
     period: float = field(default=10.0, metadata=within(0.1, 600.0, "s"))
     repetitions: int = field(default=1, metadata=within(1, 10_000))
-    table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
+    environment: Environment = field(default_factory=Environment)
     center: list[float] = field(default_factory=list, metadata=within(-100.0, 100.0, "rad or m"))
     sine: list[list[float]] = field(default_factory=list, metadata=within(-100.0, 100.0, "rad or m"))
     cosine: list[list[float]] = field(default_factory=list, metadata=within(-100.0, 100.0, "rad or m"))

@@ -143,12 +143,20 @@ def results_from_csv(tmp_path_factory, motions):
     return results(folder / "results", *paths, None)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", (*BAG_KINDS, "v5"))
-def test_motion(tmp_path, kind, motions, results_from_csv):
+def test_motion(tmp_path, kind, motions):
+    arm = load_arm("psm")
+    csv, other = both(tmp_path, "motion", arm, kind, motions[0], "/PSM1/measured_js")
+    first, second = read_recording(csv, arm), read_recording(other, arm)
+    for name in ("t", "q", "qd", "tau"):
+        np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_commands_with_motions(tmp_path, motions, results_from_csv):
     arm, expected = load_arm("psm"), results_from_csv
     paths = [
-        both(tmp_path, f"motion{k}", arm, kind, motion, "/PSM1/measured_js")[1] for k, motion in enumerate(motions)
+        both(tmp_path, f"motion{k}", arm, "mcap", motion, "/PSM1/measured_js")[1] for k, motion in enumerate(motions)
     ]
     found = results(tmp_path / "results", *paths, str(expected / "model.yaml"))
     same_models(expected / "model.yaml", found / "model.yaml")

@@ -1,16 +1,16 @@
-"""Detects collisions of the links of an arm with each other and with a table."""
+"""Detects collisions of the links of an arm with each other and with fixed objects."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import HalfSpace
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
 
@@ -20,22 +20,18 @@ class CollisionDetector:
     Pairs of links that touch in every arm are ignored, as stated by the collision filters of the SDF.
     """
 
-    def __init__(self, arm: Arm, table: float | None = None) -> None:
+    def __init__(self, arm: Arm, environment: Environment = Environment()) -> None:  # noqa: B008  immutable
         """Constructs the detector.
 
         Args:
             arm: Arm with collision shapes.
-            table: Height of a table in the base frame [m], or None.
+            environment: Fixed objects around the arm.
         """
         self._arm = arm
         builder = DiagramBuilder()
         self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
-        add_arm(self._plant, arm)
-        if table is not None:
-            shape = HalfSpace()
-            self._plant.RegisterCollisionGeometry(
-                self._plant.world_body(), RigidTransform([0.0, 0.0, table]), shape, "table", CoulombFriction()
-            )
+        self._instance = add_arm(self._plant, arm)
+        environment.add_to(self._plant)
         self._plant.Finalize()
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
@@ -51,33 +47,41 @@ class CollisionDetector:
         """
         if not self._arm.view.tip:
             raise ExcitationError(f"{self._arm.name}: the arm file does not name a frame of the tip (view.tip)")
-        set_arm_positions(self._plant, self._plant_context, self._arm, pose)
-        frame = self._plant.GetFrameByName(self._arm.view.tip)
+        set_arm_positions(self._plant, self._plant_context, self._arm, pose, self._instance)
+        frame = self._plant.GetFrameByName(self._arm.view.tip, self._instance)
         return np.asarray(frame.CalcPoseInWorld(self._plant_context).translation())
 
     def collision(self, pose: NDArray[np.float64]) -> str:
         """Returns the description of the first collision at a pose (n,), or "" if there is none."""
         plant, inspector = self._plant, self._inspector
-        set_arm_positions(plant, self._plant_context, self._arm, pose)
+        set_arm_positions(plant, self._plant_context, self._arm, pose, self._instance)
         for pair in self._query_port.Eval(self._graph_context).ComputePointPairPenetration():
             ids = pair.id_A, pair.id_B
             bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in ids]
-            # The base is mounted at the table.
-            fixed = {plant.world_body().name(), "base_link"}
-            if {body.name() for body in bodies} <= fixed:
+            bodies.sort(key=lambda body: (body.model_instance() != self._instance, body.name()))
+            # The base is mounted at the table or at another object, and objects may touch each other.
+            if all(body.model_instance() != self._instance or body.name() == "base_link" for body in bodies):
                 continue
-            names = ["the table" if body.index() == plant.world_body().index() else body.name() for body in bodies]
-            return f"collision of {' and '.join(sorted(names, key=lambda name: name == 'the table'))}"
+            return f"collision of {' and '.join(map(self._name, bodies))}"
         return ""
 
+    def _name(self, body: RigidBody) -> str:
+        if body.model_instance() == self._instance:
+            return str(body.name())
+        return "the table" if body.index() == self._plant.world_body().index() else str(body.scoped_name().get_full())
 
-def first_collision(arm: Arm, q: NDArray[np.float64], table: float | None = None) -> tuple[int, str] | None:
+
+def first_collision(
+    arm: Arm,
+    q: NDArray[np.float64],
+    environment: Environment = Environment(),  # noqa: B008  immutable
+) -> tuple[int, str] | None:
     """Returns the index of the first pose with a collision and its description, or None.
 
     Args:
         arm: Arm with collision shapes.
         q: Poses (m, n) [rad, m].
-        table: Height of a table in the base frame [m], or None.
+        environment: Fixed objects around the arm.
     """
-    detector = CollisionDetector(arm, table)
+    detector = CollisionDetector(arm, environment)
     return next(((i, what) for i, pose in enumerate(q) if (what := detector.collision(pose))), None)

@@ -140,7 +140,8 @@ def design_excitation(
         arm = arm.with_gravity(model.arm.gravity.tolist())
         # A copy has no compiled functions, which cannot be sent to another process.
         model = replace(model)
-    if collision := first_collision(arm, middle_pose(arm, limits, np.random.default_rng(seed))[None], limits.table):
+    middle = middle_pose(arm, limits, np.random.default_rng(seed))
+    if collision := first_collision(arm, middle[None], limits.environment):
         raise ExcitationError(f"{arm.name}: no motion meets all limits: {collision[1]} in the middle of the motion")
     share = step_progress(progress, "optimising")
     share(0.0)
@@ -151,7 +152,7 @@ def design_excitation(
         share(0.9 * len(results) / starts)
     best = min(results, key=lambda result: result[1])
     motion = contracted(best[0], arm, limits, model)
-    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)), table=limits.table)
+    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)), environment=limits.environment)
     share(1.0)
     information = MotionInformation(arm, limits, model)
     state = state_of(motion, INFORMATION_TIMES * harmonics)
@@ -169,18 +170,35 @@ def design_excitation(
 def contracted(
     motion: PeriodicMotion, arm: Arm, limits: MotionLimits, model: IdentifiedModel | None = None
 ) -> PeriodicMotion:
-    """Returns the motion after the smallest contraction towards its centre with which it meets all limits.
+    """Returns the motion after a small contraction towards its centre with which it meets all limits.
+
+    With one contraction less, it exceeds a limit.
 
     Raises:
         ExcitationError: The motion does not meet the limits after `_MAX_CONTRACTIONS` contractions.
     """
-    for _ in range(_MAX_CONTRACTIONS):
-        violations = motion_violations(motion, arm, limits, model)
-        if not violations:
-            return motion
-        sine, cosine = ((_CONTRACTION * np.array(x)).tolist() for x in (motion.sine, motion.cosine))
-        motion = replace(motion, sine=sine, cosine=cosine)
-    raise ExcitationError(f"{arm.name}: no motion meets all limits: {violations[0]}")
+
+    def after(contractions: int) -> tuple[PeriodicMotion, list[str]]:
+        sine, cosine = ((_CONTRACTION**contractions * np.array(x)).tolist() for x in (motion.sine, motion.cosine))
+        smaller = replace(motion, sine=sine, cosine=cosine)
+        return smaller, motion_violations(smaller, arm, limits, model)
+
+    # Contractions after which the motion exceeds a limit, and after which it meets all limits.
+    exceeds, meets = -1, 0
+    found, violations = after(meets)
+    while violations:
+        if meets == _MAX_CONTRACTIONS:
+            raise ExcitationError(f"{arm.name}: no motion meets all limits: {violations[0]}")
+        exceeds, meets = meets, min(max(1, 2 * meets), _MAX_CONTRACTIONS)
+        found, violations = after(meets)
+    while meets - exceeds > 1:
+        middle = (exceeds + meets) // 2
+        smaller, violations = after(middle)
+        if violations:
+            exceeds = middle
+        else:
+            meets, found = middle, smaller
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.soft_walls import SoftWalls
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
@@ -37,7 +38,7 @@ class MotionLimits:
         effort: Largest predicted effort, as a share of the effort limits. Dry friction is added to the prediction.
         positions: Name of a joint -> lower and upper limit of its position [rad, m], in addition to those of the arm.
         tip_box: Lower and upper corner (3,) of the box in the base frame that the tip must not leave [m], or None.
-        table: Height of a table in the base frame [m], which is the half-space below this height, or None.
+        environment: Fixed objects around the arm, with which it must not collide.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -54,7 +55,7 @@ class MotionLimits:
     effort: float = field(default=0.8, metadata=within(0.05, 1.0))
     positions: dict[str, tuple[float, float]] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
     tip_box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
-    table: float | None = field(default=None, metadata=within(-10.0, 10.0, "m"))
+    environment: Environment = field(default_factory=Environment)
 
     def __post_init__(self) -> None:
         if fault := number_fault(self):
@@ -125,13 +126,13 @@ class JointLimits:
         return np.asarray(q @ self.A.T + self.look_ahead * (v @ self.A.T))
 
 
-def execution_limits(table: float | None) -> MotionLimits:
+def execution_limits(environment: Environment) -> MotionLimits:
     """Returns the limits that every motion must meet before an arm follows it.
 
     The speed limit is slightly below that of the command guard with default settings.
 
     Args:
-        table: Height of a table in the base frame [m], or None.
+        environment: Fixed objects around the arm.
     """
     return MotionLimits(
         margin=0.0,
@@ -140,12 +141,12 @@ def execution_limits(table: float | None) -> MotionLimits:
         speed_time=0.05,
         acceleration_time=0.01,
         effort=0.95,
-        table=table,
+        environment=environment,
     )
 
 
 def path_obstacle(
-    arm: Arm, q_start: ArrayLike, q_end: ArrayLike, table: float | None, model: IdentifiedModel | None = None
+    arm: Arm, q_start: ArrayLike, q_end: ArrayLike, environment: Environment, model: IdentifiedModel | None = None
 ) -> str:
     """Returns why an arm cannot move on the straight path in joint space between two poses (n,), or "".
 
@@ -155,18 +156,18 @@ def path_obstacle(
     Args:
         arm: Arm to move.
         q_start, q_end: First and last pose (n,) [rad, m].
-        table: Height of a table in the base frame [m], or None.
+        environment: Fixed objects around the arm.
         model: Model that predicts the efforts, see `PredictedEffort`.
     """
     start, end = np.asarray(q_start, dtype=np.float64), np.asarray(q_end, dtype=np.float64)
     steps = int(np.ceil(100 * np.max(np.abs(end - start) / (arm.position_upper - arm.position_lower)))) + 1
     q = start + np.linspace(0, 1, steps + 1)[:, None] * (end - start)
-    if collision := first_collision(arm, q, table):
+    if collision := first_collision(arm, q, environment):
         return collision[1]
     predicted = PredictedEffort(arm, model)
     share = (np.abs(predicted.holding(q)) + predicted.dry_friction) / arm.effort_limits
     k, j = np.unravel_index(int(np.argmax(share)), share.shape)
-    if share[k, j] <= execution_limits(table).effort:
+    if share[k, j] <= execution_limits(environment).effort:
         return ""
     unit = "m" if arm.prismatic[j] else "rad"
     return (
@@ -222,7 +223,7 @@ def motion_violations(
                 f"{what} of {of[j]} is {value[worst, j]:.6g} at {t[worst]:.3f} s, outside "
                 f"{lower[j]:.6g}..{upper[j]:.6g}"
             )
-    if collision := first_collision(arm, q[:: round(CHECK_RATE / COLLISION_RATE)], limits.table):
+    if collision := first_collision(arm, q[:: round(CHECK_RATE / COLLISION_RATE)], limits.environment):
         row, what = collision
         messages.append(f"{what} at {row / COLLISION_RATE:.2f} s")
     return messages

@@ -135,9 +135,7 @@ def design_poses(
     blocked: set[tuple[int, int]] = set()
     while True:
         share(0.6)
-        excluded = checker.unreachable(pool, chosen)
-        if not excluded:
-            chosen, excluded = _ordered(checker, pool, chosen, blocked)
+        chosen, excluded = _ordered(checker, pool, chosen, blocked)
         if not excluded:
             break
         usable[excluded] = False
@@ -298,11 +296,10 @@ class PoseChecker:
     def __init__(self, arm: Arm, limits: MotionLimits) -> None:
         """Constructs the checker for an arm and the limits of its poses."""
         self._arm, self._limits, self._joints = arm, limits, limits.of_arm(arm)
-        self._detector, self._predicted = CollisionDetector(arm, limits.table), PredictedEffort(arm)
+        self._detector, self._predicted = CollisionDetector(arm, limits.environment), PredictedEffort(arm)
         self._middle = middle_pose(arm, limits, np.random.default_rng(0))
         self._offset = approach_offset(arm)
         self._span = arm.position_upper - arm.position_lower
-        self._reachable: set[int] = set()
 
     def random_poses(self, size: int, least: int, generator: np.random.Generator) -> NDArray[np.float64]:
         """Returns up to `size` random poses (k, n) that meet all limits.
@@ -328,27 +325,28 @@ class PoseChecker:
         return poses[:size]
 
     def violations(self, q: NDArray[np.float64]) -> list[str]:
-        """Returns the limit that each of the poses (m, n) or its approaches exceed, or "" if there is none.
-
-        The approaches are checked for their length and for position limits. `unreachable` checks their collisions.
-        """
+        """Returns the limit that each of the poses (m, n) or its approaches exceed, or "" if there is none."""
         arm, joints, n = self._arm, self._joints, self._arm.num_joints
         value = joints.positions(q, 0 * q)
         outside = np.any((value < joints.lower) | (value > joints.upper), axis=1)
         own = [arm.joint_names.index(name) for name in self._limits.positions]
         reasons = []
         for pose, is_outside in zip(q, outside, strict=True):
-            begins = [self.start(pose, side) for side in (-1, 1)]
             if is_outside:
                 reasons.append("coupled limit")
-            elif any(np.any(np.abs(begin - pose) < MIN_APPROACH * self._offset) for begin in begins):
+                continue
+            begins = [self.start(pose, side) for side in (-1, 1)]
+            if any(np.any(np.abs(begin - pose) < MIN_APPROACH * self._offset) for begin in begins):
                 reasons.append("no room to approach the pose from both sides")
             elif any(np.any((x < joints.lower[:n])[own] | (x > joints.upper[:n])[own]) for x in begins):
                 reasons.append("position limit at the start of an approach")
             elif not self._can_hold(self._path(self._middle, pose)):
                 reasons.append("effort limit")
+            elif obstacle := self._obstacle(pose):
+                reasons.append(obstacle)
             else:
-                reasons.append(self._obstacle(pose))
+                is_free = all(self.is_free(begin, pose) for begin in begins)
+                reasons.append("" if is_free else "collision or effort limit on an approach")
         return reasons
 
     def _obstacle(self, pose: NDArray[np.float64]) -> str:
@@ -377,18 +375,6 @@ class PoseChecker:
         """Returns whether the straight path between two poses (n,) has no collision and meets the effort limits."""
         path = self._path(begin, end)
         return self._can_hold(path) and not any(self._obstacle(pose) for pose in path)
-
-    def unreachable(self, pool: NDArray[np.float64], chosen: list[int]) -> list[int]:
-        """Returns the chosen poses of the pool whose approaches are not free of collisions."""
-        found = []
-        for k in chosen:
-            if k in self._reachable:
-                continue
-            if all(self.is_free(self.start(pool[k], side), pool[k]) for side in (-1, 1)):
-                self._reachable.add(k)
-            else:
-                found.append(k)
-        return found
 
     def can_follow(self, pose: NDArray[np.float64], following: NDArray[np.float64]) -> bool:
         """Returns whether the paths from a pose (n,) to the next pose and to its approaches are free of collisions."""

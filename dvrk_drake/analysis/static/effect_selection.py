@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.static.linear_fit import RobustFit, robust_fit
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
+    effect_column,
     is_prismatic,
     joint_row,
     position_along,
@@ -187,12 +188,6 @@ def _is_equal_to_gravity(model: StaticModel, effect: ActuatorEffect) -> bool:
     column = effect_column(arm, effect, poses)
     residual = column.ravel() - Y @ np.linalg.lstsq(Y, column.ravel(), rcond=None)[0]
     return bool(np.linalg.norm(residual) < 1e-9 * np.linalg.norm(column))
-
-
-def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), for a coefficient of 1."""
-    x = position_along(arm, effect.coordinate, q)
-    return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
 
 
 def _largest_shape(effect: ActuatorEffect) -> float:

@@ -64,16 +64,27 @@ def weighted_fit(
     Raises:
         numpy.linalg.LinAlgError: Theta is not identifiable from the data and the prior.
     """
-    WX = weights[..., None] * X
-    A = np.einsum("mnp,mnr->pr", X, WX) + np.diag(prior_precision)
+    theta, covariance = _estimate(X, tau, weights, prior_precision)
+    residuals = tau - X @ theta
+    hat = X @ covariance @ (weights[..., None] * X).transpose(0, 2, 1)
+    leave_one_out = np.linalg.solve(np.eye(tau.shape[1]) - hat, residuals[..., None])[..., 0]
+    return LinearFit(theta, covariance, residuals, leave_one_out)
+
+
+def _estimate(
+    X: NDArray[np.float64],
+    tau: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    prior_precision: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the parameters (p,) and their covariance (p, p), see `weighted_fit`."""
+    rows = X.reshape(-1, X.shape[2])
+    weighted = (weights[..., None] * X).reshape(rows.shape)
+    A = rows.T @ weighted + np.diag(prior_precision)
     # The matrix is scaled to a unit diagonal, because the parameters differ by orders of magnitude.
     scale = 1 / np.sqrt(np.diag(A))
     covariance = np.linalg.inv(A * np.outer(scale, scale)) * np.outer(scale, scale)
-    theta = covariance @ np.einsum("mnp,mn->p", WX, tau)
-    residuals = tau - X @ theta
-    hat = np.einsum("mip,pr,mjr->mij", X, covariance, WX, optimize=True)
-    leave_one_out = np.linalg.solve(np.eye(tau.shape[1]) - hat, residuals[..., None])[..., 0]
-    return LinearFit(theta, covariance, residuals, leave_one_out)
+    return covariance @ (weighted.T @ tau.ravel()), covariance
 
 
 def robust_fit(
@@ -98,15 +109,16 @@ def robust_fit(
     """
     sigma = np.maximum(_spread(tau, usable) if start is None else start, sigma_floor)
     weights = usable.astype(float)
-    fit = weighted_fit(X, tau, weights / sigma**2, prior_precision)
     for _ in range(iterations):
-        scale = np.maximum(_spread(fit.residuals, usable), sigma_floor)
-        u = np.abs(fit.residuals) / scale
+        theta, _covariance = _estimate(X, tau, weights / sigma**2, prior_precision)
+        residuals = tau - X @ theta
+        scale = np.maximum(_spread(residuals, usable), sigma_floor)
+        u = np.abs(residuals) / scale
         huber = np.where(u <= HUBER_LIMIT, 1.0, HUBER_LIMIT / np.maximum(u, HUBER_LIMIT))
         weights = usable * np.where(u <= REJECTION_LIMIT, huber, 0.0)
-        squares = (weights * fit.residuals**2).sum(axis=0) / np.maximum(weights.sum(axis=0), 1.0)
+        squares = (weights * residuals**2).sum(axis=0) / np.maximum(weights.sum(axis=0), 1.0)
         sigma = np.maximum(np.sqrt(squares), sigma_floor)
-        fit = weighted_fit(X, tau, weights / sigma**2, prior_precision)
+    fit = weighted_fit(X, tau, weights / sigma**2, prior_precision)
     return RobustFit(fit, sigma, usable & (weights == 0.0))
 
 
@@ -121,10 +133,19 @@ def _spread(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[n
     The lower limit is half of the estimate from the 90 % quantile of |x|. Without this limit, the result could be 0,
     because friction keeps many torques of a wrist near zero.
     """
-    masked = np.where(usable, np.abs(values), np.nan)
-    enough = usable.sum(axis=0) >= 3
+    count = usable.sum(axis=0)
+    enough = np.flatnonzero(count >= 3)
     spread = np.ones(values.shape[1])
-    if np.any(enough):
-        median, high = np.nanquantile(masked[:, enough], [0.5, 0.9], axis=0)
-        spread[enough] = np.maximum(1.4826 * median, 0.5 * high / 1.645)
+    # numpy.nanquantile gives the same quantiles, but needs ten times as long for small arrays.
+    ordered = np.sort(np.where(usable, np.abs(values), np.inf)[:, enough], axis=0)
+    median, high = (_quantiles(ordered, count[enough], share) for share in (0.5, 0.9))
+    spread[enough] = np.maximum(1.4826 * median, 0.5 * high / 1.645)
     return spread
+
+
+def _quantiles(ordered: NDArray[np.float64], count: NDArray[np.int_], share: float) -> NDArray[np.float64]:
+    """Returns the quantile (n,) of the first `count` (n,) rows of each column of sorted values (m, n)."""
+    place, column = share * (count - 1), np.arange(len(count))
+    below = place.astype(int)
+    low, high = ordered[below, column], ordered[np.minimum(below + 1, count - 1), column]
+    return np.asarray(low + (place - below) * (high - low))

@@ -7,11 +7,11 @@ import pytest
 from motions import true_dynamics
 
 from dvrk_drake.analysis.dynamic.estimates import base_parameter_estimates
-from dvrk_drake.analysis.static.effect_selection import effect_column
 from dvrk_drake.dynamics.actuator_effects import (
     POSITION_KINDS,
     ActuatorEffect,
     distinct_coordinates,
+    effect_column,
     effect_fault,
     is_prismatic,
     joint_row,
@@ -105,8 +105,12 @@ def test_poses_and_motions_use_the_same_columns(case):
     arm = case[0]
     effects = all_effects(arm)
     q = arm.sample_poses(50, np.random.default_rng(2))
-    compiled = compile_static_model(arm, effects).regressor(q)[:, :, -len(effects) :]
-    for effect, column in zip(effects, np.moveaxis(compiled, 2, 0), strict=True):
+    model = compile_static_model(arm, effects)
+    for effect, theta in zip(effects, np.eye(model.num_parameters)[-len(effects) :], strict=True):
+        column = np.empty(q.shape)
+        for pose, out in zip(q, column, strict=True):
+            model.torque_into(pose, theta, out)
+        np.testing.assert_allclose(model.torque(q, theta), column, atol=1e-12, err_msg=str(effect))
         np.testing.assert_allclose(column, effect_column(arm, effect, q), atol=1e-12, err_msg=str(effect))
         a = arm.transmission.position(q)
         x = a @ arm.effect_coordinates[effect.coordinate]

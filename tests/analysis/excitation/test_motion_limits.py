@@ -14,6 +14,7 @@ from dvrk_drake.analysis.excitation.motion_limits import (
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
@@ -106,8 +107,8 @@ def test_table_is_an_obstacle():
     arm = load_arm("psm")
     motion = one_joint(arm, 2, 0.05)
     lowest = tip_positions(arm, motion.evaluate(np.arange(4000) / 1000).q)[:, 2].min()
-    assert motion_violations(motion, arm, replace(LIMITS, table=lowest - 0.05)) == []
-    (line,) = motion_violations(motion, arm, replace(LIMITS, table=lowest + 0.01))
+    assert motion_violations(motion, arm, replace(LIMITS, environment=Environment(lowest - 0.05))) == []
+    (line,) = motion_violations(motion, arm, replace(LIMITS, environment=Environment(lowest + 0.01)))
     assert line.startswith("collision of ") and "the table at" in line
 
 
@@ -117,7 +118,7 @@ def test_first_collision_is_found():
     q[:, 2] = [0.05, 0.1, 0.15, 0.2, 0.24]
     heights = tip_positions(arm, q)[:, 2]
     assert np.all(np.diff(heights) < 0)
-    row, what = first_collision(arm, q, float(heights[3] + heights[2]) / 2)
+    row, what = first_collision(arm, q, Environment(float(heights[3] + heights[2]) / 2))
     assert row <= 3 and "the table" in what
     assert first_collision(arm, q) is None
 

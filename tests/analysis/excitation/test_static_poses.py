@@ -20,6 +20,7 @@ from dvrk_drake.analysis.excitation.static_poses import (
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, approaches
 from dvrk_drake.recordings.pose_file import load_poses
 
@@ -93,7 +94,7 @@ def test_poses_and_approaches_meet_the_limits(information, design):
 
 def test_path_above_a_table_has_no_collision():
     arm = dvrk.load_arm("psm")
-    limits = MotionLimits(margin=MARGIN, positions={"insertion": (0.05, 0.2)}, table=-0.15)
+    limits = MotionLimits(margin=MARGIN, positions={"insertion": (0.05, 0.2)}, environment=Environment(-0.15))
     design = dvrk.design_poses(arm, 10, limits=limits)
     points = []
     for pose in design.poses:
@@ -101,7 +102,7 @@ def test_path_above_a_table_has_no_collision():
             points += [begin, pose]
     assert np.min(points, axis=0)[2] >= 0.05 and np.max(points, axis=0)[2] <= 0.2
     path = [a + s * (b - a) for a, b in pairwise(points) for s in np.linspace(0, 1, 23)]
-    assert first_collision(arm, np.array(path), -0.15) is None
+    assert first_collision(arm, np.array(path), Environment(-0.15)) is None
     assert tip_positions(arm, design.poses)[:, 2].min() > -0.15
 
 
@@ -159,7 +160,11 @@ def test_order_avoids_blocked_paths():
     [
         (7, None, "the number of poses is 7; allowed: 8 to 300"),
         (301, None, "the number of poses is 301"),
-        (10, MotionLimits(table=0.0), "only 0 of 4500 random poses meet all limits, but 10 poses are required"),
+        (
+            10,
+            MotionLimits(environment=Environment(0.0)),
+            "only 0 of 4500 random poses meet all limits, but 10 poses are required",
+        ),
         (10, MotionLimits(positions={"roll": (0.0, 0.1)}), "position limit at the start of an approach"),
         (10, MotionLimits(positions={"rol": (0.0, 0.1)}), 'unknown joint "rol"'),
     ],

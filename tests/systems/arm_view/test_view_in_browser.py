@@ -23,14 +23,14 @@ def open_view(open_page, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+@pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_sliders_keep_the_loop_closed(open_page, name):
     arm, view, page = open_view(open_page, name)
     plant = shared_plant(arm)
     for joint, slider in zip(arm.joint_names, view._sliders.names, strict=True):
         link = plant.GetJointByName(joint).child_body().name()
         drawn = []
-        for share in (0.3, 0.5, 0.7):
+        for share in (0.3, 0.7):
             before = view.meshcat.GetSliderValue(slider)
             drag(page, slider, share)
             wait_until(lambda b=before, s=slider: view.meshcat.GetSliderValue(s) != b, f"slider {slider} at {share}")
@@ -45,15 +45,14 @@ def test_sliders_keep_the_loop_closed(open_page, name):
             # The browser receives the links one after the other.
             wait_until(lambda: largest_gap(page, arm) < CLOSED, f"closed linkage after {slider} = {q}")
             drawn.append(expected)
-        assert not np.allclose(drawn[0], drawn[2], rtol=0, atol=1e-3), f"{slider} does not move {link}"
+        assert not np.allclose(drawn[0], drawn[1], rtol=0, atol=1e-3), f"{slider} does not move {link}"
     assert not page.errors
     assert not page.requests
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_buttons_change_the_view(open_page, name):
-    arm, view, page = open_view(open_page, name)
+def test_buttons_change_the_view(open_page):
+    arm, view, page = open_view(open_page, "psm")
     overlay = f"['drake', '{arm.name.lower()}', 'overlay'"
     visible = f"viewer.scene_tree.find({overlay}, '{{}}']).object.visible"
 
