@@ -182,8 +182,13 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
     path = folder / SETTINGS
     if path.exists():
         found = load_typed_yaml(CalibrationSettings, path, CollectionError, "settings of a calibration")
-        for name in asdict(settings):
-            if (value := getattr(settings, name)) != (earlier := getattr(found, name)):
+        if settings.environment.directives != found.environment.directives:
+            raise CollectionError(
+                f"{folder / ENVIRONMENT}: --environment differs from this file; give this file, or another folder"
+            )
+        before = {**asdict(found), **asdict(found.environment)}
+        for name, value in {**asdict(settings), **asdict(settings.environment)}.items():
+            if name != "environment" and value != (earlier := before[name]):
                 raise CollectionError(
                     f"{path}: {name} is {earlier}, but {value} was given; give the same options, or another folder"
                 )

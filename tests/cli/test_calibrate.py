@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_output import refusal
+from models_in_directives import OTHER_ARM
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import calibrate, main
@@ -148,6 +149,26 @@ def test_only_the_next_motion_resets_a_fault(tmp_path, ran):
     moving = [words for words in ran if words[0] == "collect"]
     assert ["--reset" in words for words in moving] == [True] + 5 * [False]
     assert all("--realtime" in words for words in moving)
+
+
+def test_designs_avoid_the_objects_around_the_arm(tmp_path, ran, capsys):
+    lab = tmp_path / "lab.dmd.yaml"
+    lab.write_text(OTHER_ARM.format(x=0.6))
+    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]
+    around = ["--table", "-0.2", "--environment"]
+    assert main([*command, *around, str(lab)]) == 0
+    designs = [words for words in ran if words[0] == "excite"]
+    assert len(designs) == 4
+    for words in designs:
+        begin = words.index("--table")
+        assert words[begin : begin + 4] == [*around, "environment.dmd.yaml"]
+    assert (tmp_path / "c" / "environment.dmd.yaml").read_text() == lab.read_text()
+    assert main([*command, *around, str(lab)]) == 0
+    lab.write_text(OTHER_ARM.format(x=0.7))
+    assert "environment.dmd.yaml: --environment differs" in refused(capsys, *command, *around, str(lab))
+    assert "table is -0.2, but None was given" in refused(
+        capsys, *command, "--environment", str(tmp_path / "c" / "environment.dmd.yaml")
+    )
 
 
 def test_without_terminal_an_arm_moves_only_with_yes(tmp_path, ran, capsys):

@@ -68,7 +68,7 @@ def weighted_fit(
     residuals = tau - X @ theta
     hat = X @ covariance @ (weights[..., None] * X).transpose(0, 2, 1)
     leave_one_out = np.linalg.solve(np.eye(tau.shape[1]) - hat, residuals[..., None])[..., 0]
-    return LinearFit(theta, covariance, residuals, leave_one_out)
+    return LinearFit(theta, covariance, residuals, np.asarray(leave_one_out))
 
 
 def _estimate(

@@ -276,14 +276,13 @@ def test_command_names_the_report_or_the_option(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["motion", "poses"])
-def test_page_in_a_browser(case, request, open_page, tmp_path):
+def test_page_in_a_browser(motion, open_page, tmp_path):
     path = tmp_path / "report.html"
-    write_report(request.getfixturevalue(case), path)
+    write_report(motion, path)
     opened = check_report(open_page, path)
     opened.wait_for("document.querySelector('figure.meshcat .player').checkVisibility()")
     frame = opened.page.frames[1]
-    arm = request.getfixturevalue(case).model.arm
+    arm = motion.model.arm
     links = f"/drake/{arm.name.lower()}/links"
     script = "(name) => Object.keys(viewer.scene_tree.children.drake.children[name].children.links.children)"
     (model,) = frame.evaluate(script, arm.name.lower())
