@@ -41,6 +41,11 @@ def simulate(scenario):
     return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), np.hstack([q, 0 * q]), None, None)
 
 
+def dask_setup(_worker):
+    """Is called by a Dask worker with --preload."""
+    study_module.simulate = simulate
+
+
 if __name__ in ("__main__", "__mp_main__"):  # the command, and its workers
     study_module.simulate = simulate
 

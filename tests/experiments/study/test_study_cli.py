@@ -1,5 +1,8 @@
 """`dvrk-drake study`: invalid input gives a one-line error before any simulation."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from command_output import refusal
@@ -104,15 +107,19 @@ def test_rejects_invalid_number_of_workers(study, capsys):
         assert "--workers" in study_refusal(capsys, study, "--workers", workers)
 
 
-def test_rejects_invalid_schedulers(study, capsys, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.experiments.study.study.TIMEOUT", 0.3)
-    pytest.importorskip("distributed", reason="needs the extra dask")
+def test_rejects_invalid_schedulers(study, capsys):
+    pytest.importorskip("dask", reason="needs the extra dask")
     assert "is not the address of a scheduler; allowed: tcp://HOST:PORT" in study_refusal(
         capsys, study, "--scheduler", "here"
     )
-    assert "no Dask scheduler answers at this address" in study_refusal(
-        capsys, study, "--scheduler", "tcp://127.0.0.1:1"
+    # The threads of a Dask client would remain in the process of the tests.
+    code = (
+        "import sys, dvrk_drake.cli, dvrk_drake.experiments.study.study as study; study.TIMEOUT = 0.3;"
+        "sys.exit(dvrk_drake.cli.main(sys.argv[1:]))"
     )
+    command = [sys.executable, "-c", code, "study", str(study), "--scheduler", "tcp://127.0.0.1:1"]
+    done = subprocess.run([*command, "--output", str(study.parent / "new.csv")], capture_output=True, text=True)
+    assert done.returncode == 2 and "no Dask scheduler answers at this address" in refusal(done.stderr)
 
 
 def test_example_is_valid_study():

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
 
 import formula_study
@@ -15,7 +16,7 @@ from command_output import messages
 from waiting import TIMEOUT, wait_until
 
 import dvrk_drake.experiments.study.study as study_module
-from dvrk_drake.experiments.study.study import dask_executor, run_study
+from dvrk_drake.experiments.study.study import run_study
 from dvrk_drake.experiments.study.study_file import load_study
 
 pytestmark = pytest.mark.slow
@@ -116,25 +117,26 @@ def test_study_survives_killed_process_and_worker(study, started, release_simula
     assert path.read_bytes() == reference_table(study)
 
 
-def test_dask_cluster_survives_lost_worker(study, started, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="needs the extra dask")
+@pytest.mark.skipif(not find_spec("distributed"), reason="needs the extra dask")
+def test_dask_cluster_survives_lost_worker(study, started, release_simulations, tmp_path, monkeypatch):
+    """The threads of a Dask client would remain in the process of the tests, so the client has its own process."""
     path, address = tmp_path / "dask.csv", tmp_path / "scheduler.json"
     options = ["--no-dashboard", "--scheduler-file", address]
     scheduler = started("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, *options)
     wait_until(lambda: address.exists() and address.stat().st_size, "the scheduler's address", scheduler)
-    worker = ["-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", *options]
-    workers = [started(*worker), started(*worker)]
-
-    def kill_one(done, all_cases):
-        if done == 2:
-            workers[0].kill()
-
     url = json.loads(address.read_text())["address"]
-    with distributed.Client(url, timeout=TIMEOUT, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=TIMEOUT)
-    with dask_executor(url) as executor:
-        run_study(load_study(study), executor, path, kill_one)
-    assert workers[0].wait(TIMEOUT) == -signal.SIGKILL
+    worker = ["-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", "--preload", FORMULA, *options]
+    workers = [started(*worker), started(*worker)]
+    release_simulations(3)
+    run = started(FORMULA, "study", study, "--output", path, "--scheduler", url)
+    wait_until(lambda: rows_in(path) == 3, "three rows", run)
+    workers[0].kill()
+    release_simulations(20)
+    output, error = run.communicate(timeout=TIMEOUT)
+    assert (run.returncode, messages(error)) == (0, [])
+    assert "nominal: 2 of 5 runs" in output
+    monkeypatch.delenv(formula_study.TICKETS)
+    monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
     assert path.read_bytes() == reference_table(study)
 
 
