@@ -117,8 +117,8 @@ def test_rejects_invalid_schedulers(study, capsys):
         "import sys, dvrk_drake.cli, dvrk_drake.experiments.study.study as study; study.TIMEOUT = 0.3;"
         "sys.exit(dvrk_drake.cli.main(sys.argv[1:]))"
     )
-    command = [sys.executable, "-c", code, "study", str(study), "--scheduler", "tcp://127.0.0.1:1"]
-    done = subprocess.run([*command, "--output", str(study.parent / "new.csv")], capture_output=True, text=True)
+    command = [sys.executable, "-c", code, "study", str(study), "--scheduler", "tcp://127.0.0.1:1", "--output"]
+    done = subprocess.run([*command, str(study.parent / "new.csv")], check=False, capture_output=True, text=True)
     assert done.returncode == 2 and "no Dask scheduler answers at this address" in refusal(done.stderr)
 
 
