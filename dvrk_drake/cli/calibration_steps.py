@@ -7,13 +7,14 @@ from pathlib import Path
 
 import yaml
 
+from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.cli.support import mounted
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.files import atomic_write, read_text_input
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings import motion_parts
@@ -179,13 +180,12 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
     """
     gravity = settings.gravity
     arm = mounted(load_arm(settings.arm), (gravity[0], gravity[1], gravity[2]) if gravity else None)
+    CollisionDetector(arm, settings.environment)  # rejects objects that cannot be added to the arm
     path = folder / SETTINGS
     if path.exists():
         found = load_typed_yaml(CalibrationSettings, path, CollectionError, "settings of a calibration")
         if settings.environment.directives != found.environment.directives:
-            raise CollectionError(
-                f"{folder / ENVIRONMENT}: --environment differs from this file; give this file, or another folder"
-            )
+            raise CollectionError(f"{path}: the calibration began with another --environment; give the same file")
         before = {**asdict(found), **asdict(found.environment)}
         for name, value in {**asdict(settings), **asdict(settings.environment)}.items():
             if name != "environment" and value != (earlier := before[name]):
@@ -202,9 +202,12 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
             raise CollectionError(f"{folder}: the folder is not empty and has no calibration; give a new folder")
         with atomic_write(path) as stream:
             yaml.safe_dump(asdict(settings), stream, sort_keys=False)
-    if settings.environment.directives and not (folder / ENVIRONMENT).exists():
-        with atomic_write(folder / ENVIRONMENT) as stream:
-            stream.write(settings.environment.directives)
+    if directives := settings.environment.directives:
+        if not (folder / ENVIRONMENT).exists():
+            with atomic_write(folder / ENVIRONMENT) as stream:
+                stream.write(directives)
+        elif read_text_input(folder / ENVIRONMENT, CollectionError) != directives:
+            raise CollectionError(f"{folder / ENVIRONMENT}: the file was changed; delete it to restore it")
     if not (folder / NOMINAL).exists():
         IdentifiedModel.from_arm(arm, arm.effects.position_dependent).save(folder / NOMINAL)
     return arm

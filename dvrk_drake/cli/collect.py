@@ -255,11 +255,11 @@ def _visit(
     import numpy as np
 
     from dvrk_drake.models.coupled_limits import offset_pose
-    from dvrk_drake.models.environment import Environment
     from dvrk_drake.processes.collector import CollectionSettings, Collector, short_approach_offset
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.recordings.pose_file import pose_environment
 
     settings = CollectionSettings(traverse_time, both_sides)
     arm, poses, output = _files(controlled, poses_file, output_file, both_sides)
@@ -272,7 +272,7 @@ def _visit(
         first = poses[int(np.argmin(output.finished(poses)))]
         if both_sides:
             first = offset_pose(arm, first, -short_approach_offset(arm))
-        checked_start(load_model(controlled.model, controlled.arm), link, first, Environment())
+        checked_start(load_model(controlled.model, controlled.arm), link, first, pose_environment(poses_file))
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=line.report)

@@ -30,8 +30,7 @@ from rich.progress import (
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import leave
-from dvrk_drake.errors import ArmError, DvrkDrakeError, ExcitationError, ModelError
-from dvrk_drake.models.files import read_text_input
+from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -270,10 +269,7 @@ def load_environment(table: float | None, path: str | None) -> Environment:
     """
     from dvrk_drake.models.environment import Environment
 
-    try:
-        return Environment(table, "" if path is None else read_text_input(path, ExcitationError))
-    except ExcitationError as error:
-        raise ExcitationError(f"{path or '--table'}: {error}") from error
+    return Environment(table) if path is None else Environment.load(path, table)
 
 
 def mounted(arm: Arm, gravity: Sequence[float] | None, locked: Sequence[str] | None = None) -> Arm:

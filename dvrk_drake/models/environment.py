@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 from pydrake.geometry import HalfSpace, Role
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
@@ -11,8 +16,13 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.errors import ExcitationError
+from dvrk_drake.models.files import read_text_input
 from dvrk_drake.models.plant import package_map
 from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.typed_yaml import parse_yaml
+
+#: Accepted directives. `add_directives` would read a second file, which a motion file does not contain.
+_DIRECTIVES = "add_model", "add_weld", "add_frame"
 
 
 @dataclass(frozen=True)
@@ -26,8 +36,8 @@ class Environment:
             package://dvrk_drake/sdf/mtmr.sdf.
 
     Raises:
-        ExcitationError: Drake cannot load the directives, an object is not welded to the world, or no object has a
-            collision shape.
+        ExcitationError: The directives are not valid, an object is not welded to the world, a joint is outside its
+            limits, or there is no collision shape.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -40,24 +50,36 @@ class Environment:
     def __post_init__(self) -> None:
         if fault := number_fault(self):
             raise ExcitationError(f"environment: {fault}")
-        if not self.directives:
-            return
-        plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+        if not isinstance(self.directives, str):
+            raise ExcitationError("environment: directives must be the text of a file; Environment.load reads a file")
+        if self.directives:
+            self._check_directives()
+
+    @classmethod
+    def load(cls, path: str | Path, table: float | None = None) -> Environment:
+        """Reads Drake model directives from a .dmd.yaml file.
+
+        Args:
+            path: File with the directives.
+            table: Height of a table in the base frame [m], or None.
+
+        Raises:
+            ExcitationError: The file cannot be read, is empty, or its directives are not valid.
+        """
+        text = read_text_input(path, ExcitationError)
+        if not text.strip():
+            raise ExcitationError(f"{path}: the file is empty")
         try:
-            self.add_to(plant)
-            plant.Finalize()
-        except RuntimeError as error:
-            reason = str(error).splitlines()[0]
-            raise ExcitationError(f"environment: Drake cannot load the directives: {reason}") from error
-        if floating := sorted(
-            plant.get_body(index).scoped_name().get_full() for index in plant.GetFloatingBaseBodies()
-        ):
-            raise ExcitationError(f"environment: {', '.join(floating)} is not welded to the world; use add_weld")
-        if not scene_graph.model_inspector().NumGeometriesWithRole(Role.kProximity):
-            raise ExcitationError("environment: no object in the directives has a collision shape")
+            return cls(table, text)
+        except ExcitationError as error:
+            raise ExcitationError(f"{path}: {error}") from error
 
     def add_to(self, plant: MultibodyPlant) -> None:
-        """Adds the objects to a plant that is not finalized and has a scene graph."""
+        """Adds the objects to a plant that is not finalized and has a scene graph.
+
+        Raises:
+            ExcitationError: Drake cannot load the directives.
+        """
         if self.table is not None:
             plant.RegisterCollisionGeometry(
                 plant.world_body(), RigidTransform([0.0, 0.0, self.table]), HalfSpace(), "table", CoulombFriction()
@@ -65,4 +87,61 @@ class Environment:
         if self.directives:
             parser = Parser(plant)
             parser.package_map().AddMap(package_map())
-            parser.AddModelsFromString(self.directives, "dmd.yaml")
+            try:
+                parser.AddModelsFromString(self.directives, "dmd.yaml")
+            except RuntimeError as error:
+                reason = str(error).splitlines()[0][:300]
+                raise ExcitationError(f"environment: Drake cannot load the directives: {reason}") from error
+
+    def _check_directives(self) -> None:
+        # Drake ends the process for some wrong directives and shapes, so these are found before Drake reads them.
+        if fault := _fault(parse_yaml(self.directives, "environment", ExcitationError)):
+            raise ExcitationError(f"environment: {fault}")
+        plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+        self.add_to(plant)
+        plant.Finalize()
+        if floating := plant.GetFloatingBaseBodies():
+            name = plant.get_body(min(floating)).scoped_name().get_full()
+            raise ExcitationError(f"environment: {name} is not welded to the world; use add_weld")
+        for index in plant.GetJointIndices():
+            joint = plant.get_joint(index)
+            q, lower, upper = joint.default_positions(), joint.position_lower_limits(), joint.position_upper_limits()
+            if np.any((q < lower) | (q > upper)):
+                raise ExcitationError(
+                    f"environment: joint {joint.name()} is at {q[0]:g}; allowed: {lower[0]:g}..{upper[0]:g}"
+                )
+        inspector = scene_graph.model_inspector()
+        shapes = [inspector.GetShape(i) for i in inspector.GetAllGeometryIds(Role.kProximity)]
+        if sum(isinstance(shape, HalfSpace) for shape in shapes) > (self.table is not None):
+            raise ExcitationError("environment: a plane is not supported; use a box, or --table")
+        if len(shapes) == (self.table is not None):
+            raise ExcitationError("environment: no object in the directives has a collision shape")
+
+
+def _fault(content: Any) -> str:
+    """Returns why the parsed content of directives is not valid, or ""."""
+    if not isinstance(content, dict) or set(content) != {"directives"} or not isinstance(content["directives"], list):
+        return "the file must have the key directives with a list"
+    for number, entry in enumerate(content["directives"], 1):
+        (name, values) = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else ("", None)
+        if name not in _DIRECTIVES or not isinstance(values, dict):
+            return f"directive {number} is not valid; allowed: {', '.join(_DIRECTIVES)}"
+        url = str(values.get("file", "file:///"))
+        scheme, _, rest = url.partition("://")
+        if scheme not in ("package", "file") or (scheme == "file" and not rest.startswith("/")):
+            return f'directive {number}: file is "{url}"; allowed: package://dvrk_drake/... or file:///...'
+        if scheme == "package" and not package_map().Contains(package := rest.partition("/")[0]):
+            return f'directive {number}: unknown package "{package}"; allowed: dvrk_drake, or an absolute file:/// URL'
+        if not all(math.isfinite(x) for x in _numbers(values)):
+            return f"directive {number}: a number is not finite"
+    return ""
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for entry in value:
+            yield from _numbers(entry)
+    elif isinstance(value, int | float):
+        yield float(value)

@@ -3,14 +3,16 @@
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
@@ -23,10 +25,14 @@ _ROUNDING = 1e-9
 
 @dataclass
 class PoseFile:
-    """Schema of a pose file: the name of the arm, and one list of n joint positions [rad, m] per pose."""
+    """Schema of a pose file: the name of the arm, and one list of n joint positions [rad, m] per pose.
+
+    The paths between the poses avoid the objects of the environment.
+    """
 
     format: str = "dvrk_drake poses 1"
     arm: str = ""
+    environment: Environment = field(default_factory=Environment)
     # `check_poses` checks the limits of the arm.
     poses: list[list[float]] = field(default_factory=list, metadata=within(-1e4, 1e4, "rad or m"))
 
@@ -88,16 +94,35 @@ def same_pose(poses: NDArray[np.float64], pose: NDArray[np.float64], arm: Arm) -
     return int(rows[0]) if len(rows) else None
 
 
-def save_poses(poses: NDArray[np.float64], arm: Arm, path: str | Path) -> None:
+def pose_environment(path: str | Path) -> Environment:
+    """Returns the fixed objects around the arm in a pose file.
+
+    Raises:
+        CollectionError: The file is not a pose file.
+    """
+    return load_typed_yaml(PoseFile, path, CollectionError, "a pose file").environment
+
+
+def save_poses(poses: NDArray[np.float64], arm: Arm, path: str | Path, environment: Environment | None = None) -> None:
     """Writes poses (m, n) atomically and with full precision.
+
+    Args:
+        poses: Poses (m, n) [rad, m].
+        arm: Arm of the poses.
+        path: Pose file, which is replaced if it exists.
+        environment: Fixed objects around the arm. None: those of the existing file.
 
     Raises:
         CollectionError: See `check_poses`.
         DvrkDrakeError: The file cannot be written.
     """
     check_poses(poses, arm, str(path))
+    if environment is None:
+        environment = pose_environment(path) if os.path.lexists(path) else Environment()
     with atomic_write(path) as stream:
         stream.write(f"format: {PoseFile.format}\narm: {arm.name}\n")
+        if environment != Environment():
+            yaml.safe_dump({"environment": asdict(environment)}, stream, sort_keys=False)
         stream.write(f"# {', '.join(arm.joint_names)} [rad, m]\nposes:\n")
         stream.writelines(f"- {pose.tolist()}\n" for pose in poses)
 

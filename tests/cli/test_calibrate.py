@@ -165,7 +165,7 @@ def test_designs_avoid_the_objects_around_the_arm(tmp_path, ran, capsys):
     assert (tmp_path / "c" / "environment.dmd.yaml").read_text() == lab.read_text()
     assert main([*command, *around, str(lab)]) == 0
     lab.write_text(OTHER_ARM.format(x=0.7))
-    assert "environment.dmd.yaml: --environment differs" in refused(capsys, *command, *around, str(lab))
+    assert "began with another --environment" in refused(capsys, *command, *around, str(lab))
     assert "table is -0.2, but None was given" in refused(
         capsys, *command, "--environment", str(tmp_path / "c" / "environment.dmd.yaml")
     )

@@ -11,6 +11,7 @@ from dvrk_drake.analysis.excitation.motion_limits import motion_violations
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
+from dvrk_drake.recordings.pose_file import load_poses, pose_environment, save_poses
 
 
 @pytest.fixture(scope="module")
@@ -49,23 +50,80 @@ def test_motion_keeps_its_distance_from_another_arm(arm, tmp_path):
     assert PeriodicMotion.load(tmp_path / "motion.yaml", arm).environment == environment
 
 
+BOX = "<box><size>0.1 0.1 0.1</size></box>"
+
+
+def object_in(folder, shape=BOX, p_WL=(2.0, 0.0, 0.0)):
+    """Writes an SDF with one shape and returns directives that weld it to the world."""
+    collision = f"<collision name='c'><geometry>{shape}</geometry></collision>" if shape else ""
+    text = f"<sdf version='1.9'><model name='o'><link name='l'>{collision}</link></model></sdf>"
+    (folder / "object.sdf").write_text(text)
+    weld = f"- add_weld: {{parent: world, child: o::l, X_PC: {{translation: {[float(x) for x in p_WL]}}}}}\n"
+    return f"directives:\n- add_model: {{name: o, file: 'file://{folder}/object.sdf'}}\n{weld}"
+
+
+def test_poses_keep_their_distance_from_another_arm(arm, tmp_path):
+    environment = dvrk.Environment(directives=OTHER_ARM.format(x=-0.27))
+    design = dvrk.design_poses(arm, 8, limits=dvrk.MotionLimits(margin=0.1, environment=environment))
+    assert first_collision(arm, design.poses, environment) is None
+    path = tmp_path / "poses.yaml"
+    design.save(path)
+    assert pose_environment(path) == environment
+    save_poses(load_poses(path, arm)[:4], arm, path)  # as collect --random, which adds poses
+    assert pose_environment(path) == environment
+
+
+def test_shapes_collide_where_the_box_is(tmp_path):
+    """A box of 0.1 m around the tip."""
+    arm = dvrk.load_arm("psm")
+    q = arm.sample_poses(1, np.random.default_rng(0))
+    p = CollisionDetector(arm).tip(q[0])
+    inside = object_in(tmp_path, p_WL=p)
+    assert " and o::l" in first_collision(arm, q, dvrk.Environment(directives=inside))[1]
+    assert first_collision(arm, q, dvrk.Environment(directives=object_in(tmp_path))) is None
+    assert first_collision(arm, q, dvrk.Environment(-2.0, object_in(tmp_path))) is None
+
+
 @pytest.mark.parametrize(
     ("directives", "message"),
     [
-        ("nonsense", "Drake cannot load the directives"),
-        ("directives:\n- add_model:\n    name: a\n    file: package://none/a.sdf\n", "unknown package"),
+        ("nonsense", "the file must have the key directives"),
+        ("directives: 3", "the file must have the key directives"),
+        ("directives:\n- add_directives: {file: 'file:///a.dmd.yaml'}\n", "allowed: add_model, add_weld, add_frame"),
+        ("directives:\n- add_model: {name: a, file: a.sdf}\n", 'file is "a.sdf"; allowed: package://dvrk_drake/'),
+        ("directives:\n- add_model: {name: a, file: package://none/a.sdf}\n", 'unknown package "none"; allowed'),
+        ("directives:\n- add_model: {name: a, file: 'file:///none/a.sdf'}\n", "Drake cannot load the directives"),
+        ("directives:\n- add_weld: {parent: world, child: a::b, X_PC: {rotation: !Uniform {}}}\n", "invalid YAML"),
+        (OTHER_ARM.format(x=".nan"), "directive 2: a number is not finite"),
         (OTHER_ARM.format(x=0).split("- add_weld")[0], "is not welded to the world; use add_weld"),
         (
-            "directives:\n- add_frame:\n    name: f\n    X_PF: {base_frame: world}\n",
-            "has a collision shape",
+            OTHER_ARM.format(x=0).replace("  file", "  default_joint_positions: {outer_yaw: [9]}\n    file"),
+            "outer_yaw is",
         ),
+        ("directives:\n- add_frame: {name: f, X_PF: {base_frame: world}}\n", "has a collision shape"),
+        (OTHER_ARM.format(x=1).replace("name: other", "name: mtm").replace("other::", "mtm::"), "named 'mtm'"),
+        (OTHER_ARM.format(x=1).replace("other::base_link", "base_link"), "A Frame named 'base_link' appears in"),
+        ("PLANE", "a plane is not supported; use a box, or --table"),
+        ("NO SHAPE", "has a collision shape"),
+        ("  \n", "the file is empty"),
     ],
 )
 def test_wrong_directives_are_refused(directives, message, tmp_path, capsys):
-    with pytest.raises(ExcitationError) as error:
-        dvrk.Environment(directives=directives)
-    assert message in str(error.value)
-    path, output = tmp_path / "lab.dmd.yaml", tmp_path / "motion.yaml"
+    if directives in ("PLANE", "NO SHAPE"):
+        directives = object_in(tmp_path, "<plane><normal>0 0 1</normal></plane>" if directives == "PLANE" else "")
+    path, output = tmp_path / "lab.dmd.yaml", tmp_path / "out"
     path.write_text(directives)
-    assert main(["excite", "--arm", "mtml", "--environment", str(path), "--output", str(output)]) == 2
-    assert f"error: {path}: environment: " in refusal(capsys.readouterr().err) and not output.exists()
+    for command in (["excite"], ["excite", "--static", "8"], ["calibrate", "--yes"]):
+        assert main([*command, "--arm", "mtml", "--environment", str(path), "--output", str(output)]) == 2
+        line = refusal(capsys.readouterr().err)
+        assert message in line and len(line) < 500
+        assert not output.exists()
+
+
+def test_wrong_arguments_are_refused():
+    with pytest.raises(ExcitationError, match=r"must be the text of a file; Environment\.load"):
+        dvrk.Environment(directives=3)
+    with pytest.raises(ExcitationError, match="environment must be an Environment"):
+        dvrk.MotionLimits(environment=-0.2)
+    with pytest.raises(ExcitationError, match="table is nan"):
+        dvrk.Environment(table=float("nan"))

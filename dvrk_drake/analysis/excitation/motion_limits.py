@@ -60,6 +60,8 @@ class MotionLimits:
     def __post_init__(self) -> None:
         if fault := number_fault(self):
             raise ExcitationError(f"limits of the motion: {fault}")
+        if not isinstance(self.environment, Environment):
+            raise ExcitationError("limits of the motion: environment must be an Environment, see Environment.load")
 
     def of_arm(self, arm: Arm) -> JointLimits:
         """Returns the limits of the joints of an arm.

@@ -21,6 +21,7 @@ from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
+from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import refuse_existing
 from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.progress import Progress, step_progress
@@ -40,7 +41,7 @@ EFFORT_ERROR = 0.01
 #: Number of random poses for which holding efforts are predicted, and number of random selections for the comparison.
 NUM_TARGETS, NUM_RANDOM = 2000, 20
 #: Largest distance between two poses at which a straight path is checked, as a share of each position range.
-PATH_STEP = 0.02
+PATH_STEP = 0.01
 #: Smallest relative reduction of the squared expected error by an exchange.
 _MIN_REDUCTION = 1e-6
 #: Travel that replaces the travel of a blocked path, in units of the position ranges.
@@ -54,6 +55,7 @@ class StaticPoseDesign:
     Attributes:
         arm: Arm of the poses.
         poses: Poses (m, n) in the order of a short path [rad, m].
+        environment: Fixed objects that the paths avoid.
         expected_error: Expected RMS error of the holding efforts that an identified model predicts at random poses of
             the workspace, relative to the RMS holding efforts, see `PoseInformation.expected_error`.
         random_error: Median expected error after as many random poses within the same limits.
@@ -63,6 +65,7 @@ class StaticPoseDesign:
 
     arm: Arm
     poses: NDArray[np.float64]
+    environment: Environment
     expected_error: float
     random_error: float
     known_parameters: int
@@ -81,7 +84,7 @@ class StaticPoseDesign:
             DvrkDrakeError: The file exists and `overwrite` is False, or the file cannot be written.
         """
         refuse_existing(path, overwrite)
-        save_poses(self.poses, self.arm, path)
+        save_poses(self.poses, self.arm, path, self.environment)
 
 
 def design_poses(
@@ -149,6 +152,7 @@ def design_poses(
     return StaticPoseDesign(
         arm=arm,
         poses=pool[chosen],
+        environment=limits.environment,
         expected_error=information.expected_error(chosen),
         random_error=float(np.median(errors)),
         known_parameters=information.known_parameters(chosen),
