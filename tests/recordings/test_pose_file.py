@@ -26,7 +26,7 @@ GOOD = "0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is empty; allowed in a pose file: format, arm, poses"),
+        ("", "is empty; allowed in a pose file: format, arm, environment, poses"),
         ("just words", 'must have keys and values, not "just words"'),
         ("arm: MTML\nposes: []", "has no poses"),
         (f"arm: MTMR\nposes:\n- [{GOOD}]", 'arm is "MTMR", but the selected arm is MTML'),
