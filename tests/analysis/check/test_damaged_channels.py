@@ -59,7 +59,7 @@ def test_undamaged_motion_has_no_finding(name, coordinates):
 
 
 def test_long_motion_is_checked_in_segments():
-    arm, short, count = load_arm("mtmr"), motion("mtmr"), 5
+    arm, short, count = load_arm("mtmr"), motion("mtmr"), 6
     t = np.arange(count * len(short)) / RATE
     long = Recording(*(np.tile(x, (count, 1)) for x in (short.q, short.tau, short.qd)), t, "actuator", source="long")
     findings, expected = check_channels(long, arm), check_channels(short, arm)
