@@ -148,6 +148,25 @@ class Console:
         _ENDED.append(self)
 
 
+def _start(command, environment, output, arm, events, domain):
+    """Starts the console. Returns its process and the `Console`. The file `output` receives its output."""
+    from dvrk_drake.systems.ros.domain import RosDomain
+
+    # A pipe that nobody reads would stop the process when it is full.
+    with output.open("w") as stream:
+        process = subprocess.Popen(command, env=environment, stdout=stream, stderr=subprocess.STDOUT)
+
+    def pid():
+        return re.search(r"console pid (\d+)", output.read_text(errors="replace"))
+
+    try:
+        wait_until(pid, "start of the dVRK console", process)
+    except AssertionError as error:
+        process.kill()
+        raise AssertionError(f"{error}: {output.read_text(errors='replace')}") from None
+    return process, Console(arm, process, int(pid()[1]), events, RosDomain(domain))
+
+
 @contextlib.contextmanager
 def start_console(arm, folder, *, rate=1000.0, motion=False, gravity_compensation=None, domain=None):
     """Context in which the dVRK console runs. It is in the state DISABLED.
@@ -161,8 +180,6 @@ def start_console(arm, folder, *, rate=1000.0, motion=False, gravity_compensatio
         domain: Number of the ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
     """
     peer = find_peer()
-    from dvrk_drake.systems.ros.domain import RosDomain
-
     events = Path(folder) / f"{arm}_events.log"
     script = [SUPPORT / "dvrk_console_motion.py", peer] if motion else [peer / "run.py"]
     options = ["--rate", str(rate), "--events", events]
@@ -176,22 +193,17 @@ def start_console(arm, folder, *, rate=1000.0, motion=False, gravity_compensatio
     if domain is not None:
         environment["ROS_DOMAIN_ID"] = str(domain)
     command = [sys.executable, *script, arm, *options]
-    # A pipe that nobody reads would stop the process when it is full.
-    output = Path(folder) / f"{arm}_process.log"
-    with output.open("w") as stream:
-        process = subprocess.Popen(command, env=environment, stdout=stream, stderr=subprocess.STDOUT)
-
-    def pid():
-        return re.search(r"console pid (\d+)", output.read_text(errors="replace"))
-
+    for attempt in range(3):
+        process, console = _start(command, environment, Path(folder) / f"{arm}_process.log", arm, events, domain)
+        try:
+            wait_until(console.state, "operating state", process)
+            break
+        except AssertionError:
+            console.end()
+            # The console is a program of others, and may crash when it starts.
+            if process.poll() is None or attempt == 2:
+                raise
     try:
-        wait_until(pid, "start of the dVRK console", process)
-    except AssertionError as error:
-        process.kill()
-        raise AssertionError(f"{error}: {output.read_text(errors='replace')}") from None
-    console = Console(arm, process, int(pid()[1]), events, RosDomain(domain))
-    try:
-        wait_until(console.state, "operating state", process)
         wait_until(lambda: "ready" in console.events(), "start", process)
         ready = time.monotonic()
         wait_until(lambda: time.monotonic() > ready + START, "period of the control loop", process)
