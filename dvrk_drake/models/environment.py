@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -132,16 +130,6 @@ def _fault(content: Any) -> str:
             return f'directive {number}: file is "{url}"; allowed: package://dvrk_drake/... or file:///...'
         if scheme == "package" and not package_map().Contains(package := rest.partition("/")[0]):
             return f'directive {number}: unknown package "{package}"; allowed: dvrk_drake, or an absolute file:/// URL'
-        if not all(math.isfinite(x) for x in _numbers(values)):
-            return f"directive {number}: a number is not finite"
+        if fault := number_fault(values):
+            return f"directive {number}: {fault.removeprefix('.')}"
     return ""
-
-
-def _numbers(value: Any) -> Iterator[float]:
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list):
-        for entry in value:
-            yield from _numbers(entry)
-    elif isinstance(value, int | float):
-        yield float(value)

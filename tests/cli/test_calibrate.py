@@ -169,6 +169,9 @@ def test_designs_avoid_the_objects_around_the_arm(tmp_path, ran, capsys):
     assert "table is -0.2, but None was given" in refused(
         capsys, *command, "--environment", str(tmp_path / "c" / "environment.dmd.yaml")
     )
+    lab.write_text(OTHER_ARM.format(x=0.6))
+    (tmp_path / "c" / "environment.dmd.yaml").write_text(OTHER_ARM.format(x=0.7))
+    assert "environment.dmd.yaml: the file was changed" in refused(capsys, *command, *around, str(lab))
 
 
 def test_without_terminal_an_arm_moves_only_with_yes(tmp_path, ran, capsys):

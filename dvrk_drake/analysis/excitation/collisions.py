@@ -1,4 +1,4 @@
-"""Detects collisions of the links of an arm with each other and with fixed objects."""
+"""Detects collisions of an arm with fixed objects."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from dvrk_drake.models.plant import add_arm, set_arm_positions
 class CollisionDetector:
     """Detects collisions at poses of one arm.
 
-    Pairs of links that touch in every arm are ignored, as stated by the collision filters of the SDF.
+    Pairs of links are checked, except those that the collision filters of the SDF exclude. In the arms of this package,
+    all pairs are excluded.
     """
 
-    def __init__(self, arm: Arm, environment: Environment = Environment()) -> None:  # noqa: B008  immutable
+    def __init__(self, arm: Arm, environment: Environment = Environment()) -> None:
         """Constructs the detector.
 
         Args:
@@ -72,9 +73,7 @@ class CollisionDetector:
 
 
 def first_collision(
-    arm: Arm,
-    q: NDArray[np.float64],
-    environment: Environment = Environment(),  # noqa: B008  immutable
+    arm: Arm, q: NDArray[np.float64], environment: Environment = Environment()
 ) -> tuple[int, str] | None:
     """Returns the index of the first pose with a collision and its description, or None.
 
