@@ -2,44 +2,39 @@
 # another Python.
 PYTHON ?= python3
 VENV ?= .venv
-# Tests that test-fast runs, as for pytest's -m. TESTS= selects all tests, as in CI.
+# Tests to run, as for pytest's -m. TESTS= selects all tests.
 TESTS ?= not slow
-# Files and folders of the tests that test-fast runs. Default: all.
+# Files and folders of the tests. Default: all.
 PATHS ?=
-# CI omits the collection of the PSM, since it only repeats that of the MTM with another arm.
-RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/udp/test_collect_psm_udp.py
 # Module or folder of the package that `make mutants` changes.
 MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
+AND_TESTS = $(if $(TESTS), and $(TESTS))
 
-.PHONY: demo test test-busy test-fast test-udp test-ros test-recordings mutants lint docs package test-package benchmark clean
+.PHONY: demo test test-all test-busy test-local test-network mutants lint docs package test-package benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --folder demo_output --overwrite
 
-test: test-fast test-udp
+# Tests of everything that a change can break. test-all adds tests that repeat others with another arm, draw or duration,
+# and tests with a browser, long recordings or the dVRK console.
+test: test-local test-network
+
+test-all:
+	$(MAKE) test TESTS=
 
 # Runs the tests while two busy processes run. No test may depend on the load of the computer.
 test-busy:
 	@set -e; busy() { while :; do :; done; }; \
 	  busy & first=$$!; busy & trap "kill $$first $$! 2>/dev/null || :" EXIT INT TERM; $(MAKE) test
 
-test-fast: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --ignore-glob='*_udp.py' -m '$(TESTS)' $(PATHS)
+# The run ends when a worker dies. Tests are in the order of the files, so the workers rarely create a fixture twice.
+test-local: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n 2 --dist worksteal --max-worker-restart 0 -m 'not network$(AND_TESTS)' $(PATHS)
 
-# Tests run one after the other, since each runs several processes at 1 kHz and needs all cores.
-test-udp: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/udp/test_lcm_udp.py tests/udp/test_crtk_station_udp.py \
-	  tests/udp/test_bridge_bad_messages_udp.py
-
-# Bridge, collection and simulated arm beside the dVRK console, which is not part of the repository. They take minutes.
-test-ros: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/udp/test_bridge_udp.py tests/udp/test_crtk_conformance_udp.py \
-	  tests/udp/test_crtk_collection_udp.py
-
-# Recordings over UDP and complete collections of both arms. They take minutes.
-test-recordings: $(VENV)/.installed-test
-	$(BIN)/python -m pytest $(RECORDINGS)
+# Tests over UDP and DDS run one after the other, since each runs several processes at 1 kHz and needs all cores.
+test-network: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -m 'network$(AND_TESTS)' $(PATHS)
 
 # Mutation testing: lists changes of the code that no test detects. Not part of CI, since it takes many minutes.
 mutants: $(VENV)/.installed-test

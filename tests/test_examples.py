@@ -14,6 +14,8 @@ from repository import ROOT
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.recordings.samples import SAMPLES_FOLDER
 
+pytestmark = pytest.mark.drake_api
+
 EXAMPLES = ROOT / "examples"
 PAGE_SCRIPTS = ["hold_an_arm.py", "teleoperation.py"]
 

@@ -16,6 +16,8 @@ import dvrk_drake as dvrk
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
+pytestmark = pytest.mark.drake_api
+
 #: Packages with a slow import.
 SLOW = {"pydrake", "numba", "numpy", "scipy", "sympy", "matplotlib", "rich", "yaml"}
 

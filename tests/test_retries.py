@@ -1,4 +1,4 @@
-"""Failed UDP tests are repeated and counted: watchdog tests, and all tests during a standstill of the computer."""
+"""Failed network tests are repeated and counted: watchdog tests, and all tests during a standstill of the computer."""
 
 import os
 import re
@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from own_network import INSIDE, MAX_RETRIES
+from own_network import MAX_RETRIES
 from repository import ROOT
 from waiting import TIMEOUT
 
@@ -14,15 +14,17 @@ FILE = '''
 from pathlib import Path
 
 import own_network
-from own_network import inside, outside, run_inside, watchdog
+import pytest
 
-own_network.unshare, own_network.NETWORK = lambda: ["env"], "true"
+own_network.enter_network = lambda: None
 own_network.STALL_TIME = {standstill}
+pytestmark = pytest.mark.network
 
 
-@outside
-def test_outside(request):
-    run_inside(request)
+@pytest.fixture(scope="module")
+def setups():
+    """Counts how often fixtures of the module were created."""
+    fail(0, "setups")
 
 
 def fail(times, name):
@@ -33,39 +35,23 @@ def fail(times, name):
     assert runs >= times
 
 
-@inside
-def test_steady():
+def test_steady(setups):
     fail({steady}, "steady")
 
 
-@inside
-@watchdog
-def test_watchdog():
+@pytest.mark.watchdog
+def test_watchdog(setups):
     fail({late}, "late")
 '''
 
 
-@pytest.mark.parametrize(
-    ("steady", "late", "standstill", "passes", "retries", "runs"),
-    [
-        (0, 1, 1e9, True, "1 retry", (1, 2)),
-        (0, 100, 1e9, False, f"{MAX_RETRIES} retries", (1, 1 + MAX_RETRIES)),
-        (1, 1, 1e9, False, "0 retries", (1, 1)),
-        (1, 1, 0.0, True, "2 retries", (2, 2)),
-        (100, 0, 0.0, False, f"{MAX_RETRIES} retries", (1 + MAX_RETRIES, 1)),
-    ],
-)
-def test_failed_tests_are_repeated_and_counted(tmp_path, steady, late, standstill, passes, retries, runs):
-    path = tmp_path / "test_some_udp.py"
-    text = FILE
-    for name, value in (("steady", steady), ("late", late), ("standstill", standstill)):
-        text = text.replace("{" + name + "}", str(value))
-    path.write_text(text)
-    command = [sys.executable, "-m", "pytest", "-c", ROOT / "pyproject.toml", "-p", "own_network"]
-    environment = {name: value for name, value in os.environ.items() if name != INSIDE}
+def run(path, *options):
+    """Runs pytest with the plugin of network tests for one file. Returns the ended process."""
+    command = [sys.executable, "-m", "pytest", "-c", ROOT / "pyproject.toml", "-p", "own_network", *options]
+    environment = dict(os.environ)
     environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # pytest starts faster
     environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests/support"), *sys.path])
-    done = subprocess.run(
+    return subprocess.run(
         [*command, "-p", "no:cacheprovider", path],
         env=environment,
         capture_output=True,
@@ -73,9 +59,54 @@ def test_failed_tests_are_repeated_and_counted(tmp_path, steady, late, standstil
         timeout=TIMEOUT,
         check=False,
     )
-    assert done.returncode == (0 if passes else 1), done.stdout
-    summary = re.search(r"^UDP tests: (.*) of at most (\d+)(: .*)?$", done.stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("steady", "late", "standstill", "failed", "retries", "runs", "workers"),
+    [
+        (0, 1, 1e9, 0, "1 retry", (1, 2, 2), 0),
+        (0, 1, 1e9, 0, "1 retry", (1, 2, 3), 1),
+        (0, 100, 1e9, 1, f"{MAX_RETRIES} retries", (1, 1 + MAX_RETRIES, 1 + MAX_RETRIES), 0),
+        (1, 1, 1e9, 1, "1 retry", (1, 2, 2), 0),
+        (1, 1, 0.0, 0, "2 retries", (2, 2, 3), 0),
+        (100, 0, 0.0, 1, f"{MAX_RETRIES} retries", (1 + MAX_RETRIES, 1, 1 + MAX_RETRIES), 0),
+    ],
+)
+def test_failed_tests_are_repeated_and_counted(tmp_path, steady, late, standstill, failed, retries, runs, workers):
+    path = tmp_path / "test_some_network.py"
+    text = FILE
+    for name, value in (("steady", steady), ("late", late), ("standstill", standstill)):
+        text = text.replace("{" + name + "}", str(value))
+    path.write_text(text)
+    done = run(path, *(["-p", "xdist", "-n", str(workers)] if workers else []))
+    assert done.returncode == (1 if failed else 0), done.stdout
+    summary = re.search(r"^Network tests: (.*) of at most (\d+)(: .*)?$", done.stdout, re.MULTILINE)
     assert summary[1] == retries and summary[2] == str(MAX_RETRIES)
-    assert [len((tmp_path / name).read_text()) for name in ("steady", "late")] == list(runs)
-    if not passes:
-        assert f"failed: test_{'steady' if steady else 'watchdog'}" in done.stdout
+    assert [len((tmp_path / name).read_text()) for name in ("steady", "late", "setups")] == list(runs)
+    assert f"{2 - failed} passed" in done.stdout
+    if failed:
+        assert f"::test_{'steady' if steady else 'watchdog'} - " in done.stdout
+
+
+def test_end_of_the_process_fails_the_test(tmp_path):
+    path = tmp_path / "test_some_network.py"
+    path.write_text(
+        "import os, own_network, pytest\n"
+        "own_network.enter_network = lambda: None\n"
+        "pytestmark = pytest.mark.network\n"
+        "def test_end(): os.abort()\n"
+        "def test_next(): pass\n"
+    )
+    done = run(path)
+    assert done.returncode == 1
+    assert "the process of the test ended: -6" in done.stdout and "1 failed, 1 passed" in done.stdout
+
+
+def test_run_ends_when_a_worker_of_the_tests_dies(tmp_path):
+    """The options are those of the Makefile."""
+    path = tmp_path / "test_some.py"
+    path.write_text("import os, time\ndef test_end(): os.abort()\ndef test_next(): time.sleep(0.1)\n")
+    options = re.search(r"pytest (-n 2 .*) -m", (ROOT / "Makefile").read_text())[1]
+    done = run(path, "-p", "xdist", *options.split())
+    assert done.returncode == 1
+    assert "test_end" in done.stdout and "crashed" in done.stdout

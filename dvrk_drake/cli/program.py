@@ -47,30 +47,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 #: Importing these modules adds their commands to the application.
 COMMANDS = model, recordings, identify, excite, export, simulate, demo, simulated_arm, lcm, ros, collect, calibrate
 
-#: Mapping from each command to its options that were renamed in version 0.1. The key "" stands for a positional
-#: argument that became an option.
-RENAMED = {
-    "model": {"": "--arm", "--latex": "--format latex", "--python": "--format python", "--c": "--format c"},
-    "view": {"": "--arm"},
-    "validate": {"": "--model", "--slow-parts": "--low-speed-segments"},
-    "predict": {"": "--model"},
-    "recalibrate": {"": "--model"},
-    "convert": {
-        "": "--output",
-        "--variable": "--arrays poses=NAME",
-        "--input-format": "--coordinates wpi for wpi-csv files, and not necessary for other formats",
-    },
-    "record": {"--output": "FILE, the first argument"},
-    "key": {"": "--output"},
-    "identify": {"--tables": "--verbose", "--slow-parts": "--low-speed-segments"},
-    "compare-gc": {"--plot": "--plots"},
-    "demo": {"--output": "--folder"},
-    "reproduce": {"--output": "--folder"},
-    "teleop": {"--html": "--output"},
-    "run": {"--friction": "--friction-model"},
-    "transparency": {"--real-arm": "--simulated-effects"},
-}
-
 #: Mapping from required options to the accepted values, for the message of a missing option.
 REQUIRED = {
     "--arm": ": mtml, mtmr, psm, or the path of an arm file",
@@ -121,14 +97,11 @@ def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
-    """Returns a usage error in one line. For a renamed option, the line contains the new name."""
+    """Returns a usage error in one line."""
     name = error.command_chain[0] if error.command_chain else ""
-    renamed = RENAMED.get(name, {})
     options = {word.partition("=")[0] for word in words if word.startswith("--")}
     message = " ".join(str(error).split()).rstrip(".")
-    if old := sorted(options & renamed.keys()):
-        message = "; ".join(f"{option} is now {renamed[option]}" for option in old)
-    elif isinstance(error, UnknownCommandError):
+    if isinstance(error, UnknownCommandError):
         message = message.partition(" Available commands")[0].rstrip(".")
     elif isinstance(error, CoercionError):
         message = re.sub(r': unable to convert (".*") into float$', r": must be a number, not \1", message)
@@ -149,7 +122,5 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
             message += f". {suggestion[0]}"
         else:
             message += REQUIRED.get(error.argument.name, "")
-            if error.argument.name == renamed.get(""):
-                message += " (a positional argument before version 0.2)"
     see = " See" if message.endswith("?") else "; see"
     return f"dvrk-drake: error: {message}{see} {f'dvrk-drake {name}'.rstrip()} --help"

@@ -8,6 +8,8 @@ from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm_files import load_arm
 
+pytestmark = pytest.mark.numeric
+
 T = np.arange(0, 4, 1e-3)
 X = 0.3 * np.sin(2 * np.pi * 0.7 * T) + 0.1 * np.sin(2 * np.pi * 1.9 * T)
 V = np.gradient(X, 1e-3)

@@ -9,6 +9,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 
+pytestmark = pytest.mark.numeric
+
 NAME = "actuator.wrist_yaw"
 
 

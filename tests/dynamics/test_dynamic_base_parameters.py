@@ -11,6 +11,8 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.models.arm_files import load_arm
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.fixture(scope="module", params=["mtml", "psm"])
 def model(request):

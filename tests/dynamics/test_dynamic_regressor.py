@@ -16,6 +16,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 MOUNTINGS = [(0.0, 0.0, -9.81), (1.3, -4.2, 8.5), (0.0, 0.0, 0.0)]
 
 

@@ -12,6 +12,8 @@ from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import shared_plant
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 #: Name, offset from the parent joint [m] and axis of the joints of a UR-like arm. Three successive joints are parallel.
 UR_LIKE = [
     ("pan", (0, 0, 0.18), "0 0 1"),

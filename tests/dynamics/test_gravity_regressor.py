@@ -16,6 +16,8 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 #: Base parameters in the order of the paper, section III.H.
 PAPER_PARAMETERS = {
     "L2 (m2+...+m7) + m2 c2x",

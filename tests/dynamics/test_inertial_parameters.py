@@ -16,6 +16,8 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 
 def parameters_of_points(p, masses):
     """Returns the parameters (10,) of point masses at p (k, 3) from their definition."""

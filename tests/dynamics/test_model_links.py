@@ -21,6 +21,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 
+pytestmark = pytest.mark.numeric
+
 
 def dynamic_model(arm: Arm, rotors: dict[str, float]) -> IdentifiedModel:
     """Returns a model with links that differ from the SDF, and with only the given rotors."""

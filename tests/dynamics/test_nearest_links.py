@@ -10,6 +10,8 @@ from dvrk_drake.dynamics.model_links import MIN_EIGENVALUE_RATIO, nearest_links
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm_files import load_arm
 
+pytestmark = pytest.mark.numeric
+
 
 def other_base_values(arm, size):
     values = derive_gravity(arm).base_values

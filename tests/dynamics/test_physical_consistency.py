@@ -19,6 +19,8 @@ from dvrk_drake.dynamics.physical_consistency import (
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm_files import load_arm
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.fixture(scope="module", params=["mtmr", "psm"])
 def arm(request):

@@ -9,6 +9,8 @@ from dvrk_drake.dynamics.kinematics import PsmInverseKinematics
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 
 def test_inverse_kinematics_inverts_forward_kinematics():
     inverse = PsmInverseKinematics(PSM)

@@ -7,6 +7,8 @@ import pytest
 
 from dvrk_drake.dynamics.trigonometry import cos, sin, sin_cos
 
+pytestmark = pytest.mark.numeric
+
 #: Tolerance for numbers below 1 after a few rounding operations.
 ROUNDING = 4 * np.finfo(float).eps
 

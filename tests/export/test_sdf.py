@@ -28,6 +28,8 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_sele
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.urdf import to_urdf
 
+pytestmark = pytest.mark.drake_api
+
 
 def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:
     """Returns consistent links that differ from the SDF, by a random linear map of each pseudo-inertia."""

@@ -13,6 +13,8 @@ from dvrk_drake.errors import ExcitationError
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 from dvrk_drake.recordings.pose_file import load_poses, pose_environment, save_poses
 
+pytestmark = pytest.mark.drake_api
+
 
 @pytest.fixture(scope="module")
 def arm():

@@ -9,6 +9,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.systems.arm_station import ArmStation
 
+pytestmark = pytest.mark.drake_api
+
 PROBE_SDF = """<?xml version="1.0"?>
 <sdf version="1.9">
   <model name="probe">

@@ -14,6 +14,8 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.arm_station import ArmStation, station_ports
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+pytestmark = pytest.mark.drake_api
+
 WRIST = {"roll": 0.4, "wrist_pitch": -0.7, "wrist_yaw": 0.3, "jaw": 0.5}
 CASES = [
     ("psm", WRIST),

@@ -22,6 +22,8 @@ from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_posi
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links
 from dvrk_drake.recordings.reading import read_recording
 
+pytestmark = pytest.mark.drake_api
+
 #: Signs that mirror the joint angles and torques of an arm in the plane x = 0.
 MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
 #: Index of the parameter my5 - mz4 of the lateral wrist brackets in the gravity compensation file.

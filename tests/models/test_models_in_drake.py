@@ -16,6 +16,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, package_map, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
+pytestmark = pytest.mark.drake_api
+
 PSM = "package://dvrk_drake/directives/psm.dmd.yaml"
 
 

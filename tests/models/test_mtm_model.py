@@ -10,6 +10,8 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
 
+pytestmark = pytest.mark.drake_api
+
 PI = np.pi
 #: sawIntuitiveResearchKit share/kinematic/mtm.json, standard DH: theta offset, d, a, alpha.
 DVRK_TABLE = [

@@ -7,6 +7,8 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 
+pytestmark = pytest.mark.drake_api
+
 PI = np.pi
 #: sawIntuitiveResearchKit share/kinematic/psm.json, modified DH: alpha, a, theta offset, d; joint 3 is prismatic.
 TABLE = [

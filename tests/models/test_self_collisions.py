@@ -9,6 +9,8 @@ import dvrk_drake as dvrk
 from dvrk_drake.models import plant as plants
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
+pytestmark = pytest.mark.drake_api
+
 #: Pairs of links that touch in a real arm. The coupler of an MTM is pinned to forearm and platform. The retracted
 #: instrument of a PSM is within the end of the carriage.
 TOUCHING = {

@@ -20,6 +20,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions
 from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, compose_sdf
 
+pytestmark = pytest.mark.drake_api
+
 SDF = MODELS_FOLDER / "sdf"
 MESHES = sorted((SDF / "meshes").glob("*/*.gltf"))
 

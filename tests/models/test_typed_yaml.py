@@ -12,6 +12,8 @@ from dvrk_drake.models.schema_fault import schema_fault
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_typed_yaml, parse_yaml, typed_content
 
+pytestmark = pytest.mark.drake_api
+
 
 def own_psm(folder):
     """Writes the three files of a PSM into `folder`."""

@@ -10,13 +10,14 @@ import re
 import numpy as np
 import pytest
 from crtk_conformance import start_simulated_arm
-from own_network import inside, outside, run_inside
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
 from dvrk_drake.models.arm_files import load_arm
 
 m = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
+
+pytestmark = pytest.mark.network
 
 ARM = load_arm("psm")
 #: Number of joints in the topics without the jaw.
@@ -35,11 +36,6 @@ NOT_FINITE = [np.nan, np.inf, -np.inf]
 NUMBERS = [0.0, -0.3, 1.0, 1e-320, 1e6, -1e308, *NOT_FINITE]
 WORDS = ["", "Enable", "enable ", "ENABLED", "home\n", "fault", "x" * 2000, "%s", "\x1b[2J", "é", "jaw"]
 DISABLED, ENABLED, HOMED = ("DISABLED", True, False), ("ENABLED", False, False), ("ENABLED", True, False)
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
 
 
 class RandomMessages:
@@ -154,15 +150,12 @@ class Sender:
             self.next_setpoint()
 
 
-@inside
-def test_random_messages_do_not_move_the_arm(tmp_path, monkeypatch):
+def test_random_messages_do_not_move_the_arm(monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
-    with open(tmp_path / "output.txt", "w+") as output:
-        with start_simulated_arm("psm", "PSM1", 500.0, output) as subject:
-            check_arm(Sender(subject))
-            states = [(state, homed) for state, homed, _ in subject.states]
-        output.seek(0)
-        lines = output.read().splitlines()
+    with start_simulated_arm("psm", "PSM1", 500.0) as subject:
+        check_arm(Sender(subject))
+        states = [(state, homed) for state, homed, _ in subject.states]
+    lines = subject.process.output().splitlines()
     start = [("DISABLED", False), ("ENABLED", False), ("ENABLED", True), ("DISABLED", True)]
     assert [state for state, _ in itertools.groupby(states)] == [*start, *start[1:3]]
     refused = [re.search(r"refused: .*?(?:\((\d+) more commands refused before\))?$", line) for line in lines]

@@ -1,12 +1,12 @@
 """`dvrk-drake arm --ros`: a real process over DDS in a network namespace, and refused options."""
 
-import subprocess
+import signal
 import sys
 
 import numpy as np
 import pytest
+from arm_processes import dvrk_drake
 from command_output import refusal
-from own_network import end, inside, outside, run_inside, start
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
@@ -26,6 +26,8 @@ from dvrk_drake.systems.ros.messages import (  # noqa: E402
     StringStamped,
     TwistStamped,
 )
+
+pytestmark = pytest.mark.network
 
 COMMANDS = {
     "state_command": StringStamped,
@@ -52,7 +54,7 @@ class Client:
 
     def __init__(self, arm, namespace, *options):
         self.arm = load_arm(arm)
-        self.process = start(sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", *options)
+        self.process = dvrk_drake("arm", "--arm", arm, "--ros", *options)
         self.domain, self.namespace = ros.RosDomain(), namespace
         jaw = self.arm.separate_joint
         self.num_main = self.arm.num_joints - bool(jaw)
@@ -79,7 +81,7 @@ class Client:
 
     def until(self, condition, what):
         def updated():
-            assert self.process.poll() is None, self.process.stdout.read()
+            assert self.process.poll() is None, self.process.output()
             for name, subscription in self.states.items():
                 for message, _ in subscription.take():
                     self.last[name] = message
@@ -115,12 +117,6 @@ class Client:
         self.until(lambda: self.reached and self.reached[-1].is_homed, "homed")
 
 
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
-
-
-@inside
 def test_client_controls_the_arm(monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
     client = Client("mtml", "/MTML")
@@ -190,7 +186,7 @@ def test_client_controls_the_arm(monkeypatch):
     assert received[0] == ("DISABLED", False)
     client.send("state_command", "disable")
     client.until(lambda: client.reached[-1].state == "DISABLED", "disabled")
-    output = end(client.process, 15)
+    output = client.process.end(signal.SIGTERM)
     for line in (
         "simulated MTML on ROS domain 0, topics /MTML/...; press Ctrl-C to end",
         "servo_jf refused: the arm is DISABLED; allowed: ENABLED, homed",
@@ -202,7 +198,6 @@ def test_client_controls_the_arm(monkeypatch):
     assert "late" in output.splitlines()[-1]
 
 
-@inside
 def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
     client = Client("psm", "/dvrk/PSM2", "--topic", "/dvrk/PSM2", "--rate", "200", "--effects", "friction")
@@ -214,9 +209,9 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     client.send("servo_jp", 0.0, 0.0, 0.05, 0.0, 0.0, 0.0)
     client.until(lambda: abs(client.position()[2] - 0.05) < 2e-3, "insertion")
     # A second arm with the same topics is refused, and a client of the first arm would notice its measurements.
-    other = start(sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", "psm", "--ros", "--topic", "dvrk/PSM2")
-    assert other.wait(TIMEOUT) == 2
-    assert "another arm publishes /dvrk/PSM2/measured_js in ROS domain 0. End it, or " in other.stdout.read()
+    other = dvrk_drake("arm", "--arm", "psm", "--ros", "--topic", "dvrk/PSM2")
+    assert other.wait() == 2
+    assert "another arm publishes /dvrk/PSM2/measured_js in ROS domain 0. End it, or " in other.output()
     second = client.domain.advertise("/dvrk/PSM2/measured_js", JointState)
     observer = ros.RosDomain()
 
@@ -227,10 +222,9 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     assert {"/dvrk/PSM2/servo_jp", "/dvrk/PSM2/jaw/servo_jf"} < set(others())
     del second
     assert observer.wait_until(lambda: "/dvrk/PSM2/measured_js" not in others(), TIMEOUT), others()
-    end(client.process, 15)
+    client.process.end(signal.SIGTERM)
 
 
-@outside
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -247,12 +241,7 @@ def test_wrong_options_are_refused(options, message, capsys):
     assert message in refusal(capsys.readouterr().err)
 
 
-@outside
-def test_package_is_required():
-    code = (
-        "import sys; sys.modules['cyclonedds'] = None; from dvrk_drake.cli import main; "
-        "sys.exit(main(['arm', '--arm', 'mtml', '--ros']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT, check=False)
-    assert done.returncode == 2
-    assert "ROS 2 needs the package cyclonedds: pip install cyclonedds" in done.stderr
+def test_package_is_required(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    assert main(["arm", "--arm", "mtml", "--ros"]) == 2
+    assert "ROS 2 needs the package cyclonedds: pip install cyclonedds" in refusal(capsys.readouterr().err)

@@ -23,6 +23,8 @@ from dvrk_drake.recordings.arm_bag import joint_state_topics
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, Setpoints, write_recording
 
+pytestmark = pytest.mark.drake_api
+
 ARMS = {name: load_arm(name) for name in ("mtml", "mtmr", "psm")}
 ARMS["three joints"] = ARMS["psm"].with_locked_joints({"roll": 0.3, "wrist_pitch": -0.2, "wrist_yaw": 0.1, "jaw": 0.4})
 

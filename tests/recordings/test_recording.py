@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from forked import public_folder, run_unprivileged
 from recordings import HEADER, Q_NAMES, ROW, SIX, TAU_NAMES, random_recording, six_joint_arm, write_text
-from unprivileged import public_folder, run_unprivileged
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.reading import read_recording

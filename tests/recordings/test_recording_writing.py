@@ -8,8 +8,8 @@ import stat
 
 import numpy as np
 import pytest
+from forked import public_folder, run_unprivileged
 from recordings import random_recording, write_text
-from unprivileged import public_folder, run_unprivileged
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.files import atomic_write

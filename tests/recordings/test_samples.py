@@ -8,8 +8,8 @@ import os
 import numpy as np
 import pytest
 from command_output import refusal
+from forked import public_folder, run_unprivileged
 from repository import ROOT
-from unprivileged import public_folder, run_unprivileged
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.verdict import cross_validated_verdicts

@@ -144,7 +144,7 @@ def validation():
     )
 
 
-@pytest.mark.parametrize("is_fitted", [True, False])
+@pytest.mark.parametrize("is_fitted", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_motion_figures_show_held_out_predictions(validation, is_fitted, monkeypatch, tmp_path):
     held_out = validation.predicted * 0.9 if is_fitted else None
     with checked_figures(monkeypatch) as figures:

@@ -29,7 +29,7 @@ def test_drift_figures_name_the_joints(monkeypatch, tmp_path):
         assert len(figure.axes) == 7
 
 
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_distributions_have_one_range_for_all_joints(name, monkeypatch, tmp_path):
     released = drifts(name, 0.02)
     with checked_figures(monkeypatch) as figures:

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import lcm_controller
+from own_network import join_network
 from waiting import TIMEOUT
 
 from dvrk_drake import cli
@@ -18,6 +19,8 @@ POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 
 #: Driver configuration with long timeouts, suitable for a busy computer.
 LONG_TIMEOUT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
 
+# The fork server imports the modules to compile from this path.
+os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]).rstrip(":")
 FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
 
@@ -28,11 +31,16 @@ class Forked:
     def __init__(self, main, *arguments):
         descriptor, self.path = tempfile.mkstemp()
         os.close(descriptor)
-        self.process = FORKSERVER.Process(target=run_forked, args=(main, arguments, self.path), daemon=True)
+        details = (main, arguments, self.path, os.getpid(), dict(os.environ))
+        self.process = FORKSERVER.Process(target=run_program, args=details, daemon=True)
         self.process.start()
 
+    @property
+    def pid(self):
+        return self.process.pid
+
     def send_signal(self, number):
-        os.kill(self.process.pid, number)
+        os.kill(self.pid, number)
 
     def wait(self):
         """Returns the exit code."""
@@ -74,7 +82,10 @@ class CommandLine(Forked):
         self.process.send_signal(number)
 
 
-def run_forked(main, arguments, path):
+def run_program(main, arguments, path, parent, environment):
+    """Runs a program with the network and the environment of the process of the test."""
+    join_network(parent)
+    os.environ.update(environment)
     with open(path, "w") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)

@@ -8,16 +8,15 @@ import contextlib
 import math
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from arm_processes import dvrk_drake
 from dvrk_console import Console, start_console
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
-from waiting import TIMEOUT, wait_until
+from waiting import wait_until
 
 #: Rate of the topics [Hz].
 RATE = 200
@@ -31,29 +30,23 @@ LONGEST = 20.0
 
 
 @contextlib.contextmanager
-def start_simulated_arm(arm, name, rate=RATE, output=subprocess.DEVNULL):
+def start_simulated_arm(arm, name, rate=RATE):
     """Context in which a simulated arm runs. It is in the state DISABLED.
 
     Args:
         arm: Name of the arm for --arm, e.g. "mtml".
         name: Name of the arm in its topics, e.g. "MTML".
         rate: Rate of the measurements [Hz].
-        output: File for the lines of the arm.
     """
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    command = [sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", arm, "--ros", "--rate", str(rate)]
-    process = subprocess.Popen(command, stdout=output)
+    process = dvrk_drake("arm", "--arm", arm, "--ros", "--rate", rate)
     subject = Console(name, process, process.pid, Path(os.devnull), RosDomain())
     try:
         wait_until(subject.state, "operating state", process)
         yield subject
     finally:
-        process.send_signal(signal.SIGINT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(TIMEOUT)
-        process.kill()
-        process.wait(TIMEOUT)
+        process.end(signal.SIGINT)
 
 
 class Observer:

@@ -1,92 +1,167 @@
-"""Network namespace for tests over real UDP multicast.
+"""Network namespaces for tests over UDP and DDS, and repetition of tests that a stalled computer breaks.
 
-A test file starts pytest again for itself inside a network namespace. The actual tests run there:
+A module whose tests use UDP or DDS begins with
 
-    @outside
-    def test_runs_in_a_separate_network(request):
-        run_inside(request)
+    pytestmark = pytest.mark.network
 
-    @inside
-    def test_...
+The tests of each such module run in a forked process of pytest with a network namespace of its own. So they cannot
+exchange messages with other modules or with the network of the computer, and no DDS thread remains. Processes that the
+tests start share the namespace, except those of a fork server, which call `join_network`. The tests are skipped where
+namespaces are not permitted.
 
 Tests wait for conditions, so they also pass on a busy computer. Two kinds of failed tests run again in a new process:
 
-- Tests of a watchdog that uses the wall clock, marked `@watchdog`. If the computer is busy for 10 ms, the watchdog acts
+- Tests of a watchdog that uses the wall clock, marked `watchdog`. If the computer is busy for 10 ms, the watchdog acts
   late, and the test fails without a defect.
 - Tests that failed while the computer was stalled, so that a sleeping thread was delayed by `STALL_TIME`. Then time
   limits of the processes under test expire, e.g. no status for 1 s.
 
-The last line of a run states the number of retries. A run with more than `MAX_RETRIES` fails.
+The last line of a run states the number of repetitions. A run repeats at most `MAX_RETRIES` tests.
 """
 
+import ctypes
+import multiprocessing
 import os
-import re
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
+from _pytest.runner import runtestprotocol
 from waiting import within_time_limit
 
-INSIDE = "DVRK_DRAKE_OWN_NETWORK"
-PROCESSES = ("--pid", "--mount-proc", "--kill-child")
+#: Configures the loopback interface of a new namespace for multicast.
 NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.255.0.0/16 dev lo"
-#: Maximum number of retries in one run of pytest, over all files and tests.
+#: Maximum number of repetitions in one run of pytest, over all files and tests.
 MAX_RETRIES = 4
 #: Delay of a sleeping thread that occurs only if the computer is stalled [s].
 STALL_TIME = 0.4
-#: Time limit of a run inside the namespace [s].
-MAX_RUN = 1800
+#: Flags of the system calls, see unshare(2) and prctl(2).
+_NEW_USER, _NEW_NETWORK, _SET_CHILD_SUBREAPER = 0x10000000, 0x40000000, 36
 
-inside = pytest.mark.skipif(INSIDE not in os.environ, reason="runs in a network namespace, started by the test below")
-outside = pytest.mark.skipif(INSIDE in os.environ, reason="already inside the network namespace")
-watchdog = pytest.mark.watchdog
-
+_LIBC = ctypes.CDLL(None, use_errno=True)
 _RETRIES = pytest.StashKey[list]()
+_PROCESS = pytest.StashKey["_Process"]()
+#: Name of the list of repetitions that a worker of pytest-xdist returns.
+_OF_WORKER = "dvrk_drake_retries"
 
 
-def unshare():
-    """Returns the command that creates a network namespace. It keeps the permission for real-time scheduling.
+def enter_network():
+    """Moves this thread, and the threads and processes that it starts, into a new network namespace.
 
-    If permitted, the command also creates a process namespace, which ends all its processes with the command. A deadman
-    process whose arm has ended would otherwise remain.
+    Raises:
+        OSError: Namespaces are not permitted, or the loopback interface cannot be configured.
     """
-    for command in (
-        ["unshare", "-n", *PROCESSES],
-        ["unshare", "-rn", *PROCESSES],
-        ["unshare", "-n"],
-        ["unshare", "-rn"],
-    ):
+    if _LIBC.unshare(_NEW_NETWORK):
+        # A user without permission may create namespaces inside a user namespace, while the process has one thread.
+        user, group = os.getuid(), os.getgid()
+        if _LIBC.unshare(_NEW_USER | _NEW_NETWORK):
+            raise OSError(ctypes.get_errno(), "network namespaces are not permitted")
+        Path("/proc/self/setgroups").write_text("deny")
+        Path("/proc/self/uid_map").write_text(f"0 {user} 1")
+        Path("/proc/self/gid_map").write_text(f"0 {group} 1")
+    try:
+        subprocess.run(["sh", "-c", NETWORK], check=True, capture_output=True, text=True)
+    except subprocess.CalledProcessError as error:
+        raise OSError(error.stderr) from None
+
+
+def join_network(pid):
+    """Moves this thread into the network namespace of another process."""
+    with open(f"/proc/{pid}/ns/net") as namespace:
+        if _LIBC.setns(namespace.fileno(), _NEW_NETWORK):
+            raise OSError(ctypes.get_errno(), "setns failed")
+
+
+def _children():
+    """Returns the processes whose parent is this process."""
+    return [int(pid) for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item):
+    """Runs the tests with the marker `network` of a module in a process of its own when it runs the first of them."""
+    if not item.get_closest_marker("network"):
+        return None
+    stash, module = item.config.stash, item.getparent(pytest.Module)
+    retries = stash.setdefault(_RETRIES, [])
+    process = stash.get(_PROCESS, None)
+    if process is None or item not in process.pending:
+        tests = [item]
+        if not hasattr(item.config, "workerinput"):  # a worker of pytest-xdist does not run all tests of a module
+            after = item.session.items[item.session.items.index(item) + 1 :]
+            tests += [other for other in after if other.getparent(pytest.Module) is module]
+        process = stash[_PROCESS] = _Process(tests)
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    reports, delay = process.results(item)
+    while any(report.failed for report in reports) and len(retries) < MAX_RETRIES:
+        if not item.get_closest_marker("watchdog") and delay < STALL_TIME:
+            break
+        retries.append(item.name)
+        reports, delay = _Process([item]).results(item)
+    for report in reports:
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+class _Process:
+    """Forked process that runs tests of one module in a network namespace.
+
+    Attributes:
+        pending: Tests whose results were not received yet, in order.
+    """
+
+    def __init__(self, items):
+        self.pending = list(items)
+        if "arm_processes" in sys.modules:
+            forkserver.ensure_running()  # one fork server for the processes of all modules
+        self._receiver, sender = multiprocessing.Pipe(duplex=False)
+        self._pid = os.fork()
+        if self._pid == 0:
+            self._run(items, sender)
+            os._exit(0)
+        sender.close()
+
+    def results(self, item):
+        """Returns the reports of the next test, and the longest delay of a sleeping thread meanwhile [s]."""
+        assert item is self.pending.pop(0)
         try:
-            done = subprocess.run([*command, "sh", "-c", NETWORK], capture_output=True, timeout=60, check=False)
-        except OSError:
-            continue
-        if done.returncode == 0:
-            return command
-    pytest.skip("network namespaces are not permitted here (unshare -rn, ip)")
+            data, delay = self._receiver.recv()
+            reports = [item.config.hook.pytest_report_from_serializable(config=item.config, data=each) for each in data]
+        except EOFError:
+            status = os.waitpid(self._pid, 0)[1]
+            self.pending = []
+            problem = f"the process of the test ended: {os.waitstatus_to_exitcode(status)}"
+            return [pytest.TestReport(item.nodeid, item.location, {}, "failed", problem, "call")], 0.0
+        if not self.pending:
+            os.waitpid(self._pid, 0)
+        return reports, delay
 
-
-def run_inside(request):
-    """Runs the test file of `request` in a network namespace. Some failed tests run again, see the module."""
-    marks = {name: getattr(test, "pytestmark", []) for name, test in vars(request.module).items()}
-    watchdogs = {name for name, own_marks in marks.items() if watchdog.mark in own_marks}
-    retries = request.config.stash.setdefault(_RETRIES, [])
-    with tempfile.TemporaryDirectory() as cache_folder:
-        while True:
+    @staticmethod
+    def _run(items, sender):
+        try:
+            enter_network()
+        except OSError as error:
+            mark = pytest.mark.skip(reason=f"needs a network namespace (unshare, ip): {error}")
+            for item in items:
+                item.add_marker(mark)
+        # The fork server is a child of the parent, so this process cannot wait for it.
+        forkserver._forkserver.ensure_running = lambda: None
+        _LIBC.prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        for item, following in zip(items, [*items[1:], items[0].session], strict=True):
             with _LongestDelay() as delay:
-                failed = _run(request.path, cache_folder)
-            if not failed:
-                break
-            steady = {name.partition("[")[0] for name in failed} - watchdogs
-            if steady and delay.seconds < STALL_TIME:
-                raise AssertionError(f"failed: {', '.join(failed)}")
-            if len(retries) + len(failed) > MAX_RETRIES:
-                raise AssertionError(f"failed: {', '.join(failed)}, after {len(retries)} retries")
-            retries += failed
+                reports = runtestprotocol(item, log=False, nextitem=following)
+            hook = item.config.hook
+            data = [hook.pytest_report_to_serializable(config=item.config, report=report) for report in reports]
+            sender.send((data, delay.seconds))
+        # A deadman process of a bridge that a test has killed has lost its parent.
+        for pid in _children():
+            os.kill(pid, signal.SIGKILL)
 
 
 class _LongestDelay:
@@ -109,49 +184,25 @@ class _LongestDelay:
         self._thread.join()
 
 
+def pytest_sessionfinish(session):
+    """Returns the repetitions of a worker to the process that started it."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput[_OF_WORKER] = session.config.stash.get(_RETRIES, [])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    """Receives the repetitions of a worker."""
+    node.config.stash.setdefault(_RETRIES, []).extend(getattr(node, "workeroutput", {}).get(_OF_WORKER, []))
+
+
 def pytest_terminal_summary(terminalreporter, config):
-    """Prints the number of retries if tests over UDP ran."""
+    """Prints the number of repetitions if tests with the marker `network` ran."""
     retries = config.stash.get(_RETRIES, None)
     if retries is not None:
         names = f": {', '.join(retries)}" if retries else ""
         count = f"{len(retries)} {'retry' if len(retries) == 1 else 'retries'}"
-        terminalreporter.write_line(f"UDP tests: {count} of at most {MAX_RETRIES}{names}")
-
-
-def _run(test_file, cache_folder):
-    """Runs the tests that failed last (at first: all) and returns the names of the tests that failed now."""
-    # The shell remains, because it must wait for the orphans of the process namespace.
-    command = [*unshare(), "sh", "-c", f'{NETWORK} && "$@"; exit $?', "sh"]
-    pytest_run = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-p",
-        "no:xdist",
-        "-rsfE",
-        "-s",
-        "-o",
-        f"cache_dir={cache_folder}",
-        "--lf",
-    ]
-    environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
-    # The fork server imports the modules to compile from this path.
-    paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment["PYTHONPATH"] = os.pathsep.join(paths)
-    environment.pop("LCM_DEFAULT_URL", None)
-    done = subprocess.run(
-        [*command, *pytest_run, test_file],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=MAX_RUN,
-        check=False,
-    )
-    print(done.stdout[-6000:], done.stderr[-3000:])
-    if not done.returncode:
-        return []
-    failed = re.findall(r"^(?:FAILED|ERROR) \S*::(\S+)", done.stdout, re.MULTILINE)
-    return failed or [f"exit code {done.returncode}"]
+        terminalreporter.write_line(f"Network tests: {count} of at most {MAX_RETRIES}{names}")
 
 
 def start(*arguments):

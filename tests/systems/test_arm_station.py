@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from pydrake.geometry import HalfSpace, Meshcat, Role
+from pydrake.geometry import HalfSpace, Role
 from pydrake.lcm import DrakeLcm
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlantConfig
@@ -17,8 +17,11 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import tree_selector
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
+from dvrk_drake.systems.arm_view.page import start_meshcat
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
+
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
 
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)
@@ -311,7 +314,7 @@ def test_errors_state_the_remedy():
 
 
 def test_meshcat_shows_the_arm():
-    meshcat = Meshcat()
+    meshcat = start_meshcat()
     diagram = ArmStation(ARM, meshcat=meshcat)
     diagram.ForcedPublish(diagram.CreateDefaultContext())
     assert meshcat.HasPath("/drake/mtml/links")

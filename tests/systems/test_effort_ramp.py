@@ -7,6 +7,8 @@ from pydrake.systems.analysis import Simulator
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.systems.effort_ramp import EffortRamp
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 
 def test_ramp_starts_when_enabled_and_restarts():
     ramp = EffortRamp(2, duration=0.1)

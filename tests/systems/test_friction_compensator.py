@@ -24,6 +24,8 @@ from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 ARM = load_arm("mtml")
 EFFECTS = [
     *(ActuatorEffect(f"actuator.{name}", "presliding", d) for name in ARM.joint_names for d in (0.003, 0.02)),

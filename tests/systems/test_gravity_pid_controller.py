@@ -15,6 +15,8 @@ from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)
 N = ARM.num_joints

@@ -10,6 +10,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 
 def drift(arm, mounted, model):
     """Returns the motion [rad, m] of each joint in 0.5 s under the model's gravity compensation."""

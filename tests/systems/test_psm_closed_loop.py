@@ -14,6 +14,8 @@ from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_posi
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 ARM = load_arm("psm")
 N = ARM.num_joints
 #: Joints outside of loops, coupled by a cable in both models: dependent joint -> (leader, multiplier).

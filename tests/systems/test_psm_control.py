@@ -14,6 +14,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 ARM = load_arm("psm")
 NOMINAL = IdentifiedModel.from_arm(ARM)
 N = ARM.num_joints

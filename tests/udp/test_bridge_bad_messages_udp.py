@@ -9,7 +9,6 @@ import time
 
 import numpy as np
 import pytest
-from own_network import inside, outside, run_inside
 from ros_bridge import CommandMonitor, Operator, start_bridge, start_controller, wait_for_line
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT, wait_until
@@ -17,15 +16,11 @@ from waiting import TIMEOUT, wait_until
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 
+pytestmark = pytest.mark.network
+
 ARM = load_arm("mtml")
 NAMES, POSE = list(ARM.joint_names), [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5]
 os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    pytest.importorskip("cyclonedds", reason="needs cyclonedds")
-    run_inside(request)
 
 
 class BadArm:
@@ -106,7 +101,6 @@ BAD = [
 ]
 
 
-@inside
 def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
     arm.change = changed(position=[])
     operator, bridge = Operator("mtml"), start_bridge("mtml", tmp_path)
@@ -143,7 +137,6 @@ def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
         operator.end()
 
 
-@inside
 def test_random_commands_of_others_stop_the_bridge(arm, tmp_path):
     from dvrk_drake.systems.ros.domain import RosDomain
 

@@ -1,6 +1,6 @@
 """Bridge to the dVRK console: efforts, kills, failures of the console and of the network. All are real processes.
 
-This file starts itself again inside a network namespace. The console has no dynamics, so its guard is lenient, and the
+The console has no dynamics, so its guard is lenient, and the
 controllers command efforts of zero.
 """
 
@@ -12,8 +12,8 @@ import subprocess
 import time
 
 import pytest
-from dvrk_console import find_peer, start_console
-from own_network import NETWORK, inside, outside, run_inside
+from dvrk_console import start_console
+from own_network import NETWORK
 from ros_bridge import CommandMonitor, Operator, start_bridge, start_controller, wait_for_line
 from ros_publisher import DOMAIN_FILE
 from waiting import wait_until
@@ -21,17 +21,13 @@ from waiting import wait_until
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 
+pytestmark = pytest.mark.network
+
 EFFORT, POSITION = "JOINT_SPACE/EFFORT_MODE", "JOINT_SPACE/POSITION_MODE"
 #: Time for which DDS by default lists a killed process [s].
 DDS_LEASE = 10.0
 #: Environment of all processes. Each test file has a network of its own, so the number of the domain is free.
 os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    find_peer()
-    run_inside(request)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +85,6 @@ def wait_for_efforts(console, bridge, after=0):
     wait_for_mode(console, EFFORT, bridge)
 
 
-@inside
 def test_wrong_domain_topic_and_arm_end_with_one_line(tmp_path):
     """The first two cases wait for a publisher, the others do not."""
     cases = {
@@ -117,7 +112,6 @@ def test_wrong_domain_topic_and_arm_end_with_one_line(tmp_path):
     assert time.monotonic() - start < 60.0
 
 
-@inside
 def test_efforts_act_and_other_bridge_is_refused(console, operator, tmp_path):
     monitor = CommandMonitor(console.domain, "/MTML")
     bridge, controller = start_efforts("mtml", tmp_path, console)
@@ -145,7 +139,6 @@ def test_efforts_act_and_other_bridge_is_refused(console, operator, tmp_path):
     wait_for_mode(console, POSITION)
 
 
-@inside
 @pytest.mark.parametrize("killed", ["bridge", "both"])
 def test_deadman_holds_after_kill(console, tmp_path, killed):
     bridge, controller = start_efforts("mtml", tmp_path, console)
@@ -157,7 +150,6 @@ def test_deadman_holds_after_kill(console, tmp_path, killed):
         wait_until(lambda: "deadman: /MTML: the bridge has ended; published hold at" in bridge.output(), "line")
 
 
-@inside
 def test_deadman_holds_while_bridge_is_stopped(console, operator, tmp_path):
     bridge, controller = start_efforts("mtml", tmp_path, console)
     with running(bridge, controller):
@@ -172,7 +164,6 @@ def test_deadman_holds_while_bridge_is_stopped(console, operator, tmp_path):
         assert EFFORT not in console.modes()[num_modes:]
 
 
-@inside
 def test_bridge_without_its_deadman_refuses_efforts(console, operator, tmp_path):
     bridge, controller = start_efforts("mtml", tmp_path, console)
     with running(bridge, controller):
@@ -182,7 +173,6 @@ def test_bridge_without_its_deadman_refuses_efforts(console, operator, tmp_path)
         wait_for_mode(console, POSITION, bridge)
 
 
-@inside
 def test_pause_of_console_and_network_loss_lead_to_a_fault(console, operator, tmp_path):
     bridge, controller = start_efforts("mtml", tmp_path, console)
     with running(bridge, controller):
@@ -212,7 +202,6 @@ def network(command):
     subprocess.run(["sh", "-c", command], check=True)
 
 
-@inside
 def test_low_rate_is_refused_with_the_option_of_the_console(tmp_path):
     with start_console("MTMR", tmp_path, rate=100.0) as slow:
         slow.enable_and_home()
@@ -227,7 +216,6 @@ def test_low_rate_is_refused_with_the_option_of_the_console(tmp_path):
         assert EFFORT not in slow.modes()
 
 
-@inside
 def test_jaw_does_not_change_the_control_space_of_a_psm(tmp_path):
     with start_console("PSM1", tmp_path, motion=True) as psm:
         psm.enable_and_home()
@@ -244,7 +232,6 @@ def test_jaw_does_not_change_the_control_space_of_a_psm(tmp_path):
             assert changes <= names.count("jaw/servo_jf")
 
 
-@inside
 def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
     with start_console("MTML", tmp_path, domain=9) as console:
         console.enable_and_home()

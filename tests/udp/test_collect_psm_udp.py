@@ -1,14 +1,11 @@
-"""Collection of PSM poses from both sides, with real processes and UDP multicast in a separate network.
-
-This file starts itself again inside a network namespace. Processes are forked from one that has compiled everything.
-"""
+"""Collection of PSM poses from both sides, with real processes and UDP multicast."""
 
 import signal
 
 import numpy as np
+import pytest
 from arm_observer import Observer, is_holding
 from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
-from own_network import inside, outside, run_inside
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -16,15 +13,11 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import load_poses
 from dvrk_drake.recordings.reading import read_recording
 
+pytestmark = pytest.mark.network
+
 POSES = 3
 
 
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
-
-
-@inside
 def test_psm_collection_from_both_sides_completes(tmp_path):
     arm, poses, output = load_arm("psm"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
     assert main(["collect", "--arm", "psm", "--poses", str(poses), "--random", str(POSES), "--seed", "3"]) == 0

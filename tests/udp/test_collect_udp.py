@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from arm_observer import Observer, accepts_efforts, is_holding
 from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
-from own_network import inside, outside, run_inside
 from waiting import wait_until
 
 from dvrk_drake.cli import main
@@ -18,15 +17,12 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import load_poses
 from dvrk_drake.recordings.reading import read_recording
 
+pytestmark = pytest.mark.network
+
 #: Smallest number of poses for an identification.
 POSES = 8
 #: Time until the arm releases a silent sender: the expiry and a margin [s]; earlier, another one is refused.
 FORGOTTEN = 0.6
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +40,6 @@ def moving(status):
     return accepts_efforts(status) and np.abs(status.velocity).max() > 0.05
 
 
-@inside
 def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     arm, poses, output = load_arm("mtml"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
     assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--random", str(POSES), "--seed", "5"]) == 0

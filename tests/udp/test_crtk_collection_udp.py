@@ -10,9 +10,10 @@ import sys
 
 import numpy as np
 import pytest
+from arm_processes import dvrk_drake
 from command_output import refusal
 from dvrk_console import start_console
-from own_network import end, inside, outside, run_inside, start
+from own_network import end, start
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT, wait_until, within_time_limit
 
@@ -24,6 +25,8 @@ from dvrk_drake.recordings.reading import read_recording
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 from dvrk_drake.systems.ros.messages import Empty, JointState, OperatingState  # noqa: E402
+
+pytestmark = pytest.mark.network
 
 MTML = load_arm("mtml")
 #: Domains of ended tests. Cyclone DDS may crash if a subscription is deleted while its listener is called.
@@ -51,11 +54,6 @@ OTHER = (
 POSES = MTML.sample_poses(6, np.random.default_rng(4), margin=0.3)
 
 
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
-
-
 @pytest.fixture(autouse=True)
 def loopback(monkeypatch):
     """Uses DDS on the loopback interface."""
@@ -65,8 +63,7 @@ def loopback(monkeypatch):
 @contextlib.contextmanager
 def simulated_arm(*options):
     """Context in which a simulated MTML runs, enabled and homed."""
-    command = [sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", "mtml", "--ros", "--rate", "100", "--enabled"]
-    process = start(*command, *options)
+    process = dvrk_drake("arm", "--arm", "mtml", "--ros", "--rate", "100", "--enabled", *options)
     try:
         domain = ros.RosDomain()
         state = domain.subscribe("/MTML/operating_state", OperatingState, depth=100, latched=True)
@@ -74,14 +71,14 @@ def simulated_arm(*options):
         last = [OperatingState()]
 
         def is_ready():
-            assert process.poll() is None, process.stdout.read()
+            assert process.poll() is None, process.output()
             last.extend(message for message, _ in state.take())
             return last[-1].is_homed and not last[-1].is_busy
 
         assert domain.wait_until(is_ready, TIMEOUT)
         yield domain
     finally:
-        end(process, signal.SIGINT)
+        process.end(signal.SIGINT)
 
 
 def files(folder, poses=POSES[:2]):
@@ -109,7 +106,6 @@ def collect(folder, *options, poses=POSES, code=0):
     return output
 
 
-@inside
 def test_holding_torques_with_friction(tmp_path):
     with simulated_arm("--effects", "friction") as domain:
         hold = domain.subscribe("/MTML/hold", Empty, depth=10)
@@ -131,7 +127,6 @@ def test_holding_torques_with_friction(tmp_path):
     assert not (tmp_path / "p_2.mcap").exists()
 
 
-@inside
 def test_interrupted_collection_continues_in_a_second_bag(tmp_path):
     with simulated_arm() as domain:
         goals = domain.subscribe("/MTML/move_jp", JointState, depth=10)
@@ -150,7 +145,6 @@ def test_interrupted_collection_continues_in_a_second_bag(tmp_path):
         assert "another process publishes /MTML/servo_jp" in output
 
 
-@inside
 @pytest.mark.parametrize("command", ["bridge", "collect", "record"])
 def test_interruption_ends_the_search_for_the_arm(command, tmp_path):
     options = {"bridge": [], "collect": ["--ros", *files(tmp_path)], "record": [str(tmp_path / "a.mcap"), "--ros"]}
@@ -164,7 +158,6 @@ def test_interruption_ends_the_search_for_the_arm(command, tmp_path):
     assert process.returncode == 2 and not list(tmp_path.glob("*.mcap"))
 
 
-@inside
 @pytest.mark.parametrize("action", ["SIG_DFL", "SIG_IGN"])
 def test_closed_terminal_holds_the_arm(tmp_path, action):
     """The kernel sends SIGHUP. If the shell has ignored this signal, the next output fails."""
@@ -201,7 +194,6 @@ def test_closed_terminal_holds_the_arm(tmp_path, action):
     assert len(read_recording(tmp_path / "p_1.mcap", MTML)) > 0
 
 
-@inside
 def test_dvrk_console_moves_to_the_poses(tmp_path):
     with start_console("MTML", tmp_path, rate=100.0, motion=True) as console:
         output = collect(tmp_path, poses=POSES[:2], code=2)

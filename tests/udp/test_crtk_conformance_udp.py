@@ -2,10 +2,11 @@
 
 import pytest
 from crtk_conformance import compare
-from own_network import inside, outside, run_inside
 from ros_publisher import DOMAIN_FILE
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
+
+pytestmark = pytest.mark.network
 
 #: Checks in which the arms differ on purpose (docs/ros.md): beginnings of the texts of the console and the simulation.
 DIFFERENCES = {
@@ -16,12 +17,6 @@ DIFFERENCES = {
 }
 
 
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
-
-
-@inside
 @pytest.mark.parametrize("arm", ["MTML", "PSM1"])
 def test_simulated_arm_conforms_to_the_console(arm, tmp_path, monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)

@@ -5,7 +5,6 @@ import pytest
 import yaml
 from crtk_conformance import start_simulated_arm
 from effort_controller import LENIENT_DRIVER
-from own_network import inside, outside, run_inside
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from ros_publisher import DOMAIN_FILE
@@ -17,13 +16,9 @@ from dvrk_drake.systems.station_config import load_station_config, make_arm_stat
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 
-
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
+pytestmark = pytest.mark.network
 
 
-@inside
 def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
     from dvrk_drake.systems.ros.messages import Empty, JointState

@@ -1,6 +1,5 @@
-"""Arm process and its controllers over real UDP multicast in a separate network.
+"""Arm process and its controllers over real UDP multicast.
 
-Run by itself, this file starts itself again inside a network namespace; the tests of that run are the real ones.
 Processes are forked from one that has compiled everything; where a test starts them by their command line, it says so.
 """
 
@@ -26,7 +25,6 @@ from arm_processes import (
     start_controller,
     start_run,
 )
-from own_network import inside, outside, run_inside, watchdog
 from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -37,6 +35,8 @@ from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command import draw_id
 
+pytestmark = pytest.mark.network
+
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 #: Options of tests that publish invalid messages, which observers do not read.
 THIRD_URL = "udpm://239.255.76.67:7669?ttl=0"
@@ -45,11 +45,6 @@ PATIENT, FORGOTTEN = ("--driver", LONG_TIMEOUT_DRIVER), 0.6
 #: Speed at which logs are played: the network loses nothing when a busy computer delays the player.
 SLOWLY = 0.2
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
 
 
 @pytest.fixture(scope="module", params=["mtml", "psm"])
@@ -115,7 +110,6 @@ def reset(name, observer):
     wait_until(is_cleared, "cleared fault")
 
 
-@inside
 def test_command_and_status_round_trip(arm):
     name, _, observer = arm
     controller = start_controller(name, "--echo")
@@ -133,8 +127,7 @@ def test_command_and_status_round_trip(arm):
     assert drift(*received) < 1e-4
 
 
-@inside
-@watchdog
+@pytest.mark.watchdog
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_arm_holds_after_controller_is_killed(name, tmp_path):
     """Tests the expiry by the arm's clock and, with real-time scheduling, by the wall clock."""
@@ -184,7 +177,6 @@ def waits_for_an_operator(status):
     return is_holding(status) and not status.fault_code and bool(status.fault_text)
 
 
-@inside
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
 def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
@@ -217,8 +209,7 @@ def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
     assert farthest < 1e-3
 
 
-@inside
-@watchdog
+@pytest.mark.watchdog
 @pytest.mark.parametrize("stalled", ["arm", "run"])
 def test_run_ends_after_stall_and_operator_restarts(stalled):
     observer, url = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
@@ -246,7 +237,6 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
     assert "the guard of MTML held the arm, and the operator resumes now: " in runs[-1].output()
 
 
-@inside
 @pytest.mark.parametrize("mode", ["gravity", "hold"])
 def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     name, _, observer = arm
@@ -272,7 +262,6 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     print(f"{name} {mode}: {said.splitlines()[-2].strip()}")
 
 
-@inside
 def test_run_stops_on_fault_and_refuses_faulty_arm():
     arm = ScriptedArm(OTHER_URL)
 
@@ -311,7 +300,6 @@ def test_run_stops_on_fault_and_refuses_faulty_arm():
     assert "MTML has a fault, which is reset now: the amplifier is hot" in said
 
 
-@inside
 def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
     name, process, observer = arm
     generator = np.random.default_rng(7)
@@ -344,7 +332,6 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
     assert drift(*received) < 1e-4
 
 
-@inside
 def test_controller_clock_jump_leads_to_hold_and_restart(arm):
     name, _, observer = arm
     first = len(observer.received)
@@ -394,7 +381,6 @@ class Logged:
         subprocess.run(command, check=True, timeout=TIMEOUT, capture_output=True)
 
 
-@inside
 def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
     name, _, observer = arm
     with Logged(tmp_path / "commands", NETWORK_URL) as log:
@@ -418,8 +404,7 @@ def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
     assert drift(*received) < 1e-3
 
 
-@watchdog
-@inside
+@pytest.mark.watchdog
 def test_restarted_arm_ignores_run_and_log(tmp_path):
     """A watchdog test, since `run` ends if the computer stops the arm's guard for 40 ms."""
     observer, on_other = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
@@ -486,7 +471,6 @@ class ScriptedArm:
                 pass
 
 
-@inside
 @pytest.mark.parametrize("ends", ["restarted", "clock"])
 def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
     arm, run = ScriptedArm(THIRD_URL), start_run("mtml", "--mode", "hold", "--realtime", "--lcm-url", THIRD_URL)
@@ -530,7 +514,6 @@ def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
     assert all(command.status_utime <= 10**15 + 600_000_000 for command in arm.commands)
 
 
-@inside
 def test_first_of_two_controllers_stays_in_control(arm):
     name, _, observer = arm
     first = start_controller(name)
@@ -551,8 +534,7 @@ def test_first_of_two_controllers_stays_in_control(arm):
     assert drift(*received) < 1e-3
 
 
-@watchdog
-@inside
+@pytest.mark.watchdog
 def test_key_protects_from_flood_of_foreign_commands(tmp_path):
     """Floods the arm with valid commands of an unknown sender, as fast as a process can publish them.
 

@@ -15,7 +15,7 @@ import pytest
 from mcap.exceptions import EndOfFile
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
-from own_network import end, inside, outside, run_inside, start
+from own_network import end, start
 from status_logs import ARM, log_bytes, statuses
 from waiting import TIMEOUT, wait_until, within_time_limit
 
@@ -24,14 +24,11 @@ from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, measurements
 from dvrk_drake.recordings.reading import read_recording
 
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children
+pytestmark = [
+    pytest.mark.network,
+    pytest.mark.skipif(not (TOOLS / "lcm-logger").exists(), reason=f"no {TOOLS}/lcm-logger: the lcm wheel ships it"),
+]
 COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(7)]
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    if not (TOOLS / "lcm-logger").exists():
-        pytest.skip(f"no {TOOLS}/lcm-logger: the lcm wheel ships it")
-    run_inside(request)
 
 
 def start_records(paths, *options, arms=("mtml", "mtml")):
@@ -105,7 +102,6 @@ def end_logger(logger, path):
     assert logger.returncode == 0, said
 
 
-@inside
 def test_log_and_recording_of_live_arm_agree(tmp_path):
     pose, driver = ["0.1", "0.4", "-0.25", "0.6", "0.9", "0.1", "0.5"], tmp_path / "driver.yaml"
     # The network buffer then holds half a second, so a busy computer loses nothing.
@@ -136,7 +132,6 @@ def test_log_and_recording_of_live_arm_agree(tmp_path):
         assert recording.motion(ARM) == ""
 
 
-@inside
 def test_record_reads_log_from_lcm_logplayer(tmp_path, played):
     paths = [tmp_path / name for name in ("again.csv", "again.log", "logger.log")]
     logger, recorders = start_logger(paths[2]), start_records(paths[:2])
@@ -162,7 +157,6 @@ def missing_at_first(path):
     return (min(by_utime(path)) - statuses(1)[0].utime) // 1000
 
 
-@inside
 def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
     """Kills the process when the first file has a given number of 2000 rows."""
     original = by_utime(played)
@@ -187,7 +181,6 @@ def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
             assert all(values == original[utime] for utime, values in by_utime(path).items())
 
 
-@inside
 def test_bag_ends_with_index_and_survives_kill(tmp_path, played):
     paths = [tmp_path / "ended.mcap", tmp_path / "killed.mcap"]
     recorders = start_records(paths)
@@ -210,7 +203,6 @@ def test_bag_ends_with_index_and_survives_kill(tmp_path, played):
     assert count >= 0.95 * len(original)
 
 
-@inside
 def test_missing_status_is_explained(tmp_path, played):
     publisher, ended = lcm.LCM(), threading.Event()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import html
 
 import numpy as np
@@ -18,6 +19,11 @@ TOP, BOTTOM = [0.36, 0.45, 0.55], [0.62, 0.69, 0.75]
 GROUND, LINES = Rgba(0.56, 0.63, 0.69), Rgba(0.45, 0.52, 0.58)
 #: Distance of the grid lines, half the width of the ground, and distance of the ground below the lowest point [m].
 GRID, HALF_WIDTH, CLEARANCE = 0.1, 1.5, 0.03
+#: Views that remain until others replace them. Drake searches a free port among 1000.
+MAX_VIEWS = 100
+#: Newest views. Drake ends the process if another thread than the creating one destroys a Meshcat. Without these
+#: references, Python's garbage collection could do so in any thread.
+_VIEWS: list[Meshcat] = []
 
 
 def start_meshcat(
@@ -60,6 +66,10 @@ def start_meshcat(
         raise DvrkDrakeError(
             "no free port can be opened" if port is None else f"port {port} cannot be opened. Choose another port"
         ) from error
+    _VIEWS.append(meshcat)
+    if len(_VIEWS) > MAX_VIEWS:
+        gc.collect()  # destroys Diagrams that still use an old view
+        del _VIEWS[0]
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", TOP)

@@ -90,7 +90,15 @@ def test_static_poses_of_a_motion_are_checked_as_poses():
 
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-@pytest.mark.parametrize(("name", "joint"), [("mtmr", 1), ("mtmr", 2), ("psm", 0), ("psm", 1)])
+@pytest.mark.parametrize(
+    ("name", "joint"),
+    [
+        ("mtmr", 1),
+        ("psm", 1),
+        pytest.param("mtmr", 2, marks=pytest.mark.slow),
+        pytest.param("psm", 0, marks=pytest.mark.slow),
+    ],
+)
 def test_refuses_one_wrong_sign_of_poses(name, joint, coordinates):
     """The efforts contain Coulomb friction of random sign, as real poses do."""
     arm, generator = load_arm(name), np.random.default_rng(5)
@@ -121,6 +129,7 @@ def test_refuses_a_wrong_sign_in_real_poses(name, shared_data):
         assert refusal.joints == (joint,)
 
 
+@pytest.mark.slow
 def test_accepts_real_recordings(shared_data):
     checked = 0
     for path in [*(shared_data / "mtm_static").glob("mtm*.csv"), *(shared_data / "trajectories").glob("*_one*.csv")]:

@@ -12,6 +12,8 @@ from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 
+pytestmark = pytest.mark.numeric
+
 FOLDS, ROWS = 12, 1200
 
 

@@ -14,6 +14,8 @@ from dvrk_drake.analysis.dynamic.estimates import (
 )
 from dvrk_drake.analysis.signals.low_pass import low_pass
 
+pytestmark = pytest.mark.numeric
+
 RATE, CUT_OFF, PERIOD, SECONDS = 100.0, 5.0, 8.0, 32.0
 T = np.arange(round(SECONDS * RATE)) / RATE
 

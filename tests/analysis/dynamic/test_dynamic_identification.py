@@ -27,6 +27,8 @@ from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.reports.identification import print_identification
 from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
 
+pytestmark = pytest.mark.numeric
+
 NOISE = 0.05
 RATE = 1000.0
 
@@ -39,7 +41,7 @@ def simulated(name, seed):
     return arm, truth, recorded(truth, motion, NOISE, generator)
 
 
-@pytest.fixture(scope="module", params=["mtmr", "psm"])
+@pytest.fixture(scope="module", params=["mtmr", pytest.param("psm", marks=pytest.mark.slow)])
 def case(request):
     arm, truth, recording = simulated(request.param, 0)
     return arm, truth, recording, identify_dynamic([recording], arm)

@@ -22,7 +22,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.numeric, pytest.mark.slow]
 
 PUBLISHED = {
     "mtmr": [8.18, 16.31, 19.06, 20.90, 26.30, 23.48, 33.96],

@@ -24,6 +24,8 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 
+pytestmark = pytest.mark.numeric
+
 SCALES = {"offset": 0.0, "spring": 0.4, "cable sine": 2.0, "cable cosine": 1.5}
 
 
@@ -55,7 +57,11 @@ def model_of_all_effects(name, tilt):
     return arm, model, dynamics
 
 
-@pytest.fixture(scope="module", params=[("mtmr", (0.4, 0.2, 0.0)), ("psm", (0.0, 0.0, 0.0))], ids=lambda p: p[0])
+@pytest.fixture(
+    scope="module",
+    params=[("mtmr", (0.4, 0.2, 0.0)), pytest.param(("psm", (0.0, 0.0, 0.0)), marks=pytest.mark.slow)],
+    ids=lambda p: p[0],
+)
 def case(request):
     name, tilt = request.param
     return model_of_all_effects(name, np.array(tilt))

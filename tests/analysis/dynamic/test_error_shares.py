@@ -5,6 +5,8 @@ import pytest
 
 from dvrk_drake.analysis.dynamic.validation import FAST, SHARE_LABELS, ErrorShares, error_shares
 
+pytestmark = pytest.mark.numeric
+
 PERIOD, PASSES, RATE = 8.0, 4, 100.0
 t = np.arange(PERIOD * PASSES * RATE) / RATE
 OMEGA = 2 * np.pi / PERIOD

@@ -6,6 +6,8 @@ from scipy.optimize import lsq_linear
 
 from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 
+pytestmark = pytest.mark.numeric
+
 ROWS, COLUMNS = 300, 14
 WEIGHTS = np.array([1.0, 0.3, 5.0])
 OWN = [np.arange(0, 9), np.arange(4, 14), np.array([0, 3, 7, 13])]

@@ -7,6 +7,8 @@ import pytest
 
 from dvrk_drake.analysis.dynamic.estimates import ParameterUncertainty
 
+pytestmark = pytest.mark.numeric
+
 
 def test_nearly_equal_columns_are_named():
     generator = np.random.default_rng(1)

@@ -16,7 +16,7 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.numeric, pytest.mark.slow]
 
 WRIST = {"roll": 0.5, "wrist_pitch": -0.6, "wrist_yaw": 0.2, "jaw": 0.3}
 OPTION = [f"{name}={position}" for name, position in WRIST.items()]

@@ -18,6 +18,8 @@ from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
+pytestmark = pytest.mark.drake_api
+
 LIMITS = MotionLimits()
 
 

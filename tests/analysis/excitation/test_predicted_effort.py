@@ -21,7 +21,7 @@ from dvrk_drake.models.plant import holding_torques, inverse_dynamics
 PERIOD = 5.0
 
 
-@pytest.fixture(scope="module", params=["mtmr", "psm"])
+@pytest.fixture(scope="module", params=["mtmr", pytest.param("psm", marks=pytest.mark.slow)])
 def arm(request):
     return dvrk.load_arm(request.param)
 
@@ -84,6 +84,7 @@ def test_heavier_links_leave_less_effort_for_the_motion(arm):
         random_motion(arm, limits, PERIOD, 4, np.random.default_rng(0), heavy)
 
 
+@pytest.mark.slow
 def test_second_motion_adds_more_information():
     arm = dvrk.load_arm("psm")
     limits, rng = MotionLimits(effort=0.8), np.random.default_rng(3)

@@ -25,7 +25,7 @@ from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, approach
 from dvrk_drake.recordings.pose_file import load_poses
 
 
-@pytest.fixture(scope="module", params=["mtml", "psm"])
+@pytest.fixture(scope="module", params=["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def information(request):
     arm = dvrk.load_arm(request.param)
     checker = PoseChecker(arm, MotionLimits(margin=MARGIN))

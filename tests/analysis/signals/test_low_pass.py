@@ -6,6 +6,8 @@ from scipy.signal import butter, correlate, sosfiltfilt
 
 from dvrk_drake.analysis.signals.low_pass import ORDER, central_difference, correlation, low_pass, resample
 
+pytestmark = pytest.mark.numeric
+
 RATE = 400.0
 T = np.arange(4000) / RATE
 INNER = slice(800, -800)  # away from the ends, where the filter swings in

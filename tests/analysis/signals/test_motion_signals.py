@@ -12,6 +12,8 @@ from dvrk_drake.analysis.signals.true_time import increasing_times, repeated_row
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
+pytestmark = pytest.mark.numeric
+
 RATE = 200.0
 FREQUENCIES = np.array([0.31, 0.53, 0.83])  # [Hz]
 INNER = slice(200, -200)

@@ -6,6 +6,8 @@ import pytest
 from dvrk_drake.analysis.signals.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.signals.repetition import find_period, repeatability_floor
 
+pytestmark = pytest.mark.numeric
+
 RATE = 200.0
 T = np.arange(8000) / RATE  # 40 s
 

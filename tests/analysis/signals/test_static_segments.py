@@ -16,6 +16,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 
+pytestmark = pytest.mark.numeric
+
 ARM = load_arm("psm")
 
 

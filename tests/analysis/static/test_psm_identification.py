@@ -18,6 +18,8 @@ from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_posi
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 
+pytestmark = pytest.mark.numeric
+
 COUNT = 16
 
 

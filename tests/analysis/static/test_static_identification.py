@@ -21,7 +21,7 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.numeric, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,14 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from plotly.subplots import make_subplots
-from pydrake.geometry import Box, Meshcat, MeshcatAnimation, MeshcatParams
+from pydrake.geometry import Box, MeshcatAnimation
 from pydrake.math import RigidTransform
 from report_checks import check_report, printed_text
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.reports.html.page import Command, Page, Plot, Provenance, Section, Table, Text, Verdict
 from dvrk_drake.reports.html.page import Meshcat as MeshcatBlock
+from dvrk_drake.systems.arm_view.page import start_meshcat
 
 #: Duration of the animation [s]. The box moves along x with 0.1 m/s.
 DURATION, SPEED = 4.0, 0.1
@@ -21,7 +22,7 @@ DURATION, SPEED = 4.0, 0.1
 @pytest.fixture(scope="module")
 def scene():
     """HTML page of Meshcat with a moving box."""
-    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    meshcat = start_meshcat()
     meshcat.SetObject("box", Box(0.1, 0.1, 0.1))
     animation = MeshcatAnimation(frames_per_second=20)
     for frame in range(int(20 * DURATION) + 1):

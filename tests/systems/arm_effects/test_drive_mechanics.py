@@ -9,6 +9,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect, FrictionEffect
 from dvrk_drake.systems.arm_station import ArmStation
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 
 @pytest.mark.parametrize("name", ARMS)
 def test_joints_of_drive_coordinates_follow_the_arm(name):

@@ -9,6 +9,8 @@ from dvrk_drake.models.effects_schema import ArmEffects, Cable, EffortEffect
 from dvrk_drake.systems.arm_effects.drive_force import EffortSensor, Motors, round_to_step
 from dvrk_drake.systems.arm_effects.drive_step import _measure_into, _move_anchors
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 ARM = load_arm("mtml")
 N = ARM.num_joints
 INVERSE = ARM.transmission.inverse  # joints from actuators

@@ -15,6 +15,8 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5])
 def test_measurement_delay_is_exact(ticks):

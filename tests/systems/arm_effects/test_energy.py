@@ -13,6 +13,8 @@ from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.hand import Grip, Hand
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 HANDLES = {"mtml": "dh_7", "psm": "dh_6"}
 GRIPS = {
     "as a person": Grip(),
@@ -133,7 +135,7 @@ def test_arm_with_fixed_hand_never_gains_energy(name, grip):
     assert total[-1] < total[0] - 0.5
 
 
-@pytest.mark.parametrize("grip", ["as a person", "a thousand times as firm"])
+@pytest.mark.parametrize("grip", ["as a person", pytest.param("a thousand times as firm", marks=pytest.mark.slow)])
 def test_hand_adds_no_energy_beyond_its_work(grip):
     """The desired pose jumps between steps, which adds energy to the springs. In the step they work on the arm."""
     held = HeldArm("mtml", weightless("mtml").effects, GRIPS[grip])
@@ -152,7 +154,7 @@ def test_hand_adds_no_energy_beyond_its_work(grip):
     assert taken > 0.3
 
 
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_oscillation_on_cables_and_springs_gains_no_energy(name):
     held = HeldArm(name, weightless(name).effects.only(["cables", "springs"]), Grip())
     held.let_go()

@@ -15,6 +15,8 @@ from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, FrictionE
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.arm_station import ArmStation
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 
 def scenario(arm, *settings):
     parts = ["duration=0.3", "simulated_effects=[all]", "sample_period=0.001"]

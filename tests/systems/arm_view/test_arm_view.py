@@ -17,6 +17,8 @@ from dvrk_drake.processes.live_view import show_status
 from dvrk_drake.systems.arm_view.arm_view import ArmView
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
+pytestmark = pytest.mark.drake_api
+
 
 @pytest.fixture(scope="module")
 def view():

@@ -7,6 +7,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.camera import ASPECT, HALF_HEIGHT, Camera, close_up, framing, geometry_corners
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
+pytestmark = pytest.mark.drake_api
+
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_camera_frames_the_whole_arm(name):

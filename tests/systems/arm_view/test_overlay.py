@@ -1,8 +1,11 @@
 """Overlay: ghost, efforts, frames, texts, recording, and drawing in a simulation."""
 
+import gc
+import threading
+
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat
+from forked import run_forked
 from pydrake.math import RigidTransform
 
 import dvrk_drake as dvrk
@@ -10,12 +13,15 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.systems.arm_view import page
 from dvrk_drake.systems.arm_view.camera import Camera
 from dvrk_drake.systems.arm_view.efforts import LEVELS, share_color
 from dvrk_drake.systems.arm_view.joints import ArmJoints
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
 from dvrk_drake.systems.arm_view.text import image_mesh, text_image
+
+pytestmark = pytest.mark.drake_api
 
 HOME = {"mtml": np.zeros(7), "psm": np.array([0, 0, 0.1, 0, 0, 0, 0])}
 
@@ -30,6 +36,26 @@ class Recorder:
         return lambda *args, **kwargs: self.calls.append((name, *args)) if name != "GetTrackedCameraPose" else None
 
 
+@pytest.mark.parametrize("views", [1, 3])
+def test_view_is_not_destroyed_in_another_thread(views, monkeypatch):
+    """Drake ends the process there, e.g. when a thread of Dask collects garbage. This thread destroys old views."""
+    monkeypatch.setattr(page, "MAX_VIEWS", 2)
+
+    def check():
+        gc.disable()
+        for _ in range(views):
+            cycle = {"view": start_meshcat()}
+            cycle["itself"] = cycle
+        del cycle
+        thread = threading.Thread(target=gc.collect)
+        thread.start()
+        thread.join()
+        assert len(page._VIEWS) == min(views, 2)
+
+    monkeypatch.setattr(page, "_VIEWS", [])
+    run_forked(check)
+
+
 def transforms(meshcat, part):
     return [call for call in meshcat.calls if call[0] == "SetTransform" and part in call[1]]
 
@@ -37,7 +63,7 @@ def transforms(meshcat, part):
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_effort_share_selects_the_nearest_arc(name):
     arm = load_arm(name)
-    overlay = ArmOverlay(arm, Meshcat())
+    overlay = ArmOverlay(arm, start_meshcat())
     share = np.array([0.0, 0.009, 0.04, -0.33, 1.7, -2.0, np.nan])
     overlay.draw(HOME[name], effort=share * arm.effort_limits)
     np.testing.assert_allclose(overlay._efforts.shares, [0, 0, 0.05, -0.3, 1, -1, 0], rtol=0, atol=1e-12)
@@ -71,7 +97,7 @@ def test_frames_are_those_of_the_dvrk():
 
 def test_ghost_links_at_the_place_of_the_arm_are_hidden():
     arm = load_arm("mtml")
-    overlay = ArmOverlay(arm, Meshcat())
+    overlay = ArmOverlay(arm, start_meshcat())
     q = np.zeros(7)
     q[2] = 0.2
     overlay.draw(np.zeros(7), desired=q)
@@ -113,12 +139,12 @@ def test_recording_stores_the_visibility_before_a_change():
 
 
 def test_saved_page_has_a_title():
-    assert "<title>MTML &amp; &lt;co&gt;</title>" in page_html(Meshcat(), "MTML & <co>")
+    assert "<title>MTML &amp; &lt;co&gt;</title>" in page_html(start_meshcat(), "MTML & <co>")
 
 
 def test_close_ups_come_from_the_arm_file():
-    assert ArmOverlay(load_arm("mtmr"), Meshcat()).camera_presets == ("whole arm", "gimbal")
-    assert ArmOverlay(load_arm("psm"), Meshcat()).camera_presets == ("whole arm", "instrument")
+    assert ArmOverlay(load_arm("mtmr"), start_meshcat()).camera_presets == ("whole arm", "gimbal")
+    assert ArmOverlay(load_arm("psm"), start_meshcat()).camera_presets == ("whole arm", "instrument")
 
 
 def test_text_follows_the_camera():
@@ -140,7 +166,7 @@ def test_text_follows_the_camera():
 def test_images():
     image = text_image("q1\nouter_yaw")
     assert image.height > text_image("q1").height
-    meshcat = Meshcat()
+    meshcat = start_meshcat()
     meshcat.SetObject("text", image_mesh(image, 0.1))
     assert meshcat.HasPath("/drake/text")
     assert share_color(0.0)[2] > share_color(1.0)[2]  # blue to red

@@ -19,8 +19,10 @@ from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
+pytestmark = pytest.mark.drake_api
 
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_controller_starts_acts_and_hold_follows(name):
     lcm = DrakeLcm("memq://")
     arm, controller = SimulatedArm(lcm, name), Controller(lcm, name)

@@ -10,6 +10,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
+pytestmark = pytest.mark.drake_api
+
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_feedforward_velocity_keeps_joints_inside_limits(name):
@@ -62,7 +64,13 @@ def pushed(name, push, seconds):
     return worst, arm.statuses[-1]
 
 
-@pytest.mark.parametrize(("name", "row"), [("mtml", k) for k in range(8)] + [("psm", k) for k in range(7)])
+#: Arm and row of its limit matrix: the coupled limit of the MTM and the insertion of the PSM, then all others.
+ROWS = [("mtml", 7), ("psm", 2)]
+ROWS += [pytest.param("mtml", k, marks=pytest.mark.slow) for k in range(7)]
+ROWS += [pytest.param("psm", k, marks=pytest.mark.slow) for k in range(7) if k != 2]
+
+
+@pytest.mark.parametrize(("name", "row"), ROWS)
 @pytest.mark.parametrize("side", [-1, 1])
 def test_full_motor_effort_keeps_joints_inside_limits(name, row, side):
     # The plant has no friction, damping or stops. Only the soft wall acts.
@@ -73,7 +81,12 @@ def test_full_motor_effort_keeps_joints_inside_limits(name, row, side):
     assert (status.guard_state, status.fault_text) == (Status.STATE_EFFORT, "")
 
 
-@pytest.mark.parametrize(("name", "joint"), [("mtml", 3), ("mtml", 5), ("mtml", 6), ("psm", 3), ("psm", 4), ("psm", 6)])
+#: Arm and a joint of its wrist.
+WRISTS = [("mtml", 6), ("psm", 3)]
+WRISTS += [pytest.param(*wrist, marks=pytest.mark.slow) for wrist in (("mtml", 3), ("mtml", 5), ("psm", 4), ("psm", 6))]
+
+
+@pytest.mark.parametrize(("name", "joint"), WRISTS)
 def test_wrist_on_soft_wall_comes_to_rest(name, joint):
     """On light joints, a wall that is too stiff for one period of delay makes the motors chatter."""
     lcm = DrakeLcm("memq://")

@@ -9,7 +9,6 @@ import time
 
 import pytest
 import ros_arm
-from own_network import inside, outside, run_inside
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
@@ -20,6 +19,8 @@ ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclone
 from dvrk_drake.systems.ros.deadman import DeadmanProcess  # noqa: E402
 from dvrk_drake.systems.ros.messages import JointState, OperatingState  # noqa: E402
 
+pytestmark = pytest.mark.network
+
 
 def time_limit(seconds):
     """Returns a function that returns whether the time has passed."""
@@ -27,7 +28,6 @@ def time_limit(seconds):
     return lambda: time.monotonic() > end
 
 
-@outside
 @pytest.mark.parametrize("attempts", ["yy", "nyy", "ynyy", "nynnyy"])
 def test_two_attempts_in_succession_must_be_confirmed(monkeypatch, attempts):
     monkeypatch.setattr(confirmation, "_INTERVAL", 0.0)
@@ -36,17 +36,11 @@ def test_two_attempts_in_succession_must_be_confirmed(monkeypatch, attempts):
     assert not left
 
 
-@outside
 @pytest.mark.parametrize("attempts", ["n", "yn"])
 def test_message_that_is_never_confirmed(monkeypatch, attempts):
     monkeypatch.setattr(confirmation, "_INTERVAL", 0.001)
     results = itertools.cycle(attempts)
     assert not repeat_until_confirmed(lambda longest: next(results) == "y", time_limit(0.05))
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
 
 
 def network(state):
@@ -69,7 +63,6 @@ def arm(monkeypatch):
         process.communicate(timeout=TIMEOUT)
 
 
-@inside
 @pytest.mark.usefixtures("arm")
 def test_message_is_received_after_a_loss_of_the_network():
     domain = ros.RosDomain(1)
@@ -115,7 +108,6 @@ def deadman(arm):
         process._process.wait()
 
 
-@inside
 def test_deadman_repeats_hold_after_the_end_of_the_bridge(arm, deadman):
     deadman.close(is_confirmed=False)
     time.sleep(0.5)
@@ -125,7 +117,6 @@ def test_deadman_repeats_hold_after_the_end_of_the_bridge(arm, deadman):
     deadman._process.wait(TIMEOUT)
 
 
-@inside
 @pytest.mark.usefixtures("arm")
 def test_signal_ends_the_deadman_after_the_bridge(deadman):
     os.kill(deadman.pid, signal.SIGTERM)

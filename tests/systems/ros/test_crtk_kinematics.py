@@ -8,6 +8,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 
+pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+
 ARMS = ("mtml", "mtmr", "psm")
 
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import pytest
 import ros_arm
-from own_network import inside, outside, run_inside
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
@@ -23,17 +22,14 @@ from dvrk_drake.errors import DvrkDrakeError
 module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
 topic_module = pytest.importorskip("dvrk_drake.systems.ros.topic", reason="needs cyclonedds")
+pytestmark = pytest.mark.network
+
 JointState, OperatingState, StringStamped = messages.JointState, messages.OperatingState, messages.StringStamped
 
 #: Numbers of domains. Each test has its own domain, without endpoints of other tests.
 DOMAINS = itertools.count(1)
 #: Time in which the end of a killed process must be detected [s]. The default of Cyclone DDS is 10 s.
 DETECTION = 5.0
-
-
-@outside
-def test_runs_in_a_separate_network(request):
-    run_inside(request)
 
 
 @pytest.fixture
@@ -69,7 +65,6 @@ def received(domain, subscription, number):
     return found
 
 
-@inside
 def test_latched_states_reach_a_late_subscription(domain, arm):
     volatile = domain.subscribe(ros_arm.STATE, OperatingState, depth=100)
     assert domain.wait_until(volatile.num_publishers, TIMEOUT)
@@ -83,7 +78,6 @@ def test_latched_states_reach_a_late_subscription(domain, arm):
     assert [m.state for m in received(domain, latched, len(ros_arm.STATES))] == ros_arm.STATES
 
 
-@inside
 def test_endpoints_are_discovered(domain, arm):
     own = domain.advertise("/own", StringStamped)
     state, joints = messages.type_hash(OperatingState), messages.type_hash(JointState)
@@ -109,7 +103,6 @@ def test_endpoints_are_discovered(domain, arm):
     assert best_effort == received | {("/own", False, True)}
 
 
-@inside
 def test_endpoints_of_a_killed_process_vanish(domain, arm):
     command = domain.advertise(ros_arm.COMMAND, JointState)
     assert domain.wait_until(lambda: len(domain.publishers()) == 3 and command.num_subscribers() == 1, TIMEOUT)
@@ -119,7 +112,6 @@ def test_endpoints_of_a_killed_process_vanish(domain, arm):
     assert domain.wait_until(lambda: not domain.subscribers() and not command.num_subscribers(), DETECTION)
 
 
-@inside
 def test_messages_continue_after_a_suspension(domain, arm):
     command, measured = domain.advertise(ros_arm.COMMAND, JointState), domain.subscribe(ros_arm.MEASURED, JointState)
 
@@ -138,7 +130,6 @@ def test_messages_continue_after_a_suspension(domain, arm):
         assert domain.wait_until(answers, DETECTION)
 
 
-@inside
 def test_a_stopped_subscriber_does_not_stop_the_publisher(domain, arm):
     command = domain.advertise(ros_arm.COMMAND, JointState)
     assert domain.wait_until(command.num_subscribers, TIMEOUT)
@@ -153,7 +144,6 @@ def test_a_stopped_subscriber_does_not_stop_the_publisher(domain, arm):
     assert time.monotonic() - begin < 50.0
 
 
-@inside
 def test_depth_keeps_the_last_messages(domain):
     subscriptions = [domain.subscribe("/depth", JointState, depth=depth) for depth in (1, 3)]
     publisher = domain.advertise("/depth", JointState)
@@ -170,7 +160,6 @@ def test_depth_keeps_the_last_messages(domain):
         assert subscription.take() == []
 
 
-@inside
 def test_unused_subscription_ends(domain):
     subscription, publisher = domain.subscribe("/end", JointState), domain.advertise("/end", JointState)
     assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
@@ -202,7 +191,6 @@ for _ in range(1500):
 """
 
 
-@inside
 def test_subscriptions_end_while_messages_arrive(monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
     publisher = subprocess.Popen([sys.executable, "-c", PUBLISH])
@@ -214,7 +202,6 @@ def test_subscriptions_end_while_messages_arrive(monkeypatch):
         publisher.wait()
 
 
-@inside
 def test_arriving_message_wakes_up(domain):
     subscription, publisher = domain.subscribe("/wake", JointState), domain.advertise("/wake", JointState)
     assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
@@ -227,7 +214,6 @@ def test_arriving_message_wakes_up(domain):
     assert not domain.wait_until(lambda: False, 0.01)
 
 
-@inside
 def test_malformed_text_is_counted(domain):
     from cyclonedds._clayer import ddspy_write
     from cyclonedds.pub import DataWriter
@@ -246,7 +232,6 @@ def test_malformed_text_is_counted(domain):
     assert (subscription.num_malformed, subscription.num_lost) == (1, 0)
 
 
-@inside
 def test_publisher_of_another_layout_is_not_received(domain):
     from cyclonedds.idl import IdlStruct
     from cyclonedds.idl.types import uint32
@@ -284,7 +269,6 @@ def payloads(frame):
             yield body[4 + struct.unpack_from("<H", body, 2)[0] :]
 
 
-@inside
 def test_bytes_on_the_network_end_with_zeros(domain, arm):
     publisher = domain.advertise(ros_arm.COMMAND, JointState)
     assert domain.wait_until(publisher.num_subscribers, TIMEOUT)
@@ -307,7 +291,6 @@ def test_bytes_on_the_network_end_with_zeros(domain, arm):
             assert encoded not in captured
 
 
-@inside
 @pytest.mark.parametrize("value", ["-1", "233", "1.0", "one"])
 def test_invalid_domain_is_refused(value, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", value)
@@ -315,12 +298,10 @@ def test_invalid_domain_is_refused(value, monkeypatch):
         module.RosDomain()
 
 
-@inside
 def test_configuration_of_the_user_is_kept(domain):
     assert os.environ["CYCLONEDDS_URI"] == DOMAIN_FILE
 
 
-@inside
 def test_lost_network_prints_nothing(monkeypatch, capfd):
     peer = '<Peer address="192.0.2.1"/></Peers>'
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE.replace("</Peers>", peer))
@@ -329,7 +310,6 @@ def test_lost_network_prints_nothing(monkeypatch, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@inside
 def test_reason_of_an_invalid_configuration_is_printed(monkeypatch, capfd):
     monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><Invalid/></Domain></CycloneDDS>")
     with pytest.raises(DvrkDrakeError, match=r"ROS domain \d+ cannot be used. CYCLONEDDS_URI is .<Cyc"):
