@@ -9,6 +9,8 @@ PATHS ?=
 # Module or folder of the package that `make mutants` changes.
 MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
+# Reading all other files takes 10 s.
+NETWORK_FILES = $(shell grep -rl --include='test_*.py' '^pytestmark.*mark\.network\|^    pytest.mark.network' tests)
 AND_TESTS = $(if $(TESTS), and $(TESTS))
 
 .PHONY: demo test test-all test-busy test-local test-network mutants lint docs package test-package benchmark clean
@@ -18,7 +20,12 @@ demo: $(VENV)/.installed
 
 # Tests of everything that a change can break. test-all adds tests that repeat others with another arm, draw or duration,
 # and tests with a browser, long recordings or the dVRK console.
-test: test-local test-network
+# The tests of the network mostly wait, so they run at the same time. Their output follows that of the others.
+test: $(VENV)/.installed-test
+	@set -e; output=$$(mktemp); $(MAKE) --no-print-directory test-network >$$output 2>&1 & network=$$!; \
+	  trap "kill $$network 2>/dev/null || :; rm -f $$output" EXIT INT TERM; \
+	  result=0; $(MAKE) --no-print-directory test-local || result=$$?; \
+	  wait $$network || result=$$?; cat $$output; exit $$result
 
 test-all:
 	$(MAKE) test TESTS=
@@ -32,9 +39,9 @@ test-busy:
 test-local: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal --max-worker-restart 0 -m 'not network$(AND_TESTS)' $(PATHS)
 
-# Tests over UDP and DDS run one after the other, since each runs several processes at 1 kHz and needs all cores.
+# Tests over UDP and DDS run one after the other, since each runs several processes at 1 kHz.
 test-network: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -m 'network$(AND_TESTS)' $(PATHS)
+	$(BIN)/python -m pytest -m 'network$(AND_TESTS)' $(or $(PATHS),$(NETWORK_FILES))
 
 # Mutation testing: lists changes of the code that no test detects. Not part of CI, since it takes many minutes.
 mutants: $(VENV)/.installed-test

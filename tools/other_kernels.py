@@ -1,6 +1,6 @@
 """Runs a command with the numerical kernels of another CPU, with which OpenBLAS, numpy and numba round differently.
 
-    python tools/other_kernels.py make test-fast
+    python tools/other_kernels.py make test-local
 
 On a CPU with AVX-512, the command uses the kernels for a CPU without AVX-512. On any other CPU, it uses the kernels for
 a CPU without AVX.

@@ -47,7 +47,7 @@ SLOWLY = 0.2
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
 
 
-@pytest.fixture(scope="module", params=["mtml", "psm"])
+@pytest.fixture(scope="module", params=["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def running_arm(request):
     observer = Observer(request.param)
     process = start_arm(request.param, *PATIENT)
@@ -128,7 +128,7 @@ def test_command_and_status_round_trip(arm):
 
 
 @pytest.mark.watchdog
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_arm_holds_after_controller_is_killed(name, tmp_path):
     """Tests the expiry by the arm's clock and, with real-time scheduling, by the wall clock."""
     (tmp_path / "driver.yaml").write_text("guard: {resume_automatically: true}\n")
@@ -177,7 +177,7 @@ def waits_for_an_operator(status):
     return is_holding(status) and not status.fault_code and bool(status.fault_text)
 
 
-@pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize("seconds", [0.2, pytest.param(0.05, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
 def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
     """Stalls processes by signals, with the default expiry. Stalls of 20 ms are tested with a simulated clock.
@@ -210,7 +210,7 @@ def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
 
 
 @pytest.mark.watchdog
-@pytest.mark.parametrize("stalled", ["arm", "run"])
+@pytest.mark.parametrize("stalled", ["arm", pytest.param("run", marks=pytest.mark.slow)])
 def test_run_ends_after_stall_and_operator_restarts(stalled):
     observer, url = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
     arm, run = start_arm("mtml", *url), start_run("mtml", *url)
@@ -471,7 +471,7 @@ class ScriptedArm:
                 pass
 
 
-@pytest.mark.parametrize("ends", ["restarted", "clock"])
+@pytest.mark.parametrize("ends", ["restarted", pytest.param("clock", marks=pytest.mark.slow)])
 def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
     arm, run = ScriptedArm(THIRD_URL), start_run("mtml", "--mode", "hold", "--realtime", "--lcm-url", THIRD_URL)
     session = arm.status.session_id
