@@ -7,17 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dvrk_console import start_console
-from ros_publisher import DOMAIN_FILE, unused_domain
+from ros_publisher import DOMAIN_FILE
 from waiting import wait_until
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    """Number of a ROS domain on the loopback interface that no other test process uses."""
+def loopback(monkeypatch):
+    """Uses DDS on the loopback interface."""
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
-    number = unused_domain()
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    return number
 
 
 @pytest.mark.parametrize("motion", [False, True])

@@ -4,9 +4,6 @@ Message k of the arm and of its jaw has the header stamp `START` + k / 200 s and
 of the arm is preceded by an invalid one, as a dVRK sends them before homing.
 """
 
-import contextlib
-import os
-import socket
 import sys
 import threading
 
@@ -16,19 +13,6 @@ START, PERIOD = 1_795_257_600_000_000_000, 5_000_000
 DOMAIN_FILE = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
-
-
-def unused_domain():
-    """Returns the number of a ROS domain without participants on this computer. Earlier tests may have left some."""
-    for number in ((os.getpid() + k) % 232 + 1 for k in range(232)):
-        # Ports on which participants are discovered (DDSI-RTPS 2.3, section 9.6.1.1).
-        ports = range(7410 + 250 * number, 7430 + 250 * number, 2)
-        with contextlib.suppress(OSError):
-            for port in ports:
-                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
-                    participant.bind(("127.0.0.1", port))
-            return number
-    raise RuntimeError("no unused ROS domain")
 
 
 def rows(k):

@@ -177,7 +177,7 @@ def waits_for_an_operator(status):
     return is_holding(status) and not status.fault_code and bool(status.fault_text)
 
 
-@pytest.mark.parametrize("seconds", [0.2, pytest.param(0.05, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seconds", [0.2, *(pytest.param(seconds, marks=pytest.mark.slow) for seconds in (0.05, 1.0))])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
 def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
     """Stalls processes by signals, with the default expiry. Stalls of 20 ms are tested with a simulated clock.
