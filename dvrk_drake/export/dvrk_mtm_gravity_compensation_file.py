@@ -14,6 +14,7 @@ from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.files import atomic_write, read_json_input
 from dvrk_drake.models.schema_fault import number_fault, within
 
+#: Version of the files that `GravityCompensationFile.save` writes.
 VERSION = "2.0"
 NUM_JOINTS = 7
 #: Number of parameters: ten for gravity, then five polynomial coefficients for each of the first six joints.
@@ -31,6 +32,9 @@ _KEYS = {
     "saturation": "sat_vec_vec",
     "friction_ratio": "fric_comp_ratio_vec",
 }
+#: Fields that a file of version 1 replaces by the speeds of the key `_AMPLITUDES` [rad/s].
+_FRICTION_FIELDS = ("dead_band", "saturation", "friction_ratio")
+_AMPLITUDES = "beta_vel_amplitude"
 _LENGTHS = {"positive": NUM_PARAMETERS, "negative": NUM_PARAMETERS}
 #: Keys of the lower and upper joint positions [deg] in the recording from which the file was computed. The controller
 #: does not read these keys.
@@ -49,7 +53,8 @@ class GravityCompensationFile:
         torque_lower, torque_upper: Torque limits (7,) [N m].
         dead_band: Speeds (7,) [rad/s] below which both parameter vectors have equal weight.
         saturation: Speeds (7,) [rad/s] above which the weights differ by `friction_ratio`.
-        friction_ratio: Share of the friction to compensate on each joint (7,) during a motion, 0 to 1.
+        friction_ratio: Share of the friction to compensate on each joint (7,) during a motion, 0 to 1. 0 for a file of
+            version 1, which has another rule for motions. At rest, the torques of both versions are equal.
         sweep: Lower and upper joint positions (2, 7) [rad] in the recording from which the file was computed. None if
             the file does not contain these positions.
         arm_name: Name of the arm from the key ARM_NAME, or else from the file name. "" if neither contains a name.
@@ -96,7 +101,7 @@ class GravityCompensationFile:
 
     @classmethod
     def load(cls, path: str | Path) -> GravityCompensationFile:
-        """Reads a file of the controller.
+        """Reads a file of version 1 or 2 of the controller. The controller reads only the integer part of the version.
 
         Raises:
             ModelError: The file is missing, is not JSON or has an unknown version, or a field is missing or invalid.
@@ -105,12 +110,21 @@ class GravityCompensationFile:
         controller = content.get(_CONTROLLER) if isinstance(content, dict) else None
         if not isinstance(controller, dict):
             raise ModelError(f"{path}: has no key {_CONTROLLER}, so it is not a gravity-compensation file of an MTM")
-        if content.get("version") != VERSION:
-            raise ModelError(f'{path}: version is {content.get("version")!r}; allowed: "{VERSION}"')
-        if missing := [key for key in _KEYS.values() if key not in controller]:
+        if (version := _major_version(content.get("version"))) not in (1, 2):
+            raise ModelError(f'{path}: version is {content.get("version")!r}; allowed: "1.0", "{VERSION}"')
+        keys = {name: key for name, key in _KEYS.items() if version == 2 or name not in _FRICTION_FIELDS}
+        required = [*keys.values(), *([_AMPLITUDES] if version == 1 else [])]
+        if missing := [key for key in required if key not in controller]:
             raise ModelError(f"{path}: keys missing in {_CONTROLLER}: {', '.join(missing)}")
+        fields = {name: _numbers(controller[key]) for name, key in keys.items()}
+        if version == 1:
+            amplitudes = _numbers(controller[_AMPLITUDES])
+            if amplitudes.shape != (NUM_JOINTS,) or not np.all((amplitudes > 0) & np.isfinite(amplitudes)):
+                raise ModelError(f"{path}: {_AMPLITUDES} must be {NUM_JOINTS} positive numbers [rad/s]")
+            fields |= {"dead_band": np.zeros(NUM_JOINTS), "saturation": np.ones(NUM_JOINTS)}
+            fields["friction_ratio"] = np.zeros(NUM_JOINTS)
         file = cls(
-            **{name: _numbers(controller[key]) for name, key in _KEYS.items()},
+            **fields,
             sweep=_sweep(controller),
             arm_name=_arm_name(content.get(_ARM_NAME), Path(path).name),
         )
@@ -138,6 +152,14 @@ class GravityCompensationFile:
                 f'{{\n  "version": "{VERSION}",\n  "{_ARM_NAME}": {json.dumps(arm_name)},\n'
                 f'  "origin": {json.dumps(origin)},\n  "{_CONTROLLER}": {{\n' + ",\n".join(lines) + "\n  }\n}\n"
             )
+
+
+def _major_version(value: object) -> int:
+    """Returns the integer part of a version, or 0 if it is not a number."""
+    try:
+        return int(float(value)) if isinstance(value, str | int | float) else 0
+    except (ValueError, OverflowError):
+        return 0
 
 
 def _numbers(value: object) -> NDArray[np.float64]:

@@ -10,6 +10,9 @@ The mass of link 7 is the mass that moves with the insertion joint, minus the ma
 Link 6 moves at half of the insertion speed, and t7 does not include its weight. It has a mass only if the feedforward
 of insertion is disabled. Link 7 then has none, so the torque of insertion is 0. Both have none if the net mass is
 negative, because the controller requires masses of at least 0.
+
+The controller computes the direction of gravity in the base frame from the angle `mounting_pitch`, which is not part of
+the file but of the arm's configuration beside it. This angle describes a rotation about the x axis of the base only.
 """
 
 from __future__ import annotations
@@ -38,6 +41,11 @@ CHAIN_FROM_ARM = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0], [0, 1, 0
 #: Matrix from the joint torques of the chain to those of yaw, pitch and insertion.
 ARM_FROM_CHAIN = np.array([[1, 0, 0, 0, 0, 0, 0], [0, 0, 1, -1, 1, 0, 0], [0, 0, 0, 0, 0, 0, 1]])
 PRISMATIC = np.array([False] * 5 + [True] * 2)
+#: Gravitational acceleration of the controller [m/s^2] (mtsIntuitiveResearchKitArm.cpp of sawIntuitiveResearchKit).
+CONTROLLER_GRAVITY = 9.81
+#: Sideways tilt [rad] above which it is named as the cause of a difference. It is below the last digit of a gravity
+#: vector that is given with six digits.
+_LEAST_TILT = 1e-6
 #: Index of a link of the chain -> bodies of the arm that it represents.
 _BODIES = {
     0: ("yaw_link",),
@@ -61,9 +69,10 @@ class KinematicCompensation:
         alpha, A, theta, D: DH parameters (7,) at zero joint positions [rad, m].
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
-        loss: Largest differences between the torques of file and model on yaw, pitch and insertion. They are computed
-            with a straight instrument (all instrument joints at zero) or with the instrument joints at their locked
-            positions.
+        mounting_pitch: Angle [rad] that the arm's configuration must contain, see `controller_gravity`.
+        loss: Largest differences between the torques of file and model on yaw, pitch and insertion. The torques of the
+            file are computed with the controller's gravity for `mounting_pitch`, with a straight instrument (all
+            instrument joints at zero) or with the instrument joints at their locked positions.
         wrist: Largest changes (3,) of the model's torques on these joints due to the positions of the instrument
             joints [N m, N m, N]. The file does not represent these changes. Not meaningful if the instrument joints are
             locked.
@@ -75,6 +84,7 @@ class KinematicCompensation:
     D: NDArray[np.float64]
     mass: NDArray[np.float64]
     center: NDArray[np.float64]
+    mounting_pitch: float
     loss: CompensationLoss
     wrist: NDArray[np.float64]
 
@@ -99,6 +109,26 @@ class KinematicCompensation:
             stream.write("\n")
 
 
+def mounting_pitch(gravity: NDArray[np.float64]) -> float:
+    """Returns the angle [rad] whose `controller_gravity` is closest in direction to a gravity vector (3,)."""
+    return float(np.arctan2(-gravity[1], -gravity[2])) + 0.0
+
+
+def controller_gravity(pitch: float) -> NDArray[np.float64]:
+    """Returns the gravity vector (3,) in the base frame [m/s^2] that the controller computes from `mounting_pitch`.
+
+    A positive pitch [rad] rotates the base about its x axis, so that gravity points to -y. PSM1 and PSM2 of a da Vinci
+    Si have a pitch of -45 degrees. Source: mtsIntuitiveResearchKitArm.cpp of sawIntuitiveResearchKit 2.4.0, which
+    computes the opposite vector (0, sin(pitch), cos(pitch)) * 9.81.
+    """
+    return -CONTROLLER_GRAVITY * np.array([0.0, np.sin(pitch), np.cos(pitch)])
+
+
+def _sideways_tilt(gravity: NDArray[np.float64]) -> float:
+    """Returns the angle [rad] between a gravity vector (3,) and the y-z plane of the base."""
+    return float(np.arcsin(abs(gravity[0]) / np.linalg.norm(gravity)))
+
+
 def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = None) -> KinematicCompensation:
     """Converts the gravity torque of yaw, pitch and insertion to the controller's chain, for a straight instrument.
 
@@ -107,7 +137,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     Args:
         model: Model of a PSM.
         tolerance: Largest accepted difference between the torques of the file and of the model on any joint [N m, N].
-            Joint effects and feedforward scales below 1 cause differences. None: the dry friction of each joint, see
+            Joint effects, feedforward scales below 1 and a sideways tilt of the base cause differences. None: the dry friction of each joint, see
             `gravity_compensation_loss.accepted_differences`.
 
     Raises:
@@ -130,7 +160,8 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     tau = model.feedforward_scale[:3] * gravity
     # (m, 3, 7, 4): torque of yaw, pitch and insertion per unit of the mass and of the first moments of each link.
     frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
-    Y = np.array([_regressor(X, arm.gravity) for X in frames])
+    pitch = mounting_pitch(arm.gravity)
+    Y = np.array([_regressor(X, controller_gravity(pitch)) for X in frames])
     mass, moment = _initial_links(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
     mass_column = Y[:, 2, _LAST, 0]
     is_off = model.feedforward_scale[2] == 0
@@ -152,13 +183,17 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     known[_FITTED, 1:] += step.reshape(-1, 3)
     tau_model = model.holding_torque(straight)[:, :3]
     tau_file = np.einsum("mjlk,lk->mj", Y, known)
-    cause = "feedforward scale other than 1" if net > 0 else "negative net mass on the insertion joint"
+    tilt = _sideways_tilt(arm.gravity)
+    if tilt > _LEAST_TILT:
+        cause = f"sideways base tilt of {np.rad2deg(tilt):.2g} deg, which mounting_pitch cannot express"
+    else:
+        cause = "feedforward scale other than 1" if net > 0 else "negative net mass on the insertion joint"
     causes = {cause: tau_file - tau, **_omitted_effects(model, straight)}
     loss = make_loss(arm, straight, tau_file - tau_model, causes)
     loss.check(accepted)
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
     wrist = np.abs(model.holding_torque(q)[:, :3] - tau_model).max(axis=0)
-    return KinematicCompensation(alpha, A, theta, D, mass, center, loss, wrist)
+    return KinematicCompensation(alpha, A, theta, D, mass, center, pitch, loss, wrist)
 
 
 def _refuse_disabled_joints(model: IdentifiedModel) -> None:

@@ -72,6 +72,9 @@ def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: Model
         console.print(f"Reflected rotor inertias [kg m^2; kg if prismatic]: {rotors}", markup=False)
     for remark in bodies.left_out:
         console.print(f"Not exported: {remark}", markup=False)
+    if np.any(arm.gravity[:2]):
+        gravity = " ".join(f"{x:g}" for x in arm.gravity)
+        console.print(f"Not exported: the gravity vector of the model in the base frame, {gravity} m/s^2", markup=False)
 
 
 def _mass_table(changes: Sequence[LinkChange]) -> Table:
@@ -133,9 +136,10 @@ def _print_compensation(
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
         console.print(f"Joints whose torque limit equals the effort limit of the arm: {', '.join(short)}.")
     _print_estimates(console, export)
-    console.print(f"Install: {_installation('gravity_compensation', path)}.", markup=False)
+    name = Path(path).name
+    console.print(f'Install: enter "gravity_compensation": "{name}" in the JSON file of the arm.', markup=False)
     usual = f"gc-{arm.name}-"
-    if not Path(path).name.startswith(usual):
+    if not name.startswith(usual):
         console.print(f"The usual name of the file is {usual}<serial number>.json.", markup=False)
 
 
@@ -143,7 +147,8 @@ def _print_kinematic_compensation(
     console: Console, path: str, export: ModelExport, file: KinematicCompensation, verbose: bool
 ) -> None:
     """Prints the largest differences from the model, and the links of the kinematic chain in the file."""
-    print_answer(console, _loss_text(file.loss), _installation("kinematic_gc", path))
+    entries = f'"kinematic_gc": "{Path(path).name}", "mounting_pitch": {file.mounting_pitch:.6g}'
+    print_answer(console, _loss_text(file.loss), f"enter {entries} in the JSON file of the arm")
     locked = locked_text(export.model.arm)
     columns = (f"with {locked}",) if locked else ("straight instrument", "change by a bent wrist")
     title = "Largest difference from the model at rest, also in % of the effort limit"
@@ -203,10 +208,6 @@ def _print_causes(console: Console, loss: CompensationLoss) -> None:
 def _print_estimates(console: Console, export: ModelExport) -> None:
     if export.model.provenance.method == "nominal":
         console.print("The masses of the SDF are estimates. Identify your arm before you install a file.")
-
-
-def _installation(key: str, path: str) -> str:
-    return f'enter "{key}": "{Path(path).name}" in the JSON file of the arm'
 
 
 def print_comparison(

@@ -1,5 +1,6 @@
 """Compares exported gravity-compensation files with the model, evaluated by the dVRK's own controller."""
 
+import json
 import re
 
 import numpy as np
@@ -183,3 +184,18 @@ def test_file_of_a_psm(recording, insertion, shared_data, tmp_path):
     is_exact = file.mass[5:].any()
     assert is_exact or recording == "psm_three_joints/psm2_1.csv"
     np.testing.assert_allclose(actual, torque, rtol=0, atol=1e-12 if is_exact else 0.01)
+
+
+def test_file_of_a_tilted_psm(shared_data, tmp_path):
+    """The controller's program assumes an upright base, so the tilt of the base is added to the first joint of the file."""
+    model = IdentifiedModel.from_arm(load_arm("psm").with_gravity([0.0, 6.9367, -6.9367]))
+    file = kinematic_compensation(model)
+    path = tmp_path / "psm.json"
+    file.save(path)
+    content = json.loads(path.read_text())
+    content["DH"]["joints"][0]["alpha"] += file.mounting_pitch
+    path.write_text(json.dumps(content))
+    q = model.arm.sample_poses(100, np.random.default_rng(9))
+    q[:, 3:] = 0.0
+    expected = model.holding_torque(q)[:, :3]
+    np.testing.assert_allclose(judge(shared_data, "judge_psm", path, q[:, :3]), expected, rtol=0, atol=1e-9)

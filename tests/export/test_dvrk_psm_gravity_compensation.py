@@ -18,8 +18,12 @@ from dvrk_drake.models.effects_schema import DriveEffect
 pytestmark = pytest.mark.slow
 
 
-def dvrk_controller(path, q, gravity):
-    """Returns the torques of yaw, pitch and insertion by the recursive Newton-Euler algorithm for the chain at rest."""
+def dvrk_controller(path, q, pitch):
+    """Returns the torques of yaw, pitch and insertion by the recursive Newton-Euler algorithm for the chain at rest.
+
+    `pitch` is `mounting_pitch` in the configuration of the arm [rad].
+    """
+    gravity = [0.0, -9.81 * np.sin(pitch), -9.81 * np.cos(pitch)]
     joints = json.loads(path.read_text())["DH"]["joints"]
     positions = [q[0], 0, q[1], -q[1], q[1], q[2] / 2, q[2] / 2]
     poses = []
@@ -58,7 +62,7 @@ def perturbed_psm():
     return model
 
 
-@pytest.mark.parametrize("gravity", [None, [0.0, -4.0, -9.0]])
+@pytest.mark.parametrize("gravity", [None, [0.0, -4.0, -9.0], [0.0, 6.9367, -6.9367], [0.0, 5.0, 5.0]])
 def test_file_gives_the_torque_of_the_model(gravity, tmp_path):
     model = perturbed_psm()
     if gravity is not None:
@@ -71,7 +75,7 @@ def test_file_gives_the_torque_of_the_model(gravity, tmp_path):
     q = arm.sample_poses(200, np.random.default_rng(8))
     q[:, 3:] = 0.0
     expected = model.holding_torque(q)[:, :3]
-    actual = np.array([dvrk_controller(path, pose[:3], arm.gravity) for pose in q])
+    actual = np.array([dvrk_controller(path, pose[:3], file.mounting_pitch) for pose in q])
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9)
     assert np.ptp(expected, axis=0).min() > 0.01
     assert np.all(file.mass >= 0) and np.abs(file.center).max() < 1.0
@@ -127,12 +131,28 @@ def test_insertion_without_feedforward_has_no_torque():
     assert file.mass[5] == pytest.approx(2 * before.mass[6], rel=1e-9)
 
 
+def test_gravity_that_mounting_pitch_cannot_express_is_refused(tmp_path, capsys, monkeypatch):
+    """The difference is computed with the gravity of the controller, not with that of the model."""
+    monkeypatch.chdir(tmp_path)
+    nominal = load_arm("psm")
+    for name, gravity in {"pitch": [0.0, 6.9367, -6.9367], "roll": [6.9367, 0.0, -6.9367]}.items():
+        IdentifiedModel.from_arm(nominal.with_gravity(gravity)).save(f"{name}.yaml")
+    command = ["export", "--dvrk-kinematic-gc", "gc.json", "--model"]
+    assert main([*command, "roll.yaml"]) == 2
+    error = refusal(capsys.readouterr().err)
+    assert "cause: sideways base tilt of 45 deg, which mounting_pitch cannot express" in error
+    assert not os.path.exists("gc.json")
+    assert main([*command, "pitch.yaml"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert 'enter "kinematic_gc": "gc.json", "mounting_pitch": -0.785398 in the JSON file of the arm' in printed
+
+
 def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):
     out = tmp_path / "psm.json"
     assert main(["export", "--arm", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "are equal at rest" in printed and out.is_file()
-    assert 'enter "kinematic_gc": "psm.json" in the JSON file of the arm' in printed
+    assert 'enter "kinematic_gc": "psm.json", "mounting_pitch": 0 in the JSON file of the arm' in printed
     assert main(["export", "--arm", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
     assert "is not a PSM" in refusal(capsys.readouterr().err)
 
