@@ -17,7 +17,7 @@ from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParamete
 from dvrk_drake.dynamics.inertial_parameters import link_inertias, rotor_links
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_selector
+from dvrk_drake.models.plant import holding_torques, set_arm_positions, shared_plant, tree_selector
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,21 +83,40 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
         )
     parameters = [StandardParameter(label, axis) for label in kept for axis in ("", "x", "y", "z")]
     lengths = named_lengths(plant, bodies, frames)
-    regressor = _regressor_at_random_poses(plant, arm, list(kept.values()))
+    poses = np.random.default_rng(0).uniform(-2, 2, (4 * len(kept) + 10, arm.num_joints))
+    regressor = _regressor_at_poses(plant, arm, list(kept.values()), poses)
     order = _preference_order(parameters, _locked_labels(plant, arm, kept))
-    return GravityParameters(
+    result = GravityParameters(
         arm=arm,
         standard_parameters=tuple(parameters),
         to_standard=_to_standard(plant, arm, list(kept.values())),
         lengths={name: length for name, length in lengths.items() if name != "1"},
         base=reduce_to_base(regressor, parameters, order, lengths),
     )
+    if not serial:
+        _check_torque(arm, size * regressor[:, result.base.columns] @ result.base_values, holding_torques(arm, poses))
+    return result
 
 
-def _regressor_at_random_poses(
-    plant: MultibodyPlant, arm: Arm, bodies: Sequence[tuple[RigidBody, RigidTransform]]
+def _check_torque(arm: Arm, tau: NDArray[np.float64], expected: NDArray[np.float64]) -> None:
+    """Raises ArmError if the torques of the base parameters (m n,) differ from those of Drake (m, n)."""
+    difference = np.abs(tau.reshape(expected.shape) - expected).max(axis=0)
+    # Sums of some hundred terms, each with a relative rounding error of 2e-16, differ by less than 1e-12.
+    if np.any(difference > 1e-12 * (1.0 + np.abs(expected).max())):
+        j = int(np.argmax(difference))
+        raise ArmError(
+            f"{arm.name}: the gravity torque of {arm.joint_names[j]} differs by {difference[j]:.3g} "
+            f"{'N' if arm.prismatic[j] else 'N m'} from Drake's for the same SDF. Give each moving link one frame dh_<name>"
+        )
+
+
+def _regressor_at_poses(
+    plant: MultibodyPlant,
+    arm: Arm,
+    bodies: Sequence[tuple[RigidBody, RigidTransform]],
+    poses: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Returns regressor rows (rows, p) at random poses for gravity of 1 m/s^2.
+    """Returns regressor rows (m n, p) at poses (m, n) for gravity of 1 m/s^2.
 
     The potential energy of a link is linear in mass and first moments. The factor of the mass is the height of the
     origin of frame F. The factors of the first moments are the upward components of the axes of F. The regressor
@@ -107,7 +126,7 @@ def _regressor_at_random_poses(
     points = [X_BF.multiply(np.hstack([np.zeros((3, 1)), np.eye(3)])) for _, X_BF in bodies]
     context, world, selector = plant.CreateDefaultContext(), plant.world_frame(), tree_selector(plant, arm)
     rows = []
-    for q in np.random.default_rng(0).uniform(-2, 2, (4 * len(bodies) + 10, arm.num_joints)):
+    for q in poses:
         set_arm_positions(plant, context, arm, q)
         columns = []
         for (body, _), p_BoP in zip(bodies, points, strict=True):
@@ -132,6 +151,12 @@ def _to_standard(
     order = [link.link for link in link_inertias(arm)]
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(arm_instance(plant))]
     rotors = rotor_links(arm)
+    for joint in joints:
+        if {joint.parent_body().name(), joint.child_body().name()} <= rotors:
+            raise ArmError(
+                f"link {joint.child_body().name()} needs a frame dh_<name>, because {joint.parent_body().name()}, which "
+                "carries it, has no such frame"
+            )
     rows = np.zeros((len(bodies), 4, len(order), 10))
     for row, (body, X_BF) in zip(rows, bodies, strict=True):
         R_FB = exact_rotation(X_BF.rotation().matrix()).T
@@ -168,20 +193,24 @@ def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[Rigid
     """Returns label -> (moving body B, pose X_BF of its frame F). Numbered links come first.
 
     The parameters of the body are expressed in frame F. This is the frame <frames>_<number>, or dh_<name> for a link of
-    a linkage. The label is <number> or <name>.
+    a linkage. The label is <number> or <name>. If a body has several such frames, the first one in this order is F.
 
     Raises:
         ArmError: The SDF has no numbered frames with the prefix `frames`.
     """
-    bodies = {}
+    found = {}
     for index in plant.GetFrameIndices(arm_instance(plant)):
         frame = plant.get_frame(index)
         prefix, _, label = frame.name().partition("_")
         if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
-            bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
-    if not any(label.isdigit() for label in bodies):
+            found[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
+    if not any(label.isdigit() for label in found):
         raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; use the prefix "dh"')
-    return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
+    bodies: dict[str, tuple[RigidBody, RigidTransform]] = {}
+    for label in sorted(found, key=lambda label: (not label.isdigit(), int(label) if label.isdigit() else 0, label)):
+        if all(found[label][0] != body for body, _ in bodies.values()):
+            bodies[label] = found[label]
+    return bodies
 
 
 def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:

@@ -8,9 +8,11 @@ from dvrk_drake.dynamics import gravity_parameters as numeric
 from dvrk_drake.dynamics.base_parameters import independent_columns, reduce_to_base
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
+from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.plant import shared_plant
+from dvrk_drake.models.plant import holding_torques, shared_plant
 
 pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
 
@@ -25,9 +27,9 @@ UR_LIKE = [
 ]
 
 
-@pytest.fixture(scope="module")
-def ur_like(tmp_path_factory):
-    folder, place = tmp_path_factory.mktemp("ur"), np.zeros(3)
+def load_ur_like(folder, additional=""):
+    """Loads the UR-like arm, whose SDF has additional elements."""
+    place = np.zeros(3)
     parts = ['<link name="base_link"/><frame name="dh_0" attached_to="base_link"/>']
     for i, (name, offset, axis) in enumerate(UR_LIKE, start=1):
         place = place + offset
@@ -39,7 +41,7 @@ def ur_like(tmp_path_factory):
             f"<parent>{parent}</parent><child>{name}_link</child><axis><xyz>{axis}</xyz><limit><lower>-3</lower>"
             "<upper>3</upper><effort>100</effort></limit></axis></joint>"
         )
-    (folder / "arm.sdf").write_text(f'<sdf version="1.9"><model name="ur">{"".join(parts)}</model></sdf>')
+    (folder / "arm.sdf").write_text(f'<sdf version="1.9" xmlns:drake="http://drake.mit.edu"><model name="ur">{"".join(parts)}{additional}</model></sdf>')
     names, ones = [name for name, _, _ in UR_LIKE], [1.0] * len(UR_LIKE)
     (folder / "mechanism.yaml").write_text(
         f"sdf: arm.sdf\njoints: {names}\ngains: {{kp: {ones}, kd: {ones}, ki: {ones}}}\n"
@@ -48,6 +50,21 @@ def ur_like(tmp_path_factory):
     limits = ", ".join(f"{name}: [-3, 3]" for name in names)
     (folder / "arm.yaml").write_text(f"name: UR\nmechanism: mechanism.yaml\nposition_limits: {{{limits}}}\n")
     return load_arm(folder / "arm.yaml")
+
+
+@pytest.fixture(scope="module")
+def ur_like(tmp_path_factory):
+    return load_ur_like(tmp_path_factory.mktemp("ur"))
+
+
+def moving_link(name, parent, centre_of_mass):
+    """Returns a link without a DH frame, which a dependent joint rotates about y."""
+    return (
+        f'<link name="{name}"><inertial><pose>{centre_of_mass} 0 0 0 0 0</pose><mass>2</mass><inertia><ixx>0.1</ixx>'
+        f'<iyy>0.1</iyy><izz>0.1</izz></inertia></inertial></link><joint name="{name}_joint" type="revolute"><parent>'
+        f"{parent}</parent><child>{name}</child><axis><xyz>0 1 0</xyz></axis>"
+        '<drake:mimic joint="lift" multiplier="2" offset="0"/></joint>'
+    )
 
 
 @pytest.fixture(scope="module", params=["mtmr", "psm", "mtmr tilted", "ur"])
@@ -96,3 +113,30 @@ def test_columns_are_combinations_of_independent_columns():
     assert len(columns) == 5 and 3 not in columns and list(columns) == sorted(columns)
     np.testing.assert_allclose(Y[:, columns] @ B, Y, atol=1e-10)
     np.testing.assert_allclose(B[:, columns], np.eye(5), atol=1e-12)
+
+
+def test_link_with_several_frames_is_counted_once(tmp_path):
+    frames = "".join(f'<frame name="dh_{label}" attached_to="wrist_3_link"/>' for label in ("7", "tool"))
+    arm = load_ur_like(tmp_path, frames)
+    q = arm.sample_poses(20, np.random.default_rng(1))
+    tau = IdentifiedModel.from_arm(arm).holding_torque(q)
+    np.testing.assert_allclose(tau, holding_torques(arm, q), rtol=0, atol=1e-12 * np.abs(tau).max())
+
+
+@pytest.mark.parametrize(
+    ("links", "message"),
+    [
+        (
+            moving_link("rotor", "pan_link", 0) + moving_link("cover", "rotor", 0),
+            "link cover needs a frame dh_<name>, because rotor, which carries it, has no such frame",
+        ),
+        (
+            moving_link("lever", "base_link", 0.1),
+            r"UR: the gravity torque of lift differs by \d.* N m from Drake's for the same SDF",
+        ),
+    ],
+)
+def test_links_that_the_gravity_model_would_omit_are_refused(links, message, tmp_path):
+    arm = load_ur_like(tmp_path, links)
+    with pytest.raises(ArmError, match=message):
+        gravity_parameters(arm)
