@@ -94,19 +94,24 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
         base=reduce_to_base(regressor, parameters, order, lengths),
     )
     if not serial:
-        _check_torque(arm, size * regressor[:, result.base.columns] @ result.base_values, holding_torques(arm, poses))
+        tau = size * regressor[:, result.base.columns] @ result.base_values
+        _check_torque(arm, tau, holding_torques(arm, poses))
     return result
 
 
 def _check_torque(arm: Arm, tau: NDArray[np.float64], expected: NDArray[np.float64]) -> None:
-    """Raises ArmError if the torques of the base parameters (m n,) differ from those of Drake (m, n)."""
+    """Raises ArmError if the torques of the base parameters (m n,) differ from those of Drake (m, n).
+
+    A check of the arm's structure would repeat the assumptions of this module about frames and rotors.
+    """
     difference = np.abs(tau.reshape(expected.shape) - expected).max(axis=0)
     # Sums of some hundred terms, each with a relative rounding error of 2e-16, differ by less than 1e-12.
     if np.any(difference > 1e-12 * (1.0 + np.abs(expected).max())):
         j = int(np.argmax(difference))
+        unit = "N" if arm.prismatic[j] else "N m"
         raise ArmError(
-            f"{arm.name}: the gravity torque of {arm.joint_names[j]} differs by {difference[j]:.3g} "
-            f"{'N' if arm.prismatic[j] else 'N m'} from Drake's for the same SDF. Give each moving link one frame dh_<name>"
+            f"{arm.name}: the gravity torque of {arm.joint_names[j]} differs by {difference[j]:.3g} {unit} from "
+            "Drake's for the same SDF. Give each moving link a frame dh_<name>"
         )
 
 
@@ -152,10 +157,10 @@ def _to_standard(
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(arm_instance(plant))]
     rotors = rotor_links(arm)
     for joint in joints:
-        if {joint.parent_body().name(), joint.child_body().name()} <= rotors:
+        carrier, link = joint.parent_body().name(), joint.child_body().name()
+        if {carrier, link} <= rotors:
             raise ArmError(
-                f"link {joint.child_body().name()} needs a frame dh_<name>, because {joint.parent_body().name()}, which "
-                "carries it, has no such frame"
+                f"link {link} needs a frame dh_<name>, because {carrier}, which carries it, has no such frame"
             )
     rows = np.zeros((len(bodies), 4, len(order), 10))
     for row, (body, X_BF) in zip(rows, bodies, strict=True):

@@ -137,8 +137,8 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     Args:
         model: Model of a PSM.
         tolerance: Largest accepted difference between the torques of the file and of the model on any joint [N m, N].
-            Joint effects, feedforward scales below 1 and a sideways tilt of the base cause differences. None: the dry friction of each joint, see
-            `gravity_compensation_loss.accepted_differences`.
+            Joint effects, feedforward scales below 1 and a sideways tilt of the base cause differences. None: the dry
+            friction of each joint, see `gravity_compensation_loss.accepted_differences`.
 
     Raises:
         ModelError: The model is not of a PSM, the net mass on the insertion joint is negative and its weight exceeds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,7 @@ from dvrk_drake.models.arm_schema import (
 )
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
+from dvrk_drake.models.immutable import cached, immutable
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.locked_joints import lock_joints, locked_text
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
@@ -39,7 +40,7 @@ _MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """One arm of a dVRK.
+    """One arm of a dVRK. Arms and all their parts are immutable; `dataclasses.replace` returns a modified arm.
 
     Vectors have n elements, one per independent joint, in the dVRK's order. Units are rad and N m for revolute joints,
     m and N for prismatic joints.
@@ -108,23 +109,14 @@ class Arm:
     view: ViewSettings = field(default_factory=ViewSettings)
 
     def __post_init__(self) -> None:
-        self.check()
+        for part in dataclasses.fields(self):
+            object.__setattr__(self, part.name, immutable(getattr(self, part.name)))
+        if fault := next(filter(None, self._faults()), ""):
+            raise ArmError(fault)
 
     def __repr__(self) -> str:
         locked = f", locked {locked_text(self)}" if self.locked_joints else ""
         return f"<Arm {self.name}: {self.source}{locked}>"
-
-    def check(self) -> None:
-        """Checks the range of all numbers, the order of the limits and the number of elements of each vector.
-
-        Arrays and gains can be modified after loading, so the command guard and the controller repeat this check.
-
-        Raises:
-            ArmError: A number or the length of a vector is not accepted. The message names the first fault and the
-                accepted values.
-        """
-        if fault := next(filter(None, self._faults()), ""):
-            raise ArmError(fault)
 
     def gains_fault(self, gains: Gains) -> str:
         """Returns a message that names the first invalid gain and its accepted values, or "" if all gains are accepted.
@@ -293,7 +285,7 @@ class Arm:
             )
 
 
-@cache
+@cached
 def _mounted(arm: Arm, gravity: tuple[float, ...]) -> Arm:
     """Returns the arm with another gravity vector. Calls with equal arguments return the same Arm object."""
     if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):

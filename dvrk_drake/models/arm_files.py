@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,6 +23,7 @@ from dvrk_drake.models.arm_schema import (
     ViewSettings,
 )
 from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.schema_fault import suggest_name
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
@@ -40,7 +40,7 @@ def known_arms() -> list[str]:
 
 
 def load_arm(name: str | Path) -> Arm:
-    """Loads an arm. Repeated calls return the same Arm object until the file changes.
+    """Loads an arm. Repeated calls, also from other threads, return the same immutable object until the file changes.
 
     Changes of the other files of the arm (mechanism, instrument, SDF) take effect only in a new process.
 
@@ -78,7 +78,7 @@ def load_arm(name: str | Path) -> Arm:
     return _load_arm(str(path))
 
 
-@cache
+@cached
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     """Loads an arm by name or absolute path. `state` (time of change, size) is the version of the YAML file."""
     path = Path(name)

@@ -10,6 +10,7 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.immutable import Shared
 from dvrk_drake.models.schema_fault import Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
@@ -35,7 +36,7 @@ _CUT_OFFS = within(0.1, 1000.0, "Hz")
 
 
 @dataclass
-class CoupledLimit:
+class CoupledLimit(Shared):
     """Limit lower <= sum of coefficient * joint position <= upper; `name` is used in messages."""
 
     name: str = ""
@@ -45,7 +46,7 @@ class CoupledLimit:
 
 
 @dataclass
-class LoopClosure:
+class LoopClosure(Shared):
     """Two SDF frames whose origins coincide at every pose that the linkage permits."""
 
     frame_a: str = ""
@@ -53,7 +54,7 @@ class LoopClosure:
 
 
 @dataclass
-class Gains:
+class Gains(Shared):
     """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N/m, N s/m, N/(m s) if prismatic.
 
     The ranges in this class apply to all arms. `Arm.gains_fault` checks the narrower ranges of one arm.
@@ -65,7 +66,7 @@ class Gains:
 
 
 @dataclass
-class MotionSettings:
+class MotionSettings(Shared):
     """Settings for processing a recorded motion. Lists have one element per joint of the mechanism or instrument.
 
     Attributes:
@@ -91,7 +92,7 @@ class MotionSettings:
 
 
 @dataclass
-class BoxCorners:
+class BoxCorners(Shared):
     """Axis-aligned box in a link frame, given by its lower and upper corners (3,) [m]."""
 
     lower: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
@@ -99,7 +100,7 @@ class BoxCorners:
 
 
 @dataclass
-class BoundingShapes:
+class BoundingShapes(Shared):
     """Bounds of the mass distribution of the links of one SDF file.
 
     The bound of a link is the box around its collision shapes, enlarged by `margin` [m] on all sides. The margin is for
@@ -126,7 +127,7 @@ class IdentificationSettings(MotionSettings):
 
 
 @dataclass
-class ViewSettings:
+class ViewSettings(Shared):
     """Parts of an arm that a 3D view shows, besides its links.
 
     Attributes:
@@ -240,4 +241,4 @@ def save_gains(gains: Gains, path: str | Path, remark: str) -> None:
     """
     with atomic_write(path) as stream:
         stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m for a prismatic joint.\n")
-        stream.write(yaml_dump(dataclasses.asdict(gains)))
+        stream.write(yaml_dump({name: list(values) for name, values in vars(gains).items()}))

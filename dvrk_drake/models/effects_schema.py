@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError
+from dvrk_drake.models.immutable import Shared
 from dvrk_drake.models.schema_fault import formerly, number_fault, within
 
 #: Accepted quantization steps and noise of efforts. One bit of a dVRK wrist motor is 1e-5 N m.
@@ -17,7 +18,7 @@ _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
 
 
 @dataclass
-class DriveEffect:
+class DriveEffect(Shared):
     """One effect along a coordinate of the drive. It is defined in an arm file or identified from a recording.
 
     Attributes:
@@ -55,7 +56,7 @@ class FrictionEffect(DriveEffect):
 
 
 @dataclass
-class Cable:
+class Cable(Shared):
     """Elastic cable between the motor and the joint of an actuator that drives only this joint.
 
     The units are N m/rad and N m s/rad, or N/m and N s/m for a prismatic actuator.
@@ -66,7 +67,7 @@ class Cable:
 
 
 @dataclass
-class EncoderEffect:
+class EncoderEffect(Shared):
     """Quantization of positions, and low-pass filter of velocities.
 
     `resolution` maps an actuator to the size of one count [rad, m]. The positions of actuators without an entry are
@@ -79,7 +80,7 @@ class EncoderEffect:
 
 
 @dataclass
-class EffortEffect:
+class EffortEffect(Shared):
     """Quantization and noise of the motor currents, as efforts of the actuators [N m, N].
 
     Each attribute maps an actuator to a value. The efforts of actuators without an entry are exact.
@@ -93,7 +94,7 @@ class EffortEffect:
 
 
 @dataclass
-class DelayEffect:
+class DelayEffect(Shared):
     """Delays in time steps of the plant: from the arm to the measurement, and from the command to the motors."""
 
     measurement: int = field(default=0, metadata=within(0, 100, "time steps"))
@@ -101,7 +102,7 @@ class DelayEffect:
 
 
 @dataclass
-class ArmEffects:
+class ArmEffects(Shared):
     """Effects of a real arm. Each field is an effect group that a simulation can include by name.
 
     Attributes:

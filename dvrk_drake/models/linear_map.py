@@ -8,12 +8,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dvrk_drake.models.immutable import immutable
 from dvrk_drake.models.schema_fault import within
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """Affine map y = matrix x + offset of positions, with the corresponding maps of velocities and efforts.
+    """Immutable affine map y = matrix x + offset of positions, with the corresponding maps of velocities and efforts.
 
     Attributes:
         matrix: Constant matrix (m, n).
@@ -22,6 +23,10 @@ class LinearMap:
 
     matrix: NDArray[np.float64] = field(metadata=within(-1e4, 1e4))
     offset: NDArray[np.float64] = field(metadata=within(-100.0, 100.0, "rad or m"))
+
+    def __post_init__(self) -> None:
+        for name in ("matrix", "offset"):
+            object.__setattr__(self, name, immutable(getattr(self, name)))
 
     def position(self, x: ArrayLike) -> NDArray[np.float64]:
         """Returns y = matrix x + offset for x of shape (n,) or (samples, n)."""

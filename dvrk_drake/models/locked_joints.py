@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import ArmError, RecordingError
 from dvrk_drake.models.arm_schema import CoupledLimit, Gains
 from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.schema_fault import suggest_name
 
@@ -100,7 +100,7 @@ def check_held(where: str, names: Sequence[str], q: NDArray[np.float64], arm: Ar
                 )
 
 
-@cache
+@cached
 def _locked(arm: Arm, positions: tuple[tuple[str, float], ...]) -> Arm:
     """Returns the arm with locked joints. Calls with equal arguments return the same Arm object."""
     if not positions:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from functools import cache
 from typing import get_args
 
 import numpy as np
@@ -17,6 +16,7 @@ from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
@@ -113,7 +113,7 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
     return plant
 
 
-@cache
+@cached
 def shared_plant(arm: Arm) -> MultibodyPlant:
     """Returns the finalized plant of an arm, which is created once per Arm object. Do not modify the plant."""
     return make_arm_plant(arm)

@@ -41,7 +41,8 @@ def load_ur_like(folder, additional=""):
             f"<parent>{parent}</parent><child>{name}_link</child><axis><xyz>{axis}</xyz><limit><lower>-3</lower>"
             "<upper>3</upper><effort>100</effort></limit></axis></joint>"
         )
-    (folder / "arm.sdf").write_text(f'<sdf version="1.9" xmlns:drake="http://drake.mit.edu"><model name="ur">{"".join(parts)}{additional}</model></sdf>')
+    model = f'<model name="ur">{"".join(parts)}{additional}</model>'
+    (folder / "arm.sdf").write_text(f'<sdf version="1.9" xmlns:drake="http://drake.mit.edu">{model}</sdf>')
     names, ones = [name for name, _, _ in UR_LIKE], [1.0] * len(UR_LIKE)
     (folder / "mechanism.yaml").write_text(
         f"sdf: arm.sdf\njoints: {names}\ngains: {{kp: {ones}, kd: {ones}, ki: {ones}}}\n"

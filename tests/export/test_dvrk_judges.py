@@ -186,8 +186,15 @@ def test_file_of_a_psm(recording, insertion, shared_data, tmp_path):
     np.testing.assert_allclose(actual, torque, rtol=0, atol=1e-12 if is_exact else 0.01)
 
 
+def test_torques_of_a_file_of_version_1_equal_those_of_the_controller_at_rest(shared_data):
+    path = shared_data / "cases" / "gc-v1.json"
+    q, _ = poses_and_velocities(load_arm("mtmr"), 100)
+    actual = judge(shared_data, "judge", path, np.hstack([q, 0 * q]))
+    np.testing.assert_allclose(controller_torque(GravityCompensationFile.load(path), q), actual, rtol=0, atol=1e-12)
+
+
 def test_file_of_a_tilted_psm(shared_data, tmp_path):
-    """The controller's program assumes an upright base, so the tilt of the base is added to the first joint of the file."""
+    """The program of the controller has an upright base, so the test adds the tilt to the first joint of the file."""
     model = IdentifiedModel.from_arm(load_arm("psm").with_gravity([0.0, 6.9367, -6.9367]))
     file = kinematic_compensation(model)
     path = tmp_path / "psm.json"

@@ -343,6 +343,44 @@ def test_invalid_file_is_rejected_in_one_line(change, message, tmp_path, capsys)
     assert message in error and str(path) in error
 
 
+def as_version_1(path, version, **changes):
+    """Rewrites a gravity-compensation file in version 1, which has one speed per joint instead of the friction rule."""
+    content = json.loads(path.read_text())
+    controller = content["GC_controller"]
+    for key in ("db_vel_vec", "sat_vec_vec", "fric_comp_ratio_vec"):
+        del controller[key]
+    content["GC_controller"] = {**controller, "beta_vel_amplitude": [2.0] * 7, **changes}
+    path.write_text(json.dumps({**content, "version": version}))
+
+
+@pytest.mark.parametrize("version", ["1.0", "1", 1.0])
+def test_file_of_version_1_has_the_same_torque_at_rest(version, tmp_path):
+    path, model = tmp_path / "gc.json", balanced()
+    compensation_from_model(model, CompensationOptions(coulomb=(0.05,) * 7)).save(path, "MTML", "test")
+    q = model.arm.sample_poses(5, np.random.default_rng(2))
+    expected = controller_torque(GravityCompensationFile.load(path), q)
+    as_version_1(path, version)
+    np.testing.assert_allclose(controller_torque(GravityCompensationFile.load(path), q), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("version", "changes", "message"),
+    [
+        ("1.0", {"beta_vel_amplitude": [0.0] * 7}, r"beta_vel_amplitude must be 7 positive numbers \[rad/s\]"),
+        ("1.0", {"safe_upper_torque_limit": [1.0]}, "safe_upper_torque_limit must be 7 finite numbers"),
+        ("3.0", {}, """version is '3.0'; allowed: "1.0", "2.0\""""),
+        ("new", {}, "version is 'new'; allowed: "),
+        (None, {}, "version is None; allowed: "),
+    ],
+)
+def test_invalid_file_of_version_1_is_refused(version, changes, message, tmp_path):
+    path = tmp_path / "gc.json"
+    compensation_from_model(balanced()).save(path, "MTML", "test")
+    as_version_1(path, version, **changes)
+    with pytest.raises(ModelError, match=message):
+        GravityCompensationFile.load(path)
+
+
 def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path, monkeypatch):
     model = balanced()
     file = compensation_from_model(model)

@@ -1,6 +1,8 @@
 """Arms with locked joints: identities with the full arm, and refusals."""
 
 import dataclasses
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, shared_plant
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.arm_station import ArmStation, station_ports
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
@@ -189,3 +193,42 @@ def controller(arm):
 def test_stations_and_controllers_require_all_joints(create):
     with pytest.raises(ArmError, match=r"PSM has locked joints \(roll = 0.4, .*\), but a .* requires all joints"):
         create(load_arm("psm").with_locked_joints(WRIST))
+
+
+def test_an_arm_and_its_parts_cannot_be_modified():
+    arm = load_arm("psm").with_locked_joints({"roll": 0})
+    for change in (
+        lambda: setattr(arm, "name", "other"),
+        lambda: setattr(arm.gains, "kp", [1.0]),
+        lambda: arm.gains.kp.__setitem__(0, 1.0),
+        lambda: arm.gains.kp.append(1.0),
+        lambda: arm.position_lower.__setitem__(0, 1.0),
+        lambda: arm.linkage.matrix.__setitem__((0, 0), 1.0),
+        arm.friction_coordinates.clear,
+        arm.effects.friction.pop,
+        lambda: setattr(arm.effects.friction[0], "coefficient", 0.0),
+        lambda: arm.effects.encoder.resolution.update(yaw=1.0),
+        lambda: setattr(arm.identification, "base_may_tilt", True),
+        lambda: arm.locked_joints.update(yaw=0.0),
+    ):
+        with pytest.raises((ArmError, AttributeError, ValueError)):
+            change()
+    gains = Gains(*([1.1 * x for x in values] for values in vars(arm.gains).values()))
+    assert dataclasses.replace(arm, gains=gains).gains == gains
+    gains.kp[0] = 2.0  # The arm has a copy.
+
+
+def test_threads_get_the_same_arm(tmp_path):
+    """The threads request an arm file that was not loaded before, its tilted arm, its locked arm and its plant."""
+    (tmp_path / "arm.yaml").write_text((MODELS_FOLDER / "arms" / "psm.yaml").read_text())
+    start = threading.Barrier(4)
+
+    def load(_):
+        start.wait()
+        arm = load_arm(tmp_path / "arm.yaml")
+        locked = arm.with_gravity([0, -1, -9.7]).with_locked_joints({"roll": 0})
+        return arm, locked, shared_plant(locked)
+
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(load, range(4)))
+    assert all(a is b for result in results for a, b in zip(result, results[0], strict=True))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.soft_walls import SoftWalls
 from dvrk_drake.systems.guard.settings import GuardSettings
@@ -66,16 +65,8 @@ class GuardLimits:
     """
 
     def __init__(self, arm: Arm, settings: GuardSettings) -> None:
-        """Creates the limits of `arm`.
-
-        Raises:
-            StationError: A number of the arm is not finite or out of range; see `Arm.check`.
-        """
+        """Creates the limits of `arm`."""
         n = arm.num_joints
-        try:
-            arm.check()
-        except ArmError as error:
-            raise StationError(f"{arm.name}: {error}") from error
         self.effort_limits = np.array(arm.effort_limits)
         self.command_limits = settings.effort_fraction * self.effort_limits
         self.A, self.lower, self.upper = arm.limit_matrix()

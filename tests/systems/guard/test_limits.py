@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, N, Q
 
-from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_schema import CoupledLimit
@@ -49,14 +48,6 @@ def test_limits_follow_from_the_arm_and_the_settings():
     effort, _ = limits.follow_effort(LIMIT, FREE, 0.01)
     np.testing.assert_allclose(effort, 0.1 * LIMIT, atol=1e-12)
     assert limits.names == [*ARM.joint_names, "parallelogram"]
-
-
-@pytest.mark.parametrize("kp", [0.0, -1.0])
-def test_joint_without_gains_is_refused(kp):
-    arm = dataclasses.replace(ARM, gains=dataclasses.replace(ARM.gains, kp=list(ARM.gains.kp)))
-    arm.gains.kp[-1] = kp
-    with pytest.raises(StationError, match=r"MTML: gains\.kp\[6\] is .*; allowed: "):
-        GuardLimits(arm, GuardSettings())
 
 
 # Poses beyond the limits
