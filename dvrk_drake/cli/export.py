@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
@@ -37,6 +37,7 @@ def export(
     urdf: Annotated[str | None, Parameter(metavar="FILE.urdf")] = None,
     dvrk_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
     dvrk_kinematic_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
+    meshes: Literal["gltf", "obj"] = "gltf",
     diff: Annotated[bool, Parameter(show_default=False)] = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -56,6 +57,7 @@ def export(
         urdf: URDF file to write, with the inertias of the model. Joints of the linkage become mimic joints.
         dvrk_gc: Gravity-compensation file to write for an MTM, in the format of the dVRK controller.
         dvrk_kinematic_gc: Gravity-compensation file to write for a PSM, in the format of the dVRK controller.
+        meshes: Format of the meshes of the SDF and URDF. PyBullet and MuJoCo require obj.
         diff: Print the differences between the SDF of the arm and the exported SDF.
         gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: the dry
             friction of each joint, which holds a joint at rest despite such a difference.
@@ -93,6 +95,7 @@ def export(
         "friction_ratio": friction_ratio,
         "dead_band": dead_band,
         "saturation": saturation,
+        "meshes": meshes,
     }
     # All files are computed before the first file is written, so that an error leaves no partial output.
     origin = model or arm or ""
@@ -104,6 +107,9 @@ def export(
         if format != "urdf" or "sdf" not in outputs:  # both formats contain the same model
             print_export(make_console(), path, exports[format], verbose=verbose)
     for format, path in outputs.items():
+        if omitted := exports[format].omitted_shapes:
+            shapes = ", ".join(f"{shape} of {link}" for link, shape in omitted)
+            print(f"Omitted in {path}, because they touch shapes of other links: {shapes}")
         print_written(path)
         if format in ("sdf", "urdf"):
             print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")

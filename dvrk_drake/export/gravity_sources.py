@@ -79,7 +79,8 @@ def to_c(gravity: SymbolicGravity) -> str:
     The array `out` is row-major.
     """
     torque, regressor, arguments, beta_argument = _functions(gravity)
-    prefix = gravity.arm.name.lower()
+    prefix = re.sub(r"\W", "_", gravity.arm.name.lower(), flags=re.ASCII)
+    prefix = f"arm_{prefix}" if prefix[:1].isdigit() else prefix
     table = "\n".join(f" *   beta[{i}] = {v!r}: {name}" for i, (name, v) in enumerate(_named_values(gravity)))
     header = (
         f"/* {_title(gravity)}: holding torque, tau = Y(q) beta [N m; N if prismatic].\n"
@@ -120,7 +121,8 @@ def _title(gravity: SymbolicGravity) -> str:
     x, y, z = gravity.arm.gravity
     labels = {p.label for p in gravity.standard_parameters}
     serial = "" if any(not label.isdigit() for label in labels) else ", without the links of its linkage"
-    return f"{gravity.arm.name}{serial}, gravity ({x:g}, {y:g}, {z:g}) m/s^2 in its base frame"
+    name = re.sub(r"[^\w .-]", "_", gravity.arm.name)  # The name must not end the comment.
+    return f"{name}{serial}, gravity ({x:g}, {y:g}, {z:g}) m/s^2 in its base frame"
 
 
 def _functions(

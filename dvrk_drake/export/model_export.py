@@ -13,8 +13,8 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import KinematicCompensation, kinematic_compensation
-from dvrk_drake.export.sdf import refuse_existing_meshes, write_sdf
-from dvrk_drake.export.urdf import write_urdf
+from dvrk_drake.export.sdf import MeshFormat, refuse_existing_meshes, write_sdf
+from dvrk_drake.export.urdf import touching_shapes, write_urdf
 from dvrk_drake.models.files import refuse_existing
 
 Format = Literal["sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc"]
@@ -31,6 +31,7 @@ class ModelExport:
         bodies: Inertias of links and rotors in an SDF or URDF, and effects that this file omits. None for other
             formats.
         compensation: Content of a file for the dVRK's controller. None for SDF and URDF.
+        meshes: Format of the meshes of an SDF or URDF.
     """
 
     model: IdentifiedModel
@@ -38,6 +39,12 @@ class ModelExport:
     origin: str
     bodies: ModelBodies | None = None
     compensation: GravityCompensationFile | KinematicCompensation | None = None
+    meshes: MeshFormat = "gltf"
+
+    @property
+    def omitted_shapes(self) -> tuple[tuple[str, str], ...]:
+        """Links and names of the collision shapes that the file omits, see `touching_shapes`."""
+        return touching_shapes(self.model.arm) if self.format == "urdf" else ()
 
     def write(self, path: str | Path) -> None:
         """Writes the file atomically and replaces an existing file.
@@ -52,7 +59,7 @@ class ModelExport:
         arm = self.model.arm
         if self.bodies is not None:
             write = write_sdf if self.format == "sdf" else write_urdf
-            write(arm, self.bodies.links, path, self.origin, self.bodies.rotors)
+            write(arm, self.bodies.links, path, self.origin, self.bodies.rotors, self.meshes)
         elif isinstance(self.compensation, GravityCompensationFile):
             self.compensation.save(path, arm.name, f"dvrk-drake export of {self.origin}")
         elif self.compensation is not None:
@@ -69,15 +76,18 @@ def prepare_export(
     friction_ratio: Sequence[float] | None = None,
     dead_band: Sequence[float] | None = None,
     saturation: Sequence[float] | None = None,
+    meshes: MeshFormat = "gltf",
 ) -> ModelExport:
     """Returns the content that `export_model` writes. See `export_model` for arguments and errors."""
     origin = origin or f"a model of {model.arm.name}"
     if format not in get_args(Format):
         raise ModelError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
+    if meshes not in get_args(MeshFormat):
+        raise ModelError(f'unknown format of meshes "{meshes}"; allowed: {", ".join(get_args(MeshFormat))}')
     if format != "dvrk-kinematic-gc":  # this file contains only yaw, pitch and insertion of a PSM
         model.arm.refuse_locked_joints(f"the format {format}")
     if format in ("sdf", "urdf"):
-        return ModelExport(model, format, origin, bodies=model_bodies(model))
+        return ModelExport(model, format, origin, bodies=model_bodies(model), meshes=meshes)
     if format == "dvrk-kinematic-gc":
         file = kinematic_compensation(model, tolerance)
         return ModelExport(model, format, origin, compensation=file)
@@ -104,6 +114,7 @@ def export_model(
     friction_ratio: Sequence[float] | None = None,
     dead_band: Sequence[float] | None = None,
     saturation: Sequence[float] | None = None,
+    meshes: MeshFormat = "gltf",
     overwrite: bool = False,
 ) -> ModelExport:
     """Writes a model to a file for another program, as `dvrk-drake export` does.
@@ -124,6 +135,8 @@ def export_model(
         dead_band: Speeds (7,) [rad/s] below which no friction is compensated, for "dvrk-gc". None uses typical values.
         saturation: Speeds (7,) [rad/s] above which the full share `friction_ratio` of the friction is compensated, for
             "dvrk-gc". None uses typical values.
+        meshes: Format of the meshes of an SDF or URDF: "gltf" keeps the meshes of the arm. "obj" converts them for
+            programs that do not read glTF, such as PyBullet and MuJoCo.
         overwrite: Whether to replace existing files.
 
     Returns:
@@ -157,6 +170,7 @@ def export_model(
         friction_ratio=friction_ratio,
         dead_band=dead_band,
         saturation=saturation,
+        meshes=meshes,
     )
     export.write(path)
     return export

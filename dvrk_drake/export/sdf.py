@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
+from dvrk_drake.export.gltf import to_obj
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
 from dvrk_drake.models.sdf_model import DRAKE, PACKAGE_URL, compose_sdf, local_path
 
 #: Relative change of a parameter below which a link counts as unchanged.
 _UNCHANGED = 1e-12
+#: Format of exported meshes. Only meshes in glTF format are converted to OBJ.
+MeshFormat = Literal["gltf", "obj"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +93,7 @@ def write_sdf(
     path: str | Path,
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
+    meshes: MeshFormat = "gltf",
 ) -> None:
     """Writes the SDF of `with_inertias` atomically, and copies its meshes into the folder <name>_meshes beside it.
 
@@ -95,6 +101,7 @@ def write_sdf(
         arm, links, rotor_inertias: Arguments of `with_inertias`.
         path: Path of the SDF.
         origin: Source of the inertias, written into a comment at the start of the file.
+        meshes: "obj" converts glTF meshes to OBJ, for programs that do not read glTF, such as PyBullet and MuJoCo.
 
     Raises:
         ModelError: An argument is invalid, see `with_inertias`.
@@ -102,7 +109,7 @@ def write_sdf(
     """
     target = Path(path)
     root = with_inertias(arm, links, rotor_inertias)
-    copies = redirect_meshes(root, target)
+    copies = redirect_meshes(root, target, meshes)
     copy_meshes(copies)
     with atomic_write(target) as stream:
         stream.write(to_text(root, f"{arm.name}, inertial parameters of {origin}. Written by dvrk-drake export."))
@@ -120,7 +127,8 @@ def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mappi
 def to_text(root: ElementTree.Element, comment: str = "") -> str:
     """Returns the indented XML text of a model."""
     ElementTree.indent(root)
-    head = '<?xml version="1.0"?>\n' + (f"<!-- {comment.replace('--', '- -')} -->\n" if comment else "")
+    comment = re.sub("-(?=-)", "- ", comment)  # XML does not allow -- in a comment.
+    head = '<?xml version="1.0"?>\n' + (f"<!-- {comment} -->\n" if comment else "")
     return head + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
@@ -195,7 +203,7 @@ def refuse_existing_meshes(model_path: str | Path, overwrite: bool) -> None:
         )
 
 
-def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, Path]:
+def redirect_meshes(root: ElementTree.Element, model_path: Path, meshes: MeshFormat = "gltf") -> dict[Path, Path]:
     """Replaces every mesh `<uri>` in a model by a path in `mesh_folder`, relative to the model file.
 
     URIs of other packages, and URIs that are not file paths, are not changed.
@@ -203,9 +211,11 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
     Args:
         root: Model from `with_inertias`, which is modified.
         model_path: Path of the file to which the model will be written.
+        meshes: Format of the copies of glTF files.
 
     Returns:
-        Mapping from the source to the target of each file to copy, including the files to which glTF files refer.
+        Mapping from the source to the target of each file to copy, including the files to which glTF files refer. A
+        target with another suffix than its source must be converted.
 
     Raises:
         ArmError: A mesh does not exist, or two meshes would have the same target.
@@ -218,20 +228,22 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
         if not os.path.isfile(source):
             raise ArmError(f"{source}: the mesh file does not exist")
         relative = Path(mesh_folder(model_path)) / source.parent.name / source.name
+        if meshes == "obj" and source.suffix in (".gltf", ".glb"):
+            relative = relative.with_suffix(".obj")
         target = model_path.parent / relative
         if copies.setdefault(source, target) != target or list(copies.values()).count(target) > 1:
             raise ArmError(
                 f"{source}: another mesh file of the model has the same file name, in a folder with the same name. "
                 "Rename one of the files"
             )
-        for file in _referenced_files(source):
+        for file in _referenced_files(source) if target.suffix == source.suffix else ():
             copies[source.parent / file] = target.parent / file
         uri.text = relative.as_posix()
     return copies
 
 
 def copy_meshes(copies: dict[Path, Path]) -> None:
-    """Copies each file atomically.
+    """Copies each file atomically, or converts it to OBJ if the target has this format.
 
     Args:
         copies: Mapping from source to target.
@@ -239,6 +251,7 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
     Raises:
         DvrkDrakeError: A file cannot be written.
     """
+    converted = {source: to_obj(source) for source, target in copies.items() if target.suffix != source.suffix}
     for source, target in copies.items():
         if str(source) == os.path.realpath(target):
             continue
@@ -246,6 +259,10 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DvrkDrakeError(f"{target.parent}: the folder cannot be created: {error.strerror}") from error
+        if source in converted:
+            with atomic_write(target) as text:
+                text.write(converted[source])
+            continue
         with open_input(source, ArmError) as stream, atomic_write(target, "wb") as copy:
             shutil.copyfileobj(stream, copy)
 

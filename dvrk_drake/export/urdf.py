@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
+import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
-from dvrk_drake.export.sdf import copy_meshes, redirect_meshes, to_text, with_inertias
+from dvrk_drake.export.sdf import MeshFormat, copy_meshes, redirect_meshes, to_text, with_inertias
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.plant import package_map, set_arm_positions
+from dvrk_drake.models.sdf_model import DRAKE, compose_sdf
 from dvrk_drake.models.urdf import to_urdf
+
+#: Number of random poses at which collision shapes are tested.
+_POSES = 500
+#: Enlargement of each shape on all sides [m], because shapes are closer at other poses than at the random poses.
+_MARGIN = 2.5e-3
 
 
 def write_urdf(
@@ -18,15 +33,17 @@ def write_urdf(
     path: str | Path,
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
+    meshes: MeshFormat = "gltf",
 ) -> None:
     """Writes the URDF atomically, and copies the meshes into the folder <name>_meshes beside the file.
 
     Dependent joints of the linkage become mimic joints, because URDF does not support closed loops. A capsule becomes a
     cylinder and two spheres, because URDF does not support capsules. Rotor inertias, gear ratios, named frames and
-    collision filters are written in Drake's extensions of URDF. Other programs ignore these extensions.
+    collision filters are written in Drake's extensions of URDF. Other programs ignore these extensions, so the URDF
+    does not contain `touching_shapes`.
 
     Args:
-        arm, links, path, origin, rotor_inertias: Arguments of `write_sdf`.
+        arm, links, path, origin, rotor_inertias, meshes: Arguments of `write_sdf`.
 
     Raises:
         ModelError: An inertia is not physically consistent, or URDF does not support a part of the SDF.
@@ -34,8 +51,71 @@ def write_urdf(
     """
     target = Path(path)
     root = with_inertias(arm, links, rotor_inertias)
-    copies = redirect_meshes(root, target)
+    for link in root.iterfind("model/link"):
+        for shape in link.findall("collision"):
+            if (link.get("name"), shape.get("name")) in touching_shapes(arm):
+                link.remove(shape)
+    copies = redirect_meshes(root, target, meshes)
     robot = to_urdf(root, arm)
     copy_meshes(copies)
     with atomic_write(target) as stream:
         stream.write(to_text(robot, f"{arm.name}, inertial parameters of {origin}. Written by dvrk-drake export."))
+
+
+@cache
+def touching_shapes(arm: Arm) -> tuple[tuple[str, str], ...]:
+    """Returns (link, collision shape) of the shapes that a URDF omits, so that no shapes of different links touch.
+
+    The SDF excludes contact between the links of an arm with collision filters. Other programs ignore these filters.
+    They exclude contact only between a moving link and the link that carries it. Pairs of enlarged shapes that touch at
+    random poses within the limits of the arm are removed by omitting the shape with the most contacts first.
+    """
+    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    (model,) = root.findall("model")
+    for group in model.findall(f"{DRAKE}collision_filter_group"):
+        model.remove(group)
+    for link in model.findall("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+        for element in link.iterfind("collision/geometry/*/*"):
+            if element.tag in ("radius", "length", "size"):
+                sides = 1 if element.tag == "radius" else 2
+                sizes = (float(x) + sides * _MARGIN for x in (element.text or "").split())
+                element.text = " ".join(map(str, sizes))
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    plant.set_adjacent_bodies_collision_filters(False)
+    parser = Parser(plant)
+    parser.package_map().AddMap(package_map())
+    parser.AddModelsFromString(ElementTree.tostring(root, encoding="unicode"), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
+    plant.Finalize()
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    carried = {frozenset((j.parent_body(), j.child_body())) for j in joints if not plant.IsAnchored(j.parent_body())}
+    diagram, inspector = builder.Build(), scene_graph.model_inspector()
+    context = diagram.CreateDefaultContext()
+    shapes = {
+        geometry: (plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)), inspector.GetName(geometry))
+        for geometry in inspector.GetAllGeometryIds()
+    }
+    touching: set[frozenset] = set()
+    for q in [
+        np.clip(0.0, arm.position_lower, arm.position_upper),
+        *arm.sample_poses(_POSES, np.random.default_rng(0)),
+    ]:
+        set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
+        query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+        pairs = [(p.id_A, p.id_B) for p in query.ComputePointPairPenetration()]
+        touching |= {
+            frozenset(pair)
+            for pair in pairs
+            if frozenset(bodies := [shapes[geometry][0] for geometry in pair]) not in carried and bodies[0] != bodies[1]
+        }
+    omitted = []
+    while touching:
+        counts = Counter(geometry for pair in touching for geometry in pair)
+        worst = max(counts, key=lambda geometry: (counts[geometry], shapes[geometry][1]))
+        touching = {pair for pair in touching if worst not in pair}
+        body, name = shapes[worst]
+        omitted.append((body.name(), name.removeprefix(f"{model.get('name')}::")))
+    return tuple(omitted)

@@ -220,7 +220,9 @@ def _numbers_of(where: str, name: str, text: str, element: ElementTree.Element) 
     values = [_number(word) for word in text.split()]
     allowed = [_RANGES[name]] * len(values)
     if name == "pose":
-        allowed[3:] = [_POSE_DEGREES if element.get("degrees") in ("true", "1") else _POSE_ANGLES] * len(values[3:])
+        allowed[3:] = [_POSE_DEGREES if element.get("degrees", "").lower() in ("true", "1") else _POSE_ANGLES] * len(
+            values[3:]
+        )
     are_numbers = all(math.isfinite(v) or v in a for v, a in zip(values, allowed, strict=True))
     if len(values) not in counts or not are_numbers:
         number = "a finite number" if counts == (1,) else f"{counts[0]} finite numbers"

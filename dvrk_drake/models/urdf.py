@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 
 import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.errors import ModelError
@@ -14,6 +15,9 @@ from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, read_sdf_facts
 
 #: Speed limit of joints for which the SDF has no speed limit [rad/s, m/s]. URDF requires a speed limit.
 NO_SPEED_LIMIT = "1000"
+#: Inertia of a link without `<inertial>`, which only the fixed base may be: a sphere of 1 kg with a radius of 0.1 m.
+#: libsdformat removes a link without mass from a URDF, and all links that it carries.
+_BASE_MASS, _BASE_MOMENT = "1", "0.004"
 
 
 def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
@@ -21,7 +25,7 @@ def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
 
     Dependent joints of the linkage become mimic joints, because URDF does not support closed loops. A capsule becomes a
     cylinder and two spheres, because URDF does not support capsules. Rotor inertias, gear ratios, named frames and
-    collision filters are written in Drake's extensions of URDF.
+    collision filters are written in Drake's extensions of URDF. A link without `<inertial>` gets a mass.
 
     Raises:
         ModelError: URDF does not support a part of the SDF, such as a `<pose>` in a joint, a joint spring or an
@@ -43,9 +47,11 @@ def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
         if facts.effort_limits.get(joint.get("name", ""), 0.0) > 0:
             _add_transmission(robot, joint)
     for frame in model.findall("frame"):
+        if (link := frame.get("attached_to", "")) not in X_ML:
+            raise ModelError(f"frame {frame.get('name')} is attached to {link!r}; URDF supports only frames of links")
         X_LF = _pose(frame)
         xyz, rpy = _xyz_rpy(X_LF)
-        attributes = {"name": frame.get("name", ""), "link": frame.get("attached_to", ""), "xyz": xyz, "rpy": rpy}
+        attributes = {"name": frame.get("name", ""), "link": link, "xyz": xyz, "rpy": rpy}
         ElementTree.SubElement(robot, "frame", attributes)
     for group in model.findall(f"{DRAKE}collision_filter_group"):
         _add_filter_group(robot, group)
@@ -55,12 +61,16 @@ def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
 def _add_link(robot: ElementTree.Element, name: str, link: ElementTree.Element) -> None:
     out = ElementTree.SubElement(robot, "link", name=name)
     inertial = link.find("inertial")
+    element = ElementTree.SubElement(out, "inertial")
+    mass, moments = _BASE_MASS, {tag: _BASE_MOMENT for tag in ("ixx", "iyy", "izz")}
+    products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
     if inertial is not None:
-        element = ElementTree.SubElement(out, "inertial")
         _add_origin(element, _pose(inertial))
-        ElementTree.SubElement(element, "mass", value=_text(inertial, "mass"))
-        moments = {tag: _text(inertial, f"inertia/{tag}") for tag in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
-        ElementTree.SubElement(element, "inertia", moments)
+        mass = _text(inertial, "mass")
+        moments = {tag: _text(inertial, f"inertia/{tag}") for tag in moments}
+        products = {tag: inertial.findtext(f"inertia/{tag}", "0") for tag in products}
+    ElementTree.SubElement(element, "mass", value=mass)
+    ElementTree.SubElement(element, "inertia", moments | products)
     for kind in ("visual", "collision"):
         for shape in link.findall(kind):
             _add_shape(out, kind, name, shape)
@@ -119,7 +129,7 @@ def _add_joint(
     _add_origin(out, X_ML[parent].inverse() @ X_ML[child])
     if kind == "fixed":
         return
-    ElementTree.SubElement(out, "axis", xyz=_text(joint, "axis/xyz"))
+    ElementTree.SubElement(out, "axis", xyz=_axis(joint, child, X_ML))
     lower, upper = ranges.get(name, (0.0, 0.0))
     if name in facts.mimics:
         leader, multiplier, offset = facts.mimics[name]
@@ -156,18 +166,39 @@ def _add_filter_group(robot: ElementTree.Element, group: ElementTree.Element) ->
         ElementTree.SubElement(out, f"{DRAKE}ignored_collision_filter_group", name=ignored.text or "")
 
 
+def _axis(joint: ElementTree.Element, child: str, X_ML: Mapping[str, RigidTransform]) -> str:
+    """Returns the axis of a joint, expressed in the frame of its child link."""
+    text, xyz = _text(joint, "axis/xyz"), joint.find("axis/xyz")
+    frame = "" if xyz is None else xyz.get("expressed_in", "")
+    if frame in ("", child, joint.get("name")):
+        return text
+    if frame != "__model__" and frame not in X_ML:
+        raise ModelError(
+            f"joint {joint.get('name')}: <xyz expressed_in> is {frame!r}; URDF export supports links and __model__"
+        )
+    X_MF = RigidTransform() if frame == "__model__" else X_ML[frame]
+    axis = X_ML[child].rotation().inverse() @ X_MF.rotation() @ np.array(text.split(), dtype=np.float64)
+    return " ".join(repr(float(x) + 0.0) for x in axis)
+
+
 def _pose(element: ElementTree.Element) -> RigidTransform:
     """Returns the pose of an element, which is the identity if the element has no `<pose>`."""
     pose = element.find("pose")
     if pose is None or not (pose.text or "").strip():
         return RigidTransform()
+    name, is_euler = element.get("name"), pose.get("rotation_format", "euler_rpy") == "euler_rpy"
     if pose.get("relative_to"):
-        raise ModelError(f"{element.get('name')}: URDF does not support <pose relative_to>; remove relative_to")
-    x, y, z, roll, pitch, yaw = map(float, (pose.text or "").split())
-    angles = np.array([roll, pitch, yaw])
-    if pose.get("degrees") == "true":
-        angles = np.deg2rad(angles)
-    return RigidTransform(RollPitchYaw(angles), np.array([x, y, z]))
+        raise ModelError(f"{name}: URDF does not support <pose relative_to>; remove relative_to")
+    numbers = np.array((pose.text or "").split(), dtype=np.float64)
+    if len(numbers) != (6 if is_euler else 7):
+        raise ModelError(f"{name}: <pose> has {len(numbers)} numbers; allowed: {6 if is_euler else 7}")
+    p, angles = numbers[:3], numbers[3:]
+    if not is_euler:
+        x, y, z, w = angles / np.linalg.norm(angles)
+        return RigidTransform(Quaternion(w, x, y, z), p)
+    return RigidTransform(
+        RollPitchYaw(np.deg2rad(angles) if pose.get("degrees", "").lower() in ("true", "1") else angles), p
+    )
 
 
 def _add_origin(element: ElementTree.Element, X: RigidTransform) -> None:
