@@ -79,8 +79,7 @@ def to_c(gravity: SymbolicGravity) -> str:
     The array `out` is row-major.
     """
     torque, regressor, arguments, beta_argument = _functions(gravity)
-    prefix = re.sub(r"\W", "_", gravity.arm.name.lower(), flags=re.ASCII)
-    prefix = f"arm_{prefix}" if prefix[:1].isdigit() else prefix
+    prefix = c_identifier(gravity.arm.name)
     table = "\n".join(f" *   beta[{i}] = {v!r}: {name}" for i, (name, v) in enumerate(_named_values(gravity)))
     header = (
         f"/* {_title(gravity)}: holding torque, tau = Y(q) beta [N m; N if prismatic].\n"
@@ -91,6 +90,12 @@ def to_c(gravity: SymbolicGravity) -> str:
     body = c_source(f"{prefix}_gravity_torque", [*arguments, beta_argument], torque)
     body += "\n" + c_source(f"{prefix}_gravity_regressor", arguments, regressor).replace("#include <math.h>\n\n", "")
     return header + body
+
+
+def c_identifier(name: str) -> str:
+    """Returns the name of an arm as an identifier of C, in lower case."""
+    identifier = re.sub(r"\W", "_", name.lower(), flags=re.ASCII)
+    return identifier if re.match("[a-z]", identifier) else f"arm_{identifier}"
 
 
 def c_source(

@@ -1,10 +1,14 @@
 """Tests that exported SDF and URDF files have the given inertial parameters and equations of motion."""
 
+import base64
 import dataclasses
+import json
 import re
+import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from pydrake.geometry import Mesh
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
@@ -20,7 +24,9 @@ from dvrk_drake.dynamics.inertial_parameters import (
 )
 from dvrk_drake.dynamics.model_links import nearest_links
 from dvrk_drake.errors import ArmError, ModelError
-from dvrk_drake.export.sdf import changed_links, sdf_difference, write_sdf
+from dvrk_drake.export.gltf import to_obj
+from dvrk_drake.export.gravity_sources import c_identifier
+from dvrk_drake.export.sdf import changed_links, sdf_difference, to_text, write_sdf
 from dvrk_drake.export.urdf import write_urdf
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
@@ -244,3 +250,167 @@ def test_rejects_invalid_inertias_and_unknown_links(tmp_path):
     with pytest.raises(ModelError, match="rotor inertia -1 must not be negative"):
         write_sdf(arm, [], path, "a test", {"outer_yaw": -1.0})
     assert list(tmp_path.iterdir()) == []
+
+
+def robot_of(model):
+    """Returns the URDF of an SDF model with base_link and joint "two" between base_link and link "b"."""
+    return to_urdf(
+        ElementTree.fromstring(f'<sdf version="1.9"><model name="m">{model}</model></sdf>'), load_arm("mtml")
+    )
+
+
+@pytest.mark.parametrize(
+    ("pose", "axis"),
+    [
+        ('<pose degrees="1">.1 .2 .3 10 20 30</pose>', "<xyz>0 1 0</xyz>"),
+        ('<pose degrees="TRUE">.1 .2 .3 10 20 30</pose>', "<xyz>0 1 0</xyz>"),
+        ('<pose rotation_format="quat_xyzw">.1 .2 .3 .1 .2 .3 .9273618495495703</pose>', "<xyz>0 1 0</xyz>"),
+        ("<pose>.1 .2 .3 .4 .5 .6</pose>", '<xyz expressed_in="__model__">0 0 1</xyz>'),
+        ("<pose>.1 .2 .3 .4 .5 .6</pose>", '<xyz expressed_in="base_link">0.6 0 0.8</xyz>'),
+        ("<pose>.1 .2 .3 .4 .5 .6</pose>", '<xyz expressed_in="two">0 0 1</xyz>'),
+    ],
+)
+def test_poses_and_axes_of_the_urdf_are_those_that_drake_reads(pose, axis):
+    model = (
+        f'<link name="base_link"><pose>0 0 .5 .7 0 0</pose></link><link name="b">{pose}<inertial>{pose}<mass>2</mass>'
+        "<inertia><ixx>.1</ixx><iyy>.1</iyy><izz>.1</izz></inertia></inertial></link>"
+        f'<joint name="two" type="revolute"><parent>base_link</parent><child>b</child><axis>{axis}<limit><lower>-1'
+        f'</lower><upper>1</upper></limit></axis></joint><frame name="f" attached_to="b">{pose}</frame>'
+    )
+    results = []
+    for kind in ("sdf", "urdf"):
+        text = f'<sdf version="1.9"><model name="m">{model}</model></sdf>'
+        if kind == "urdf":
+            text = ElementTree.tostring(robot_of(model), encoding="unicode")
+        plant = MultibodyPlant(0.0)
+        Parser(plant).AddModelsFromString(text, kind)
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
+        plant.Finalize()
+        context = plant.CreateDefaultContext()
+        plant.GetJointByName("two").set_angle(context, 0.8)
+        poses = [plant.GetFrameByName(name).CalcPoseInWorld(context).GetAsMatrix34() for name in ("b", "f")]
+        center = plant.GetBodyByName("b").CalcCenterOfMassInBodyFrame(context)
+        results.append(np.hstack([*poses, center[:, None]]))
+    np.testing.assert_allclose(results[1], results[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<xyz>", '<xyz expressed_in="f">', "joint two: <xyz expressed_in> is 'f'; URDF export supports links and"),
+        ('attached_to="b"', 'attached_to="g"', "frame f is attached to 'g'; URDF supports only frames of links"),
+        ("<pose>0 0 0 0 0 0<", "<pose>0 0 0 0 0 0 1<", "b: <pose> has 7 numbers; allowed: 6"),
+    ],
+)
+def test_poses_and_axes_that_urdf_does_not_support_are_refused(old, new, message):
+    model = (
+        '<link name="base_link"/><link name="b"><pose>0 0 0 0 0 0</pose><inertial><mass>1</mass><inertia><ixx>.1</ixx>'
+        '<iyy>.1</iyy><izz>.1</izz></inertia></inertial></link><frame name="f" attached_to="b"/><joint name="two" '
+        'type="revolute"><parent>base_link</parent><child>b</child><axis><xyz>1 0 0</xyz></axis></joint>'
+    )
+    robot_of(model)
+    with pytest.raises(ModelError, match=message):
+        robot_of(model.replace(old, new))
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_urdf_without_extensions_has_a_heavy_base_and_no_contact(name, tmp_path):
+    """MuJoCo ignores collision filters. It excludes contact between a moving link and the link that carries it."""
+    arm, path = load_arm(name), tmp_path / "arm.urdf"
+    write_urdf(arm, [], path, "a test")
+    robot = ElementTree.parse(path).getroot()
+    masses = [link.find("inertial/mass") for link in robot.findall("link")]
+    assert all(mass is not None and float(mass.get("value")) > 0 for mass in masses)
+    total = len(list(compose_sdf(arm.sdf, arm.mirrored_links).iter("collision")))
+    assert len({(c.get("name")) for c in robot.iter("collision")}) > 0.4 * total > 0
+    for element in robot.findall("{http://drake.mit.edu}collision_filter_group"):
+        robot.remove(element)
+    for link in robot.findall("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    plant.set_adjacent_bodies_collision_filters(False)
+    Parser(plant).AddModelsFromString(ElementTree.tostring(robot, encoding="unicode"), "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
+    plant.Finalize()
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    parents = {
+        j.get("name"): {j.find(tag).get("link") for tag in ("parent", "child")} for j in robot.iter("joint") if len(j)
+    }
+    carried = [pair for pair in parents.values() if "base_link" not in pair]
+    for q in arm.sample_poses(100, np.random.default_rng(5)):
+        set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
+        query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+        for contact in query.ComputePointPairPenetration():
+            frames = [query.inspector().GetFrameId(i) for i in (contact.id_A, contact.id_B)]
+            bodies = {plant.GetBodyFromFrameId(frame).name() for frame in frames}
+            assert len(bodies) == 1 or bodies in carried, bodies
+
+
+def test_obj_meshes_have_the_shape_of_the_gltf_meshes(tmp_path):
+    arm = load_arm("mtmr")
+    write_urdf(arm, [], tmp_path / "arm.urdf", "a test", meshes="obj")
+    copies = sorted(tmp_path.rglob("*.obj"))
+    assert len(copies) == 10 and not list(tmp_path.rglob("*.gltf"))
+    for copy in copies[:2]:
+        (source,) = (MODELS_FOLDER / "sdf" / "meshes" / "mtm").glob(f"{copy.stem}.gltf")
+        hulls = [Mesh(str(path)).GetConvexHull() for path in (source, copy)]
+        corners = [np.array([hull.vertex(i) for i in range(hull.num_vertices())]) for hull in hulls]
+        for bound in (np.min, np.max):
+            np.testing.assert_allclose(bound(corners[1], axis=0), bound(corners[0], axis=0), rtol=0, atol=1e-6)
+
+
+def gltf(tmp_path, **changes):
+    """Writes a glTF file with one triangle, whose node has a parent."""
+    points, corners = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], "<f4"), np.array([0, 1, 2], "<u2")
+    data = base64.b64encode(points.tobytes() + corners.tobytes()).decode()
+    content = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"translation": [0, 0, 5], "children": [1]},
+            {"mesh": 0, "scale": [1, 1, 2], "rotation": [1, 0, 0, 0]},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"},
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 6}],
+        "buffers": [{"uri": f"data:application/octet-stream;base64,{data}", "byteLength": 42}],
+    }
+    path = tmp_path / "mesh.gltf"
+    path.write_text(json.dumps(content | changes))
+    return path
+
+
+def test_gltf_nodes_are_transformed(tmp_path):
+    """The rotation by 180 deg about x negates y. The y axis of glTF is the z axis of OBJ."""
+    assert to_obj(gltf(tmp_path)) == "v 0 -5 0\nv 1 -5 0\nv 0 -5 -2\nf 1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]}, "primitives other than triangles"),
+        ({"nodes": [{"children": [0]}]}, "not a glTF file that can be converted to OBJ"),
+        ({"buffers": [{"uri": "data:;base64,AAAA"}]}, "not a glTF file that can be converted to OBJ"),
+        ({"buffers": [{"uri": "../other.bin"}]}, "outside the folder of the mesh"),
+    ],
+)
+def test_gltf_that_cannot_be_converted_is_refused(changes, message, tmp_path):
+    with pytest.raises(ArmError, match=message):
+        to_obj(gltf(tmp_path, **changes))
+
+
+@pytest.mark.parametrize("origin", ["a---b", "a--b", "-----", "b-"])
+def test_comment_of_a_file_is_well_formed(origin):
+    assert ElementTree.fromstring(to_text(ElementTree.Element("robot"), f"model {origin}")).tag == "robot"
+
+
+def test_names_of_arms_are_valid_in_source_code():
+    names = ["MTML", "PSM-1", "2nd arm", "", "b\u00e4r", "_"]
+    assert [c_identifier(name) for name in names] == ["mtml", "psm_1", "arm_2nd_arm", "arm_", "b_r", "arm__"]
