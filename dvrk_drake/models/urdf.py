@@ -47,11 +47,13 @@ def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
         if facts.effort_limits.get(joint.get("name", ""), 0.0) > 0:
             _add_transmission(robot, joint)
     for frame in model.findall("frame"):
-        if (link := frame.get("attached_to", "")) not in X_ML:
-            raise ModelError(f"frame {frame.get('name')} is attached to {link!r}; URDF supports only frames of links")
+        if (carrier := frame.get("attached_to", "")) not in X_ML:
+            raise ModelError(
+                f"frame {frame.get('name')} is attached to {carrier!r}; URDF supports only frames of links"
+            )
         X_LF = _pose(frame)
         xyz, rpy = _xyz_rpy(X_LF)
-        attributes = {"name": frame.get("name", ""), "link": link, "xyz": xyz, "rpy": rpy}
+        attributes = {"name": frame.get("name", ""), "link": carrier, "xyz": xyz, "rpy": rpy}
         ElementTree.SubElement(robot, "frame", attributes)
     for group in model.findall(f"{DRAKE}collision_filter_group"):
         _add_filter_group(robot, group)
