@@ -186,7 +186,7 @@ def test_file_of_a_psm(recording, insertion, shared_data, tmp_path):
     np.testing.assert_allclose(actual, torque, rtol=0, atol=1e-12 if is_exact else 0.01)
 
 
-def test_torque_at_rest_of_a_version_1_file_equals_the_controller(shared_data):
+def test_version_1_file_has_the_torque_of_the_controller(shared_data):
     path = shared_data / "cases" / "gc-v1.json"
     q, _ = poses_and_velocities(load_arm("mtmr"), 100)
     actual = judge(shared_data, "judge", path, np.hstack([q, 0 * q]))
