@@ -11,7 +11,7 @@ from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
 from dvrk_drake.analysis.check.pose_check import check_poses
-from dvrk_drake.analysis.signals.motion_faults import motion_fault
+from dvrk_drake.analysis.signals.motion_faults import source_fault, time_fault
 from dvrk_drake.analysis.signals.motion_grid import MIN_SEGMENT, default_settings, motion_grid
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.signals.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
@@ -62,6 +62,8 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         findings.append(Finding("note", "locked joints", ", ".join(arm.locked_joints), what, advice))
     try:
         joints = recording.in_joint_coordinates(arm)
+        if fault := source_fault(recording, arm):
+            return replace(report, findings=(Finding("refusal", *fault), *findings))
         recording.check_fits(arm)
         tau = joints.measured_effort()
         check_effort_unit(joints, arm)
@@ -70,9 +72,6 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         refusal = Finding("refusal", "unusable", source, what, advice)
         return replace(report, findings=(refusal, *findings))
     joint_signals = _joint_signals(joints, arm)
-    fault = motion_fault(recording, arm)
-    if fault is not None and fault.kind in ("two sources", "wrapped angle"):
-        return replace(report, joints=joint_signals, findings=(Finding("refusal", *fault), *findings))
     findings += _positions(joints, arm, joint_signals)
     findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm, report.kind)
     if report.kind == "motion":
@@ -81,7 +80,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     findings += time
     report = replace(report, joints=joint_signals)
     if any(finding.severity == "refusal" for finding in time):
-        pass
+        report = replace(report, kind="motion")
     elif report.kind == "motion":
         report, more = check_motion(report, recording, arm)
         findings += more
@@ -244,7 +243,7 @@ def _time(recording: Recording, arm: Arm, kind: str) -> list[Finding]:
         rows, times, _ = distinct_rows(recording)
         factor = time_factor(times, recording.q[rows], recording.qd[rows])
     if factor is None or abs(factor - 1) < TIME_TOLERANCE:
-        return [Finding("refusal", *fault)] if (fault := motion_fault(recording, arm)) else []
+        return [Finding("refusal", *fault)] if (fault := time_fault(recording, arm)) else []
     units = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
     unit = next((name for size, name in units.items() if abs(factor / size - 1) < 0.1), "")
     cause = f"t may be in {unit}" if unit else "usual causes: a wrong rate, or qd in another unit"

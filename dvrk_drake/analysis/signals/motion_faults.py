@@ -16,9 +16,9 @@ MIN_RETURNS = 0.15
 #: A channel returns if the distance of the rows before and after is at most the first share of both jumps. Jumps are
 #: larger than the second share of the range of the channel, so that quantisation does not count.
 SAME_SOURCE, MIN_JUMP = 0.2, 0.02
-#: Largest difference of a jump of a wrapped angle from a multiple of 2 pi [rad], and smallest speed of the jump
-#: [rad/s]. No arm reaches this speed.
-WRAP_TOLERANCE, WRAP_SPEED = 0.5, 50.0
+#: Largest difference of a jump of a wrapped angle from a multiple of 2 pi [rad], smallest speed of the jump [rad/s],
+#: which no arm reaches, and smallest ratio of the jump to the median step, as angles in degrees have less isolated steps.
+WRAP_TOLERANCE, WRAP_SPEED, ISOLATED = 0.5, 50.0, 10.0
 #: Units of times in which recorders write, with their size [s].
 _TIME_UNITS = {
     "milliseconds": 1e-3,
@@ -49,9 +49,14 @@ class MotionFault(NamedTuple):
     advice: str
 
 
-def motion_fault(recording: Recording, arm: Arm) -> MotionFault | None:
-    """Returns the first fault of a motion, or None. Static poses have no such faults."""
-    return _two_sources(recording, arm) or _wrapped_angle(recording, arm) or _time_fault(recording, arm)
+def source_fault(recording: Recording, arm: Arm) -> MotionFault | None:
+    """Returns a fault of a motion whose rows have two sources or whose angles are wrapped, or None.
+
+    Raises:
+        RecordingError: The number of joints is wrong.
+    """
+    joints = recording.in_joint_coordinates(arm)
+    return _two_sources(recording, arm) or _wrapped_angle(recording, joints, arm)
 
 
 def _two_sources(recording: Recording, arm: Arm) -> MotionFault | None:
@@ -87,16 +92,16 @@ def _returns(x: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(2 * np.sum(returns, axis=1) > max(int(np.sum(changes)), 1))
 
 
-def _wrapped_angle(recording: Recording, arm: Arm) -> MotionFault | None:
+def _wrapped_angle(recording: Recording, joints: Recording, arm: Arm) -> MotionFault | None:
     """Returns a fault if an angle jumps by a multiple of 2 pi between two rows of a motion."""
     if not (recording.is_motion and recording.has_increasing_times):
         return None
     intervals = np.diff(np.asarray(recording.t))
-    for one in (recording, recording.in_joint_coordinates(arm), recording.in_actuator_coordinates(arm)):
+    for one in (recording, joints, recording.in_actuator_coordinates(arm)):
         steps = np.abs(np.diff(one.q, axis=0))
         turns = np.round(steps / (2 * np.pi))
         wraps = (turns > 0) & (np.abs(steps - 2 * np.pi * turns) < WRAP_TOLERANCE) & ~arm.prismatic
-        wraps &= steps > WRAP_SPEED * intervals[:, None]
+        wraps &= (steps > WRAP_SPEED * intervals[:, None]) & (steps > ISOLATED * np.median(steps, axis=0))
         if np.any(wraps):
             joint = int(np.argmax(np.sum(wraps, axis=0)))
             rows = np.flatnonzero(wraps[:, joint]) + 1
@@ -108,7 +113,7 @@ def _wrapped_angle(recording: Recording, arm: Arm) -> MotionFault | None:
     return None
 
 
-def _time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
+def time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
     """Returns a fault of the times of rows that are a motion.
 
     The times are implausible if the joints would move faster than `MAX_SPEED`, or if rows in small steps are too slow
