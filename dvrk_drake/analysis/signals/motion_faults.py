@@ -16,8 +16,9 @@ MIN_RETURNS = 0.15
 #: A channel returns if the distance of the rows before and after is at most the first share of both jumps. Jumps are
 #: larger than the second share of the range of the channel, so that quantisation does not count.
 SAME_SOURCE, MIN_JUMP = 0.2, 0.02
-#: Largest difference of a jump of a wrapped angle from a multiple of 2 pi [rad], smallest speed of the jump [rad/s],
-#: which no arm reaches, and smallest ratio of the jump to the median step, as angles in degrees have less isolated steps.
+#: Largest difference of a jump of a wrapped angle from a multiple of 2 pi [rad], and smallest speed of the jump
+#: [rad/s], which no arm reaches. Smallest ratio of the jump to the median step, because angles in degrees have large
+#: steps.
 WRAP_TOLERANCE, WRAP_SPEED, ISOLATED = 0.5, 50.0, 10.0
 #: Units of times in which recorders write, with their size [s].
 _TIME_UNITS = {
