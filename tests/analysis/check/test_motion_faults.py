@@ -41,7 +41,7 @@ def motion(rate=100.0, seconds=12.0, arm=ARM, speed=1.0, velocities=False):
     ("unit", "factor"),
     [("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9), ("hours", 1 / 3600), ("days", 1 / 86400)],
 )
-def test_times_in_another_unit_are_refused_with_this_unit(unit, factor, rate):
+def test_names_the_unit_of_wrong_times(unit, factor, rate):
     whole = motion(rate)
     assert motion_fault(whole, ARM) is None
     # A time since 1970, as in a bag, and lost rows.
@@ -55,7 +55,7 @@ def test_times_in_another_unit_are_refused_with_this_unit(unit, factor, rate):
             call()
 
 
-def test_unit_of_times_is_found_for_one_moving_joint_with_velocities():
+def test_finds_the_unit_of_times_of_one_moving_joint():
     whole = motion(velocities=True)
     still = np.where(np.arange(7) == 1, 1.0, 0.0)
     one = replace(whole, q=whole.q * still + 0.1 * (1 - still), qd=whole.qd * still, t=1e3 * whole.t)
@@ -81,7 +81,7 @@ def test_static_poses_with_times_have_no_fault():
     assert "If the arm was at rest in each row, remove the column t" in fault.advice
 
 
-def test_a_rate_just_below_the_nominal_rate_and_lost_rows_are_accepted():
+def test_accepts_49_9_hz_and_lost_rows():
     settings = default_settings(ARM)
     for recording in (motion(49.9), motion(50.0).select(np.delete(np.arange(600), [100, 400]))):
         assert motion_grid(recording, ARM, settings).rate == pytest.approx(49.9, abs=0.11)
@@ -132,7 +132,7 @@ def test_a_wrapped_angle_is_named(in_motors):
     assert motion_fault(replace(wrapped, t=None, qd=None), ARM) is None
 
 
-def test_rows_without_power_are_dropped_with_their_number():
+def test_drops_rows_without_power():
     whole = motion()
     tau = whole.tau.copy()
     tau[1000:] = 0.0
@@ -169,7 +169,7 @@ def test_constant_efforts_are_not_measured():
 
 
 @pytest.mark.parametrize(("arm", "joint"), [(PSM, 6), (PSM, 5), (ARM, 3), (ARM, 1), (ARM, 6)])
-def test_measured_channels_use_only_measured_efforts(arm, joint):
+def test_channels_use_only_measured_efforts(arm, joint):
     """The channels are the same for every effort of the joint that was not measured, and contain all other efforts."""
     tau = np.random.default_rng(5).normal(size=(2, 7)) + np.zeros((7, 1, 1))
     tau = tau[0]
@@ -201,13 +201,15 @@ def test_filters_and_states_begin_anew_after_a_gap():
     expected = [g.filter_efforts(g.efforts_at_rows(x)) for g, x in zip(alone, dry, strict=True)]
     found = grid.filter_efforts(grid.efforts_at_rows(np.concatenate(dry)))
     np.testing.assert_allclose(found, np.concatenate(expected), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(grid.row_times[grid.inner], np.concatenate([g.row_times[g.inner] for g in alone]))
+    np.testing.assert_allclose(
+        grid.row_times[grid.inner], np.concatenate([g.row_times[g.inner] for g in alone]), rtol=0, atol=1e-9
+    )
     parts = [part.filter_rows(part.at_rows(part.t**2, 0), own) for part, own in grid.thinned(3).parts()]
     expected = [part.filter_rows(part.at_rows(part.t**2, 0), own) for g in alone for part, own in g.thinned(3).parts()]
     np.testing.assert_allclose(np.concatenate(parts), np.concatenate(expected), rtol=0, atol=1e-6)
 
 
-def test_short_segments_between_gaps_are_dropped_with_their_number():
+def test_drops_short_segments_between_gaps():
     whole = motion(seconds=20.0)
     cut = whole.select(np.r_[0:900, 1000:1100, 1200:2000])
     with pytest.raises(RecordingError, match=r"row 901: only 0.99 s of motion between two gaps of t"):
@@ -218,7 +220,7 @@ def test_short_segments_between_gaps_are_dropped_with_their_number():
 
 
 @pytest.mark.parametrize("segments", [1, 4])
-def test_gain_of_a_hypothesis_does_not_grow_with_the_length(segments):
+def test_gain_does_not_grow_with_the_length(segments):
     """Repetitions of a motion have the same errors of the arm model, so they are no further evidence."""
     almost = Finding("refusal", "inverted channel", "pitch", "inverted", "", (1,), 0.4 * MIN_MIRROR_GAIN)
     assert channel_check._best_hypothesis([[almost]] * segments) == []

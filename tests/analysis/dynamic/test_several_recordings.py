@@ -265,7 +265,7 @@ def test_recordings_are_thinned_to_similar_rates(days):
     assert abs(len(grids[0].inner_rows) - len(grids[1].inner_rows)) < 5
 
 
-def test_joints_are_identified_although_one_effort_was_not_measured(days):
+def test_identifies_joints_beside_an_unmeasured_one(days):
     """The jaw and the wrist yaw of a PSM share motors, so the yaw is identified from its joint effort. With a gap."""
     _, _, recordings = days
     whole = recordings[1]
