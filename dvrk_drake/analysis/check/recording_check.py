@@ -149,7 +149,7 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
     min_range = arm.per_joint(*MIN_RANGE)
     for j, name in enumerate(arm.joint_names):
         if not np.any(tau[:, j]):
-            what = f"tau{j + 1} is 0 in all rows, so it was not measured"
+            what = f"tau{j + 1} is the same number in all rows, so it was not measured"
             advice = "The motor was off, or its effort was not recorded. The model has no friction of this actuator."
             findings.append(Finding("warning", "no effort", name, what, advice, (j,)))
             continue
@@ -326,10 +326,6 @@ def with_power(recording: Recording, arm: Arm) -> tuple[Recording, tuple[Finding
     tau = recording.measured_effort()
     moves = np.ptp(recording.q, axis=0) > arm.per_joint(*MIN_RANGE)
     constant = moves & (np.ptp(tau, axis=0) == 0) & (tau[0] != 0) & (len(tau) >= MIN_POSES)
-    for j in np.flatnonzero(constant):
-        what = f"tau{j + 1} is {tau[0, j]:.4g} {'N' if arm.prismatic[j] else 'N m'} in all rows, so it was not measured"
-        advice = "The efforts of this channel are not used."
-        findings.append(Finding("warning", "constant effort", arm.joint_names[j], what, advice, (int(j),)))
     if np.any(constant):
         recording = replace(recording, tau=np.where(constant, 0.0, tau))
     if recording.is_motion and recording.has_increasing_times:
