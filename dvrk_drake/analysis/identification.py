@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
 from dvrk_drake.analysis.signals.static_segments import find_poses
@@ -87,18 +87,19 @@ def identify(
                 raise RecordingError(f"{what}: requires one recording, but {len(recording)} were given")
             return _identify_several(recording, arm, progress)
         (recording,) = recording
+    recording, dropped = with_power(recording, arm)
     poses = find_poses(recording, arm, low_speed_segments)
     report = require_usable(poses.recording, arm, progress, channels=True)
     share = step_progress(progress, "identifying")
     try:
         if poses.moves:
             motion = identify_dynamic([poses.recording], arm, share)
-            return replace(motion, warnings=(*report.warnings, *_unexplained(motion)))
+            return replace(motion, warnings=(*dropped, *report.warnings, *_unexplained(motion)))
         static = identify_static(poses.recording, arm, method, share, poses.measured)
     except DvrkDrakeError as error:
-        error.findings = report.warnings
+        error.findings = (*dropped, *report.warnings)
         raise
-    warnings = (*report.warnings, *_friction_in_segments(static, poses.measured))
+    warnings = (*dropped, *report.warnings, *_friction_in_segments(static, poses.measured))
     return replace(static, warnings=warnings, note=poses.note, num_rows=len(poses.recording))
 
 
@@ -107,8 +108,11 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
         raise RecordingError("no recordings were given; a model requires at least one")
     motions: list[tuple[str, Recording]] = []
     static: list[tuple[str, Recording]] = []
-    for i, recording in enumerate(recordings):
+    warnings: list[Finding] = []
+    for i, whole in enumerate(recordings):
+        recording, dropped = with_power(whole, arm)
         name = recording.source or f"recording {i + 1}"
+        warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in dropped]
         found = find_poses(recording, arm)
         if not found.moves and (static or (i == len(recordings) - 1 and not motions)):
             also = f", and so does {static[0][0]}" if static else ""
@@ -123,7 +127,6 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
                     "them is predicted from the others"
                 )
         (motions if found.moves else static).append((name, found.recording))
-    warnings: list[Finding] = []
     for name, recording in motions + static:
         report = require_usable(recording, arm, progress, channels=True)
         warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in report.warnings]

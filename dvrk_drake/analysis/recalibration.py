@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.results import ModelResult
 from dvrk_drake.analysis.signals.drive_efforts import (
     FRICTION_PARTS,
@@ -123,12 +123,13 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
         (1.5, True)
     """
     dynamics = model.dynamic_model
+    recording, dropped = with_power(recording, dynamics.arm)
     report = require_usable(recording, dynamics.arm, progress)
     share = step_progress(progress, "refitting friction")
     share(0.0)
     result = refit_friction(model, recording)
     share(1.0)
-    return replace(result, warnings=report.warnings)
+    return replace(result, warnings=(*dropped, *report.warnings))
 
 
 def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
@@ -158,7 +159,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     while np.any(worse := free & ~(after < before)):
         free &= ~worse
         after = fit.cross_validated_error(free)
-    if not np.mean(np.minimum(before, after)) < MAX_ERROR:
+    if not np.mean(np.minimum(before, after)[fit.measured]) < MAX_ERROR:
         raise RecordingError(
             f"{recording.source or 'recording'}: the mean relative error over the actuators is "
             f"{100 * np.mean(after):.0f} % with fitted friction ({100 * np.mean(before):.0f} % before); at most "
@@ -168,6 +169,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     actuators = []
     for i, name in enumerate(fit.names):
         reason = "" if free[i] else "error not reduced" if excited[i] else "no motion in both directions"
+        reason = reason if fit.measured[i] else "effort not measured"
         actuators.append(
             RecalibratedActuator(
                 name=name,
@@ -221,7 +223,8 @@ class _Fit:
         self.names = model.arm.joint_names
         self.rate = grid.rate
         expected = drive_efforts(model, grid)
-        self.tau = grid.filter_efforts(recording.in_actuator_coordinates(model.arm).measured_effort())
+        self.tau = grid.filter_efforts(recording.measured_actuators(model.arm).measured_effort())
+        self.measured = np.any(self.tau, axis=0)
         self.other = expected.other
         self.keys = list(expected.friction)
         self.friction = np.stack([expected.friction[key] for key in self.keys], axis=2)
@@ -230,7 +233,7 @@ class _Fit:
         self.expected = expected.total()
         self._folds = folds
         self._fold, self._edge = phase_folds(grid, period_of(grid), folds)
-        self.excited = _moves_in_both_directions(model, grid)
+        self.excited = _moves_in_both_directions(model, grid) & self.measured
         self.unchanged = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
 
     def error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -257,7 +260,7 @@ class _Fit:
 
     def _relative(self, squares: NDArray[np.float64]) -> NDArray[np.float64]:
         size = np.sum(self.tau**2, axis=0)
-        return np.asarray(np.sqrt(squares / np.maximum(size, np.finfo(float).tiny)))
+        return np.sqrt(np.divide(squares, size, out=np.zeros_like(size), where=size > 0))
 
     def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Returns x (k + n,), fitted to some rows of the motion.
@@ -269,10 +272,10 @@ class _Fit:
         """
         k, n = len(self.keys), len(self.names)
         fixed = np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
-        size = np.sqrt(np.mean(self.tau**2, axis=0))
+        size = np.where(self.measured, np.sqrt(np.mean(self.tau**2, axis=0)), 1.0)
         deviation = np.concatenate([np.full(k, SCALE_DEVIATION), OFFSET_DEVIATION * size])
         H, b = np.diag(deviation**-2.0), self.unchanged / deviation**2
-        for i in range(n):
+        for i in np.flatnonzero(self.measured):
             X = np.hstack([self.friction[rows, i], np.tile(np.eye(n)[i], (int(np.sum(rows)), 1))])
             # Rows within the correlation time are not independent.
             weight = 1 / (_RELATIVE_ERROR * size[i]) ** 2 / (self.rate * _CORRELATION_TIME)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation, predict_motion, validate_motion
 from dvrk_drake.analysis.results import Prediction
 from dvrk_drake.analysis.signals.static_segments import find_poses
@@ -53,6 +53,7 @@ def validate(
         ('good', 0.091)
     """
     arm = model.arm
+    recording, dropped = with_power(recording, arm)
     poses = find_poses(recording, arm, low_speed_segments)
     report = require_usable(poses.recording, arm, progress)
     share = step_progress(progress, "validating")
@@ -69,7 +70,7 @@ def validate(
     if validation.of_same_recording:
         what = "the model was identified from this recording, so the errors are those of the fit"
         found += (Finding("warning", "same recording", report.source, what, "Validate with another recording."),)
-    return replace(validation, warnings=(*report.warnings, *found), note=poses.note)
+    return replace(validation, warnings=(*dropped, *report.warnings, *found), note=poses.note)
 
 
 def _static_model_warning(motion: str, source: str) -> tuple[Finding, ...]:
@@ -109,7 +110,8 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     arm = model.arm
     # `find_poses` and `require_usable` require efforts, so zeros replace missing efforts.
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
-    if model.dynamics is None or not find_poses(measured, arm).moves:
+    moves = find_poses(measured, arm).moves
+    if model.dynamics is None or not moves:
         step_progress(progress, "predicting")(0.0)
         return Prediction(predict_static(model, recording))
     report = require_usable(measured, arm, progress, ignored_kind="no effort" if recording.tau is None else "")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -27,8 +27,20 @@ Coordinates = Literal["joint", "actuator"]
 LIMIT_TOLERANCE = 0.2, 0.02
 #: Minimum number of rows of a motion, and maximum median sampling interval of a motion [s].
 MIN_ROWS, MAX_PERIOD = 100, 0.05
+#: Smallest nominal rate of a motion for a dynamic model [Hz], and largest share by which its mean rate may be lower.
+#: Real rates deviate from nominal rates, and recorders lose rows.
+MIN_RATE, MAX_LOST = 50.0, 0.05
 #: RMS joint velocity above which a joint is not at rest [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
+#: Interval below which consecutive rows at different positions belong to a motion [s]. An arm needs more time to move
+#: to a pose and to rest there for a measurement.
+MAX_INTERVAL = 0.5
+#: Largest step between two rows of a motion, as a share of the range of a joint, and smallest range of a joint that
+#: moves [rad], [m]. Static poses are further apart.
+MAX_MOTION_STEP, MIN_RANGE = 0.05, (0.02, 0.002)
+#: An interval between two rows of a motion is a gap if it exceeds both values: the first in median intervals, the
+#: second in s.
+GAP, MIN_GAP = 5.0, MAX_PERIOD
 #: Maximum difference of each joint position between samples of the same pose [rad], [m].
 SAME_POSE = 0.01, 0.001
 #: Values of `--coordinates` with their meaning, for messages.
@@ -122,13 +134,14 @@ class Recording:
         """Returns a text with the fastest joint and its speed, e.g. "joint 1 at 0.2 rad/s RMS".
 
         The text is empty if all joints are at rest, or if the speed is unknown. The speed is computed from qd, or from
-        q and t if samples are less than 0.1 s apart. At longer intervals the speed between poses is unknown.
+        q and t if the rows are less than `MAX_INTERVAL` apart or form a path (`is_path`). Otherwise, the speed between
+        poses is unknown.
         """
         if not len(self):
             return ""
         if self.qd is not None:
             qd = self.qd
-        elif self.t is not None and len(self) > 1 and self.has_increasing_times and np.median(np.diff(self.t)) < 0.1:
+        elif self.t is not None and len(self) > 1 and self.has_increasing_times and self._is_continuous(arm):
             qd = np.diff(self.q, axis=0) / np.diff(self.t)[:, None]
         else:
             return ""
@@ -137,6 +150,83 @@ class Recording:
         joint = int(np.argmax(share))
         unit = "m/s" if arm.prismatic[joint] else "rad/s"
         return f"joint {joint + 1} at {speed[joint]:.2g} {unit} RMS" if share[joint] > 1 else ""
+
+    def _is_continuous(self, arm: Arm) -> bool:
+        return float(np.median(np.diff(np.asarray(self.t)))) < MAX_INTERVAL or self.is_path(arm)
+
+    def is_path(self, arm: Arm) -> bool:
+        """Returns whether the positions are at least `MIN_ROWS` rows in small steps, as in a motion.
+
+        The steps are at most `MAX_MOTION_STEP` of the range of each joint that moves. Steps over a gap are not used.
+        """
+        spans = np.ptp(self.q, axis=0)
+        moves = spans > arm.per_joint(*MIN_RANGE)
+        if len(self) < MIN_ROWS or not np.any(moves):
+            return False
+        steps = np.abs(np.diff(self.q[:, moves], axis=0))
+        if self.t is not None and self.has_increasing_times:
+            intervals = np.diff(self.t)
+            steps = steps[intervals <= GAP * np.median(intervals)]
+        return bool(np.all(steps <= MAX_MOTION_STEP * spans[moves]))
+
+    def select(self, rows: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Recording:
+        """Returns the recording with some of its rows: indices, a mask or a slice."""
+        return replace(
+            self,
+            q=self.q[rows],
+            tau=None if self.tau is None else self.tau[rows],
+            qd=None if self.qd is None else self.qd[rows],
+            t=None if self.t is None else self.t[rows],
+            lines=None if self.lines is None else self.lines[rows],
+        )
+
+    def segments(self) -> list[slice]:
+        """Returns the rows of each segment of a motion between gaps of its times, see `GAP`."""
+        intervals = np.diff(np.asarray(self.t))
+        typical = float(np.median(intervals)) if len(intervals) else 0.0
+        edges = [0, *(np.flatnonzero(intervals > max(GAP * typical, MIN_GAP)) + 1).tolist(), len(self)]
+        return [slice(first, last) for first, last in pairwise(edges)]
+
+    def longest_segment(self) -> Recording:
+        """Returns the longest segment of a motion between gaps of its times, or the recording if it has no gap."""
+        segments = self.segments()
+        if len(segments) == 1:
+            return self
+        return self.select(max(segments, key=lambda rows: rows.stop - rows.start))
+
+    @property
+    def unmeasured(self) -> NDArray[np.bool_]:
+        """Mask (n,) of the channels whose effort is 0 in all rows, so that it was not measured."""
+        return ~np.any(self.measured_effort(), axis=0)
+
+    def measured_channels(self, arm: Arm) -> NDArray[np.float64]:
+        """Returns the matrix (n, n) that maps the efforts of the actuators to the measured efforts.
+
+        It is the identity if all efforts are measured. Row i is 0 if the effort of actuator i is not known. In a
+        recording in joint coordinates, the effort of an actuator depends on the efforts of several joints. If one of
+        them was not measured, row i can instead be the effort of joint i, which is a combination of the efforts of the
+        actuators.
+        """
+        unmeasured = self.unmeasured
+        if self.coordinates == "actuator" or not np.any(unmeasured):
+            return np.diag((~unmeasured).astype(float))
+        J = arm.transmission.matrix
+        is_unknown = np.any(arm.transmission.inverse.matrix.T[:, unmeasured] != 0, axis=1)
+        is_joint = is_unknown & ~unmeasured
+        return np.asarray(np.where(is_joint[:, None], J.T, np.diag((~is_unknown).astype(float))))
+
+    def measured_actuators(self, arm: Arm) -> Recording:
+        """Returns the recording in actuator coordinates, with efforts of 0 where the effort is not known."""
+        channels = self.measured_channels(arm)
+        actuators = self.in_actuator_coordinates(arm)
+        known = np.all(channels == np.eye(len(channels)), axis=1)
+        return actuators if np.all(known) else replace(actuators, tau=actuators.measured_effort() * known)
+
+    def measured_joints(self, arm: Arm) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the joints whose effort is known."""
+        if self.coordinates == "joint":
+            return ~self.unmeasured
+        return ~np.any(arm.transmission.matrix[self.unmeasured] != 0, axis=0)
 
     def measured_effort(self) -> NDArray[np.float64]:
         """Returns tau (m, n).

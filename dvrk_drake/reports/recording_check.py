@@ -85,7 +85,7 @@ def _print_signals(console: Console, report: RecordingReport) -> None:
         )
     console.print(table)
     if report.period is not None:
-        floors = [joint.floor for joint in report.joints if joint.floor is not None]
+        floors = [joint.floor for joint in report.joints if joint.floor is not None and joint.floor == joint.floor]
         print_note(
             console,
             f"Repeatability: rms(tau(t) - tau(t + {report.period:.4f} s)) / sqrt(2) / rms(tau), low-pass filtered at "

@@ -21,7 +21,8 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Smallest gain in log-likelihood at which a hypothesis of `check_channels` is accepted. On the unmodified public
 #: motions, no exchange of channels has a positive gain. On public motions with one added error, the correct hypothesis
-#: has a gain of at least 25, and in most cases of more than 100.
+#: has a gain of at least 25, and in most cases of more than 100. These motions are single segments. The gain of several
+#: segments is their mean, because all segments have the same errors of the arm model.
 MIN_GAIN = 20.0
 #: Smallest gain at which the hypothesis of an inverted channel is accepted. An arm is almost symmetric under
 #: reflection. This hypothesis therefore has gains of up to 46 on the unmodified public motions.
@@ -63,7 +64,8 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     Each hypothesis is tested by a maximum-a-posteriori fit (`ChannelFit`), and the fits are compared by their
     log-likelihood. In a motion, a wrong scale is detected from the dissipated friction power. Offsets and inverted
     positions are not detected in poses at rest. A long motion is fitted in at most `MAX_SEGMENTS` segments, and the
-    log-likelihoods of these segments are added. A warning is reported if it occurs in at least half of the segments.
+    gain of a hypothesis is the mean over these segments. It does not grow with the length of the recording. A warning
+    is reported if it occurs in at least half of the segments.
 
     Args:
         recording: Motion or poses at rest, with efforts, in joint or actuator coordinates.
@@ -86,7 +88,7 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         # The spring torque of a cable may exceed the gravity torque of a light wrist. The effort then opposes gravity.
         return [replace(f, severity="warning") if f.kind == "effort sign" else f for f in found]
     hypotheses, scales_and_offsets = [], []
-    for segment in _segments(recording):
+    for segment in _segments(recording.longest_segment()):
         if segment.motion(arm):
             fit = ChannelFit(segment, arm)
             hypotheses.append(_hypotheses(fit))
@@ -96,19 +98,13 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
 
 def _segments(recording: Recording) -> list[Recording]:
     """Returns at most `MAX_SEGMENTS` equal segments of a motion, each at most `MAX_SEGMENT_DURATION` long."""
-    t, qd = recording.t, recording.qd
+    t = recording.t
     if t is None or t[-1] - t[0] <= MAX_SEGMENT_DURATION:
         return [recording]
     edges = np.linspace(t[0], t[-1], int(np.ceil((t[-1] - t[0]) / MAX_SEGMENT_DURATION)) + 1)
-    tau = recording.measured_effort()
     segments = np.split(np.arange(len(t)), np.searchsorted(t, edges[1:-1]))
     chosen = np.unique(np.linspace(0, len(segments) - 1, min(len(segments), MAX_SEGMENTS)).round().astype(int))
-    return [
-        replace(
-            recording, q=recording.q[rows], tau=tau[rows], qd=None if qd is None else qd[rows], t=t[rows], lines=None
-        )
-        for rows in (segments[k] for k in chosen)
-    ]
+    return [recording.select(segments[k]) for k in chosen]
 
 
 def _hypotheses(fit: ChannelFit) -> list[Finding]:
@@ -121,7 +117,7 @@ def _hypotheses(fit: ChannelFit) -> list[Finding]:
 
 
 def _best_hypothesis(segments: list[list[Finding]], *, at_rest: bool = False) -> list[Finding]:
-    """Returns the hypothesis with the largest total gain over all segments, or an empty list if no gain is sufficient.
+    """Returns the hypothesis with the largest mean gain over all segments, or an empty list if no gain is sufficient.
 
     The advice lists hypotheses with a similar gain.
     """
@@ -130,12 +126,15 @@ def _best_hypothesis(segments: list[list[Finding]], *, at_rest: bool = False) ->
         groups.setdefault((finding.kind, finding.joints, finding.what), []).append(finding)
     min_gains = {"exchanged channels": MIN_GAIN_AT_REST if at_rest else MIN_GAIN, "inverted channel": MIN_MIRROR_GAIN}
     min_effort_gain = MIN_EFFORT_GAIN_AT_REST if at_rest else MIN_GAIN
-    totals = [replace(group[0], size=sum(finding.size for finding in group)) for group in groups.values()]
-    totals = sorted(totals, key=lambda finding: -finding.size)
-    best = next((finding for finding in totals if finding.size > min_gains.get(finding.kind, min_effort_gain)), None)
+    # A hypothesis that a segment cannot test has a gain of 0 in this segment.
+    means = [
+        replace(group[0], size=sum(finding.size for finding in group) / len(segments)) for group in groups.values()
+    ]
+    means = sorted(means, key=lambda finding: -finding.size)
+    best = next((finding for finding in means if finding.size > min_gains.get(finding.kind, min_effort_gain)), None)
     if best is None:
         return []
-    similar = [f for f in totals if f is not best and f.size > max(best.size - SIMILAR_GAIN, 0.0)]
+    similar = [f for f in means if f is not best and f.size > max(best.size - SIMILAR_GAIN, 0.0)]
     if not similar:
         return [best]
     alternatives = ", ".join(finding.what.partition(". ")[0] for finding in similar)

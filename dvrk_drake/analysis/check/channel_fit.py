@@ -104,7 +104,7 @@ class ChannelFit:
             independent = len(recording)
             moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*MIN_RANGE)
         self._independent = min(independent, MAX_INDEPENDENT)
-        measured = np.any(self._tau != 0, axis=0)
+        measured = np.any(recording.measured_actuators(arm).measured_effort() != 0, axis=0)
         self.used, self.resting = np.flatnonzero(moves & measured), np.flatnonzero(~moves & measured)
         self.log_likelihood = 0.0
         if len(self.used):

@@ -23,15 +23,13 @@ from dvrk_drake.analysis.signals.true_time import (
     velocity_agreement,
 )
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
+from dvrk_drake.recordings.recording import MAX_LOST, MIN_RATE, REST_SPEED, Recording
 
 #: Largest share of repeated rows that is reported as a note, because it hardly changes a model. Above it: warning.
 MIN_REPEATED = 0.005
 #: Smallest difference of two shares of rows for a warning that a signal (q, qd or tau) comes from a slower topic: the
 #: share of rows that repeat this signal, and the share of rows that repeat all signals.
 MIN_EXTRA = 0.05
-#: An interval between two rows is a gap if it exceeds both values: the first in median intervals, the second in s.
-GAP, MIN_GAP = 5.0, MAX_PERIOD
 #: Smallest reported jitter as a share of the mean interval.
 MIN_JITTER = 0.05
 #: An effort has the wrong sign in two cases: its Coulomb friction is more than the first number of standard errors
@@ -56,20 +54,19 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
         Report with the statistics of the motion, and the findings.
     """
     interval = float(np.median(np.diff(np.asarray(recording.t))))
-    gaps = _gaps(np.asarray(recording.t), interval)
-    actuators = _longest_segment(recording.in_actuator_coordinates(arm), gaps)
+    actuators = recording.measured_actuators(arm).longest_segment()
     clock = true_time(actuators)
     t = np.asarray(actuators.t)
     duration, rate = float(t[-1] - t[0]), 1 / interval
-    findings = [*_times(clock), *_gap_findings(recording, gaps)]
+    findings = [*_times(clock), *_gap_findings(recording)]
     report = replace(
         report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
     )
-    if duration < MIN_DURATION or rate < 2 / MAX_PERIOD:
+    if duration < MIN_DURATION or rate < (1 - MAX_LOST) * MIN_RATE:
         what = (
             f"the motion lasts {duration:.3g} s at {rate:.3g} Hz, so lags, signs, noise and repetition are not checked"
         )
-        advice = f"Record at least {MIN_DURATION:g} s at {2 / MAX_PERIOD:g} Hz or more."
+        advice = f"Record at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
     signals = motion_signals(actuators, 20.0, rate=min(rate, GRID_RATE))
     moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
@@ -150,36 +147,20 @@ def _times(clock: TrueTime) -> list[Finding]:
     return findings
 
 
-def _gaps(t: NDArray[np.float64], interval: float) -> NDArray[np.int_]:
-    """Returns the indices of the rows before a gap."""
-    return np.flatnonzero(np.diff(t) > max(GAP * interval, MIN_GAP))
-
-
-def _longest_segment(recording: Recording, gaps: NDArray[np.int_]) -> Recording:
-    edges = np.concatenate([[0], gaps + 1, [len(recording)]])
-    longest = int(np.argmax(np.diff(edges)))
-    rows = slice(edges[longest], edges[longest + 1])
-    return replace(
-        recording,
-        q=recording.q[rows],
-        qd=None if recording.qd is None else recording.qd[rows],
-        tau=recording.measured_effort()[rows],
-        t=np.asarray(recording.t)[rows],
-        lines=None if recording.lines is None else recording.lines[rows],
-    )
-
-
-def _gap_findings(recording: Recording, gaps: NDArray[np.int_]) -> list[Finding]:
-    if not len(gaps):
+def _gap_findings(recording: Recording) -> list[Finding]:
+    segments = recording.segments()
+    if len(segments) == 1:
         return []
-    intervals = np.diff(np.asarray(recording.t))
-    largest = int(gaps[np.argmax(intervals[gaps])])
-    gap = f"{intervals[largest]:.3g} s before {recording.where(largest + 1)}"
+    t = np.asarray(recording.t)
+    gaps = {rows.start: float(t[rows.start] - t[rows.start - 1]) for rows in segments[1:]}
+    row = max(gaps, key=lambda start: gaps[start])
+    gap = f"{gaps[row]:.3g} s before {recording.where(row)}"
     what = f"the times have a gap of {gap}" if len(gaps) == 1 else f"the times have {len(gaps)} gaps, the largest {gap}"
     advice = (
-        "Split the recording at each gap, because the motion in a gap is unknown. Only the longest segment is checked."
+        "The motion in a gap is unknown, so the segments between gaps are filtered and simulated separately. Lags, "
+        "signs, noise and channels are checked only in the longest segment."
     )
-    return [Finding("warning", "gaps", "t", what, advice, size=float(intervals[largest]))]
+    return [Finding("warning", "gaps", "t", what, advice, size=gaps[row])]
 
 
 def _agreement(actuators: Recording, clock: TrueTime, signals: MotionSignals) -> VelocityAgreement | None:

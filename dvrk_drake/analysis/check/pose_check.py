@@ -10,15 +10,13 @@ from dvrk_drake.analysis.static.excluded_measurements import find_excluded, usab
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.recordings.recording import MIN_ROWS, Recording
+from dvrk_drake.recordings.recording import MAX_MOTION_STEP, Recording
 
 #: Largest number of poses at which efforts are compared with the gravity of the SDF model.
 MAX_COMPARED = 500
 #: Smallest RMS gravity effort of the SDF model [N m], [N], and its smallest share of the measured RMS effort, for a
 #: check of the sign. The torque of a cable can exceed a smaller gravity effort.
 MIN_GRAVITY, GRAVITY_SHARE = (0.1, 1.0), 0.5
-#: Largest step between two rows of a motion, as a share of the range of a joint. Static poses are further apart.
-MAX_MOTION_STEP = 0.05
 #: An effort has the wrong sign if its regression coefficient on gravity is more than the first number of standard
 #: errors below 0, and if the correlation of effort and gravity is below minus the second number.
 MIN_SIGN_ERRORS, MIN_OPPOSITE_CORRELATION = 5.0, 0.7
@@ -33,13 +31,10 @@ def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
         what = f"the recording has {distinct} distinct pose{'s' * (distinct != 1)}, but identify requires {MIN_POSES}"
         advice = "Record 40 or more poses that cover the range of the arm."
         findings.append(Finding("warning", "few poses", "rows", what, advice, size=float(distinct)))
-    if recording.t is None and recording.qd is None and len(joints) >= MIN_ROWS:
-        steps, spans = np.abs(np.diff(joints.q, axis=0)), np.ptp(joints.q, axis=0)
-        largest = float(np.max(steps / np.maximum(spans, 1e-9)))
-        if largest < MAX_MOTION_STEP:
-            what = f"{len(joints)} rows without times follow in steps up to {100 * largest:.1f} % of the joint ranges"
-            advice = "The rows seem to be a motion. State its times, or its sampling rate with --rate HZ."
-            findings.append(Finding("warning", "no times", "t", what, advice, size=largest))
+    if recording.t is None and recording.qd is None and joints.is_path(arm):
+        what = f"{len(joints)} rows without times follow in steps below {100 * MAX_MOTION_STEP:g} % of the joint ranges"
+        advice = "The rows seem to be a motion. State its times, or its sampling rate with --rate HZ."
+        findings.append(Finding("warning", "no times", "t", what, advice))
     excluded = find_excluded(joints, arm)
     if excluded:
         rows = len({measurement.row for measurement in excluded})

@@ -11,19 +11,18 @@ from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
 from dvrk_drake.analysis.check.pose_check import check_poses
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.signals.motion_faults import source_fault, time_fault
+from dvrk_drake.analysis.signals.motion_grid import MIN_SEGMENT, default_settings, motion_grid
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.signals.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
-from dvrk_drake.analysis.static.static_identification import usable_poses
+from dvrk_drake.analysis.static.static_identification import MIN_POSES, usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import COORDINATES_HELP, REST_SPEED, Recording
+from dvrk_drake.recordings.recording import COORDINATES_HELP, MIN_RANGE, REST_SPEED, Recording
 
-#: Smallest range of the positions of a joint that moves [rad], [m].
-MIN_RANGE = 0.02, 0.002
 #: Smallest share of the range between its limits that a joint must cover for accurate estimates of its parameters.
 MIN_COVERAGE = 0.1
 #: Smallest reported excess of a position beyond a limit [rad], [m].
@@ -34,6 +33,11 @@ IMPOSSIBLE_EFFORT = 5.0
 IMPOSSIBLE_EXCESS = 0.3
 #: Smallest number of consecutive rows at the extreme effort, and smallest share of all rows, for a saturated effort.
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
+#: Smallest number of runs of rows without power, if they alternate with rows of another source, and share of all rows.
+MIN_OFF_RUNS, MIN_OFF_SHARE = 10, 0.1
+#: Smallest duration for which the effort of a moving joint is exactly 0 if its motor is off [s]. At rest or for
+#: moments, a quantised effort can be 0.
+MIN_OFF_TIME = 1.0
 #: Largest relative error of the recorded times, estimated from q and qd. A larger error indicates a wrong unit or rate.
 TIME_TOLERANCE = 0.05
 _ORDER: dict[Severity, int] = {"refusal": 0, "warning": 1, "note": 2}
@@ -58,6 +62,8 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         findings.append(Finding("note", "locked joints", ", ".join(arm.locked_joints), what, advice))
     try:
         joints = recording.in_joint_coordinates(arm)
+        if fault := source_fault(recording, arm):
+            return replace(report, findings=(Finding("refusal", *fault), *findings))
         recording.check_fits(arm)
         tau = joints.measured_effort()
         check_effort_unit(joints, arm)
@@ -70,11 +76,11 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm, report.kind)
     if report.kind == "motion":
         findings += repeated_row_findings(recording.in_actuator_coordinates(arm))
-    time = _time(recording, report.kind)
+    time = _time(recording, arm, report.kind)
     findings += time
     report = replace(report, joints=joint_signals)
     if any(finding.severity == "refusal" for finding in time):
-        pass
+        report = replace(report, kind="motion")
     elif report.kind == "motion":
         report, more = check_motion(report, recording, arm)
         findings += more
@@ -143,11 +149,19 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
     min_range = arm.per_joint(*MIN_RANGE)
     for j, name in enumerate(arm.joint_names):
         if not np.any(tau[:, j]):
-            what = f"tau{j + 1} is 0 in all rows"
-            advice = (
-                "The motor was off, or its effort was not recorded. The parameters of this joint are not identifiable."
-            )
+            what = f"tau{j + 1} is the same number in all rows, so it was not measured"
+            advice = "The motor was off, or its effort was not recorded. The model has no friction of this actuator."
             findings.append(Finding("warning", "no effort", name, what, advice, (j,)))
+            continue
+        if kind == "motion" and (off := _off_rows(actuators, tau[:, j], j, arm)):
+            what = (
+                f"tau{j + 1} is exactly 0 in {len(off)} successive rows while the joint moves, first at "
+                f"{actuators.where(off[0])}"
+            )
+            advice = (
+                "Its motor was off. Identify from the other rows, or set tau to 0 in all rows to leave this joint out."
+            )
+            findings.append(Finding("refusal", "no power", name, what, advice, (j,), float(len(off))))
             continue
         exceeds = int(np.sum(np.abs(tau[:, j]) > arm.effort_limits[j]))
         if exceeds:
@@ -183,6 +197,21 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
     return findings
 
 
+def _off_rows(actuators: Recording, tau: NDArray[np.float64], joint: int, arm: Arm) -> range:
+    """Returns the longest run of rows in which the effort tau (m,) of a moving joint is exactly 0, or an empty range.
+
+    The run lasts at least `MIN_OFF_TIME`.
+    """
+    t, q = np.asarray(actuators.t), actuators.in_joint_coordinates(arm).q[:, joint]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], tau == 0, [False]]).astype(int))).reshape(-1, 2)
+    runs = [
+        range(first, end)
+        for first, end in edges.tolist()
+        if t[end - 1] - t[first] >= MIN_OFF_TIME and np.ptp(q[first:end]) > arm.per_joint(*MIN_RANGE)[joint]
+    ]
+    return max(runs, key=len, default=range(0))
+
+
 def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
     """Returns the share of rows that are in runs of at least `FLAT_ROWS` rows at the extreme value."""
     at = np.abs(values - extreme) <= 1e-6 * max(abs(extreme), float(np.ptp(values)))
@@ -191,7 +220,7 @@ def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
     return float(np.sum(lengths[lengths >= FLAT_ROWS]) / len(values))
 
 
-def _time(recording: Recording, kind: str) -> list[Finding]:
+def _time(recording: Recording, arm: Arm, kind: str) -> list[Finding]:
     """Returns findings for missing times, times that do not increase, and times that disagree with q and qd."""
     t, qd = recording.t, recording.qd
     if t is None:
@@ -209,12 +238,12 @@ def _time(recording: Recording, kind: str) -> list[Finding]:
         if np.all(repeated_rows(recording)[decreasing + 1]):
             advice = "These rows repeat the previous row and its time. Remove these rows."
         return [Finding(severity, "time goes back", "t", what, advice, size=float(count))]
-    if recording.qd is None or len(t) < MIN_ROWS:
-        return []
-    rows, times, _ = distinct_rows(recording)
-    factor = time_factor(times, recording.q[rows], recording.qd[rows])
+    factor = None
+    if recording.qd is not None and len(t) >= MIN_ROWS:
+        rows, times, _ = distinct_rows(recording)
+        factor = time_factor(times, recording.q[rows], recording.qd[rows])
     if factor is None or abs(factor - 1) < TIME_TOLERANCE:
-        return []
+        return [Finding("refusal", *fault)] if (fault := time_fault(recording, arm)) else []
     units = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
     unit = next((name for size, name in units.items() if abs(factor / size - 1) < 0.1), "")
     cause = f"t may be in {unit}" if unit else "usual causes: a wrong rate, or qd in another unit"
@@ -258,7 +287,9 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     """
     share = step_progress(progress, "checking the recording")
     share(0.0)
+    recording, dropped = with_power(recording, arm)
     report = check_with_channels(recording, arm)
+    report = replace(report, findings=(*report.refusals, *dropped, *report.findings[len(report.refusals) :]))
     share(1.0)
     if report.refusals:
         return report
@@ -266,6 +297,52 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     # A refusal of identify makes the warning of too few poses redundant.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
+
+
+def with_power(recording: Recording, arm: Arm) -> tuple[Recording, tuple[Finding, ...]]:
+    """Returns the part of a recording whose efforts can be used, and findings on all other rows and channels.
+
+    The result has no rows without power, in which all efforts are exactly 0, and no segments of a motion that are
+    shorter than `MIN_SEGMENT` between two gaps. Efforts of a moving joint that are constant in all rows were not
+    measured. They are replaced by 0, which marks a channel that was not measured (`Recording.unmeasured`). A recording
+    without any efforts is not changed.
+    """
+    if recording.tau is None or not np.any(recording.tau) or recording.q.shape[1] != arm.num_joints:
+        return recording, ()
+    findings: list[Finding] = []
+    count = len(recording)
+    off = ~np.any(recording.tau, axis=1)
+    if num_off := int(np.sum(off)):
+        runs = int(np.sum(np.diff(off.astype(int), prepend=0) == 1))
+        what = (
+            f"all efforts are exactly 0 in {num_off} of {count} row{'s' * (count != 1)}, first at "
+            f"{recording.where(int(np.argmax(off)))}. These rows are not used"
+        )
+        advice = "The motors were off, or the efforts were not measured."
+        if runs > MIN_OFF_RUNS and runs > MIN_OFF_SHARE * count:
+            advice = "The rows alternate with rows that have efforts. Usual cause: two publishers on one topic."
+        findings.append(Finding("warning", "no power", "efforts", what, advice, size=float(num_off)))
+        recording = recording.select(~off)
+    tau = recording.measured_effort()
+    moves = np.ptp(recording.q, axis=0) > arm.per_joint(*MIN_RANGE)
+    constant = moves & (np.ptp(tau, axis=0) == 0) & (tau[0] != 0) & (len(tau) >= MIN_POSES)
+    if np.any(constant):
+        recording = replace(recording, tau=np.where(constant, 0.0, tau))
+    if recording.is_motion and recording.has_increasing_times:
+        t, segments = np.asarray(recording.t), recording.segments()
+        short = [rows for rows in segments if t[rows.stop - 1] - t[rows.start] < MIN_SEGMENT]
+        if 0 < len(short) < len(segments):
+            keep = np.ones(len(t), dtype=bool)
+            for rows in short:
+                keep[rows] = False
+            what = (
+                f"{np.sum(~keep)} of {len(t)} rows are in {len(short)} segment{'s' * (len(short) != 1)} shorter than "
+                f"{MIN_SEGMENT:g} s between gaps of t, first at {recording.where(short[0].start)}. These rows are not "
+                "used"
+            )
+            findings.append(Finding("warning", "short segments", "t", what, "Record without interruptions."))
+            recording = recording.select(keep)
+    return recording, tuple(findings)
 
 
 def require_usable(

@@ -74,7 +74,8 @@ class DynamicColumns:
     coefficients of the effects. The effect columns are E_i = shapes[i] * rows[:, i].
 
     Attributes:
-        tau: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
+        tau: Measured efforts (r, n) after low-pass filtering [N m, N], see `MotionGrid.channels`. They are those of the
+            actuators if all efforts are measured. Efforts that were not measured, and their columns, are 0.
         base: Matrix (b, p) that maps the p rigid-body parameters to the base parameters. If the arm file allows a base
             tilt, the matrix is valid for every gravity direction. The rigid-body parameters are those of the links,
             then one rotor inertia per actuator.
@@ -254,18 +255,34 @@ def dynamic_columns(
     tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
     columns = base_columns([regressor, *tilted])
     rigid = _filtered(grid, regressor, columns)
-    at_rest = replace(grid, v=np.zeros_like(grid.v), vd=np.zeros_like(grid.vd))
-    tilts = [_filtered(at_rest, r, columns) for r in tilted]
+    tilts = [_filtered(grid.at_rest(), r, columns) for r in tilted]
     nominal = arm.transmission.inverse.pull_back_effort(regressor.torque(grid.q, grid.v, grid.vd, regressor.values))
     return DynamicColumns(
-        tau=grid.filter_efforts(tau),
+        tau=grid.filter_efforts(tau @ grid.channels.T),
         base=columns.base,
         rigid=rigid,
         tilts=np.array(tilts).reshape(-1, *rigid.shape),
         effects=tuple(effects),
         shapes=_effect_columns(grid, regressor, effects, nominal),
-        rows=np.array([arm.effect_coordinates[effect.coordinate] for effect in effects]),
+        rows=_effect_rows(grid, effects),
     )
+
+
+def _is_combined(grid: MotionGrid) -> NDArray[np.bool_]:
+    """Returns the mask (n,) of the measured efforts that are combinations of efforts of several actuators."""
+    return np.asarray(np.count_nonzero(grid.channels, axis=1) > 1)
+
+
+def _effect_rows(grid: MotionGrid, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
+    """Returns the factors (e, n) of the shapes of effects in the measured efforts.
+
+    The shapes of a combined effort already contain the ratios of its actuators.
+    """
+    rows = np.array([grid.arm.effect_coordinates[effect.coordinate] for effect in effects]).reshape(
+        len(effects), grid.arm.num_joints
+    )
+    acts = (rows != 0).astype(float) @ (grid.channels != 0).T > 0
+    return np.where(_is_combined(grid), acts, rows * np.diag(grid.channels))
 
 
 def _effect_columns(
@@ -274,16 +291,23 @@ def _effect_columns(
     effects: Sequence[ActuatorEffect],
     transmitted: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], ...]:
-    """Returns the filtered shapes (r, e) of effects, one array per actuator, see `DynamicColumns.shapes`."""
+    """Returns the filtered shapes (r, e) of effects, one array per measured effort, see `DynamicColumns.shapes`."""
     delays = np.array(grid.settings.effort_delay)
     by_delay = {delay: np.zeros((len(grid.inner_rows), len(effects))) for delay in dict.fromkeys(delays)}
-    shapes = effect_shapes(regressor, effects, grid.q, grid.v, transmitted)
-    for k, (effect, shape) in enumerate(zip(effects, shapes, strict=True)):
+    # Effects with a state begin anew after a gap.
+    of_segments = (effect_shapes(regressor, effects, g.q, g.v, transmitted[own]) for g, own, _ in grid.each_segment())
+    for k, (effect, *parts) in enumerate(zip(effects, *of_segments, strict=True)):
+        shape = np.concatenate(parts)
         acts = grid.arm.effect_coordinates[effect.coordinate] != 0
         for delay in dict.fromkeys(delays[acts]):
             actuator = int(np.flatnonzero(delays == delay)[0])
             by_delay[delay][:, k] = grid.filter_efforts(grid.at_rows(shape, actuator))
-    return tuple(by_delay[delay] for delay in delays)
+    result = [by_delay[delay] for delay in delays]
+    rows = np.array([grid.arm.effect_coordinates[effect.coordinate] for effect in effects])
+    for i in np.flatnonzero(_is_combined(grid)) if len(effects) else ():
+        weights = grid.channels[i] * rows
+        result[i] = sum(by_delay[delay] * weights[:, k] for k, delay in enumerate(delays))
+    return tuple(result)
 
 
 class BaseColumns(NamedTuple):
@@ -337,7 +361,8 @@ def _filtered(grid: MotionGrid, regressor: DynamicRegressor, columns: BaseColumn
         for i, drives in enumerate(arm.transmission.inverse.matrix.T):
             own, of_actuator = columns.of_actuator(Y, drives)
             filtered[-1][:, i, own] = part.filter_rows(part.at_rows(of_actuator, i), rows)
-    return np.concatenate(filtered)
+    efforts = np.concatenate(filtered)
+    return efforts if np.array_equal(grid.channels, np.eye(arm.num_joints)) else grid.channels @ efforts
 
 
 def _coordinates(arm: Arm, grids: Sequence[MotionGrid]) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
@@ -26,7 +26,7 @@ from dvrk_drake.analysis.dynamic.estimates import (
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import FOLDS, period_of, phase_folds, repeatability_floor
+from dvrk_drake.analysis.signals.repetition import FOLDS, motion_floor, period_of, phase_folds
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
@@ -57,8 +57,8 @@ class FittedMotion:
         recording: Motion as recorded.
         grid: Resampled motion.
         period: Period of the motion [s], or None if the motion does not repeat.
-        measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
-        predicted: Predicted efforts (r, n) of the actuators, after the same low-pass filter [N m, N].
+        measured: Measured efforts (r, n) after low-pass filtering, see `MotionGrid.channels` [N m, N].
+        predicted: Predicted efforts (r, n), after the same low-pass filter [N m, N].
         held_out: Efforts (r, n) that cross-validation predicts for the rows of each held-out fold [N m, N]. If there is
             more than one recording, the fold is the whole recording.
     """
@@ -143,10 +143,12 @@ def identify_dynamic(
     )
     for motion in motions:
         _refuse_worse_than_zero(motion)
-    series = [
-        ResidualSeries(own, grid.rate / grid.step, period)
-        for own, grid, period in zip(rows, grids, periods, strict=True)
-    ]
+    series = []
+    for own, grid, period in zip(rows, grids, periods, strict=True):
+        first = own.start
+        for segment, _, _ in grid.each_segment():
+            series.append(ResidualSeries(slice(first, first + len(segment.inner_rows)), grid.rate / grid.step, period))
+            first += len(segment.inner_rows)
     covariance = parameter_covariance(problem, fit, measured - predicted, settings.effort_cut_off, series)
     estimates = DynamicEstimates(problem, fit, covariance)
     floors = [_repeatability(own, motion) for own, motion in zip(tau, motions, strict=True)]
@@ -170,7 +172,7 @@ def thinned(grids: Sequence[MotionGrid]) -> tuple[MotionGrid, ...]:
     """Returns the motions with similar rates of their rows, and with at most about `MAX_ROWS` rows in total."""
     seconds = sum(len(grid.row_times) / grid.rate for grid in grids)
     rate = min(MAX_ROWS / seconds, *(grid.rate for grid in grids))
-    return tuple(replace(grid, step=max(1, round(grid.rate / rate))) for grid in grids)
+    return tuple(grid.thinned(max(1, round(grid.rate / rate))) for grid in grids)
 
 
 def _refuse_worse_than_zero(motion: FittedMotion) -> None:
@@ -237,7 +239,7 @@ def _repeatability(tau: NDArray[np.float64], motion: FittedMotion) -> NDArray[np
     if motion.period is None:
         return np.full(tau.shape[1], np.nan)
     grid, size = motion.grid, np.sqrt(np.mean(motion.measured**2, axis=0))
-    return np.nan_to_num(repeatability_floor(tau, grid.rate, motion.period, grid.settings.effort_cut_off)) * size
+    return np.nan_to_num(motion_floor(tau, grid, motion.period)) * size
 
 
 def _section(
@@ -287,10 +289,20 @@ def _model(
     q = np.concatenate([recording.in_joint_coordinates(arm).q for recording in recordings])
     as_mounted = arm.with_gravity(section.gravity)
     joints = []
+    measured = np.any([recording.measured_joints(arm) for recording in recordings], axis=0)
     for j, name in enumerate(arm.joint_names):
         lower, upper = float(q[:, j].min()), float(q[:, j].max())
         coverage = (upper - lower) / float(arm.position_upper[j] - arm.position_lower[j])
-        joints.append(JointStatistics(name=name, position_lower=lower, position_upper=upper, coverage=coverage))
+        # A joint whose effort was not measured gets no feedforward.
+        joints.append(
+            JointStatistics(
+                name,
+                feedforward_scale=float(measured[j]),
+                position_lower=lower,
+                position_upper=upper,
+                coverage=coverage,
+            )
+        )
     model = IdentifiedModel(
         arm=as_mounted,
         joints=joints,

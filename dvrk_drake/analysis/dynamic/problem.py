@@ -133,7 +133,7 @@ class DynamicProblem:
         """Reciprocals (e,) of the prior variances of the effect coefficients. The prior means are 0."""
         size = sum(
             np.mean((self.columns.shapes[i] * self.columns.rows[:, i]) ** 2, axis=0) / (self.efforts[i] / self.num_rows)
-            for i in range(len(self.efforts))
+            for i in np.flatnonzero(self.efforts)
         )
         deviation = np.full(self.num_effects, EFFECT_DEVIATION)
         mandatory = {(e.coordinate, e.kind, e.scale) for e in self.columns.effects[: self.num_mandatory]}
@@ -305,7 +305,8 @@ class DynamicProblem:
     @cached_property
     def _identifiable(self) -> NDArray[np.float64]:
         """Orthonormal identifiable directions (p, k) of the rigid-body parameters divided by their deviations."""
-        weights = self.independent / self.num_rows / (self.efforts / self.num_rows * _INITIAL_ERROR**2)
+        efforts = np.where(self.efforts > 0, self.efforts, np.inf)
+        weights = self.independent / self.num_rows / (efforts / self.num_rows * _INITIAL_ERROR**2)
         H = sum(weight * self.rigid[:, i].T @ self.rigid[:, i] for i, weight in enumerate(weights))
         scaled = self.columns.base * self.deviation
         values, vectors = np.linalg.eigh(scaled.T @ H @ scaled)

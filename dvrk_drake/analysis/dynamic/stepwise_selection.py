@@ -34,7 +34,8 @@ class StepwiseSelection:
         precision: Reciprocals (k,) of the prior variances of all unknowns.
         non_negative: Mask (k,) of the unknowns that must not be negative.
         independent: Effective number of independent rows, divided by the number of rows.
-        weights: Weights (n,) of the squared errors of the actuators, updated by `fit`.
+        weights: Weights (n,) of the squared errors of the actuators, updated by `fit`. They are 0 for efforts that were
+            not measured.
     """
 
     equations: NormalEquations
@@ -64,12 +65,12 @@ class StepwiseSelection:
         """Returns the estimates (k,) of all unknowns, with 0 for excluded effects, and updates `weights`."""
         for _ in range(3):
             x = self._fit_to(self._total.weighted(self.weights), effects).solve()
-            self.weights = self._weights(self._total.squared_errors(x) / self._efforts)
+            self.weights = self._weights(self._relative(self._total.squared_errors(x)))
         return x
 
     def relative_error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the relative error |tau - X x| / |tau| of each actuator (n,)."""
-        return np.asarray(np.sqrt(self._total.squared_errors(x) / self._efforts))
+        return np.sqrt(self._relative(self._total.squared_errors(x)))
 
     def cross_validated(self, effects: NDArray[np.int_], candidates: Sequence[int] = ()) -> tuple[float, list[float]]:
         """Returns the cross-validated relative error with `effects`, and the errors with one more effect.
@@ -82,7 +83,7 @@ class StepwiseSelection:
         for training, held_out in zip(self._training, self._held_out, strict=True):
             fit = self._fit_to(training.weighted(self.weights), effects, np.array(candidates, dtype=int))
             squares += [held_out.squared_errors(fit.solve(k)) for k in added]
-        error, *errors = np.mean(np.sqrt(squares / self._efforts), axis=1).tolist()
+        error, *errors = np.mean(np.sqrt(self._relative(squares))[:, self._efforts > 0], axis=1).tolist()
         return error, errors
 
     def select(
@@ -146,4 +147,8 @@ class StepwiseSelection:
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the weights (n,) of the actuators for squared relative errors (n,)."""
         variance = np.maximum(squared, MIN_ERROR**2) * self._efforts / np.sum(self.rows)
-        return np.asarray(self.independent / variance)
+        return self.independent / np.where(self._efforts > 0, variance, np.inf)
+
+    def _relative(self, squares: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Divides squared errors (..., n) by the squared efforts. The result is 0 if an effort was not measured."""
+        return squares / np.where(self._efforts > 0, self._efforts, np.inf)

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.results import Validation
-from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.repetition import period_of, repeatability_floor
+from dvrk_drake.analysis.signals.repetition import motion_floor, period_of
 from dvrk_drake.analysis.verdict import judge, rule_text
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import GAP, MIN_GAP, Recording
 
 #: Width of the smoothed sign function of the friction-like error, as a share of the RMS velocity.
 _FRICTION_WIDTH = 0.1
@@ -101,8 +100,8 @@ class DynamicValidation(Validation):
         v: Velocities (r, n) of the actuators [rad/s, m/s].
         vd: Accelerations (r, n) of the actuators [rad/s^2, m/s^2].
         period: Period of the motion [s], or None if the motion does not repeat.
-        measured: Measured efforts (r, n) of the actuators after low-pass filtering [N m, N].
-        predicted: Predicted efforts (r, n) of the actuators after low-pass filtering [N m, N].
+        measured: Measured efforts (r, n) after low-pass filtering, see `MotionGrid.channels` [N m, N].
+        predicted: Predicted efforts (r, n) after low-pass filtering [N m, N].
         grid: Resampled motion.
     """
 
@@ -162,7 +161,7 @@ def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
     """
     dynamics = model.dynamic_model
     grid = motion_grid(recording, model.arm, dynamics.section.signals)
-    return low_pass(_efforts(model, grid), grid.rate, grid.settings.effort_cut_off)
+    return grid.low_passed(_efforts(model, grid))
 
 
 def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicValidation:
@@ -180,20 +179,20 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     arm = model.arm
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     grid = motion_grid(recording, arm, dynamics.section.signals)
-    measured, predicted = grid.filter_efforts(tau), grid.filter_efforts(_efforts(model, grid))
+    measured, predicted = (grid.filter_efforts(x @ grid.channels.T) for x in (tau, _efforts(model, grid)))
     t, a, v = grid.actuator_motion()
     period = period_of(grid)
     floor: list[float | None] = [None] * arm.num_joints
     if period is not None:
-        floors = repeatability_floor(tau, grid.rate, period, grid.settings.effort_cut_off)
-        floor = [float(x) if np.isfinite(x) else None for x in floors]
+        floor = [float(x) if np.isfinite(x) else None for x in motion_floor(tau, grid, period)]
     vd = grid.efforts_at_rows(arm.transmission.velocity(grid.vd))[grid.inner]
     actuators = []
     for i, name in enumerate(arm.joint_names):
         shares = error_shares(measured[:, i] - predicted[:, i], i, a, v[:, i], vd, t, period)
         limit = float(arm.effort_limits[i])
-        error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], limit)
-        if width := float(dynamics.half_width[i]):
+        commanded = model.joints[i].feedforward_scale > 0
+        error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], limit, commanded)
+        if np.any(measured[:, i]) and (width := _half_width(dynamics.half_width, grid.channels[i])):
             error = replace(error, inside=float(np.mean(np.abs(measured[:, i] - predicted[:, i]) <= width)))
         actuators.append(error)
     return DynamicValidation(
@@ -212,8 +211,16 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     )
 
 
+def _half_width(of_actuators: NDArray[np.float64], channel: NDArray[np.float64]) -> float:
+    """Returns the half width of the prediction interval of one measured effort, 0 if a half width is not known."""
+    used = channel != 0
+    # The errors of the actuators are independent.
+    return float(np.linalg.norm(channel[used] * of_actuators[used])) if np.all(of_actuators[used]) else 0.0
+
+
 def _efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:
-    return grid.efforts_at_rows(model.dynamic_model.effort(grid.q, grid.v, grid.vd))
+    dynamics = model.dynamic_model
+    return grid.efforts_at_rows(np.concatenate([dynamics.effort(g.q, g.v, g.vd) for g, _, _ in grid.each_segment()]))
 
 
 def _actuator_error(
@@ -223,11 +230,12 @@ def _actuator_error(
     shares: ErrorShares,
     repeatability: float | None,
     effort_limit: float,
+    commanded: bool,
 ) -> ActuatorError:
     error = measured - predicted
     effort, size = float(np.sqrt(np.mean(measured**2))), float(np.sqrt(np.mean(error**2)))
     relative = size / effort if effort > 0 else None
-    verdict = judge(effort, size, effort_limit, in_motion=True)
+    verdict = judge(effort, size, effort_limit, in_motion=True, commanded=commanded)
     return ActuatorError(name, effort, size, relative, shares, repeatability, verdict)
 
 
@@ -295,5 +303,7 @@ def _mean_square_between_periods(x: NDArray[np.float64], t: NDArray[np.float64],
     """Returns half the mean square of the difference of a signal (r,) between periods. Returns 0 without a period."""
     if period is None:
         return 0.0
-    first = t + period <= t[-1]
+    # Times in a gap have no measurement.
+    after = np.clip(np.searchsorted(t, t + period), 1, len(t) - 1)
+    first = (t + period <= t[-1]) & (t[after] - t[after - 1] < max(MIN_GAP, GAP * float(np.median(np.diff(t)))))
     return float(np.mean((np.interp(t[first] + period, t, x) - x[first]) ** 2)) / 2

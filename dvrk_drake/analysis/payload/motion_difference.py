@@ -117,6 +117,8 @@ class MotionDifference:
 def motion_difference(reference: Recording, other: Recording, model: DynamicModel) -> MotionDifference:
     """Aligns two recordings of one motion in time and subtracts the efforts of the reference.
 
+    Of a recording with gaps, the longest segment between gaps is used.
+
     Args:
         reference: Recording of the motion without payload, in joint or actuator coordinates.
         other: Recording of the same motion with the payload, in joint or actuator coordinates.
@@ -128,6 +130,7 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
     """
     signals = model.section.signals
     settings = replace(signals, effort_cut_off=min(CUT_OFF, signals.effort_cut_off))
+    reference, other = reference.longest_segment(), other.longest_segment()
     reference_grid, grid = (motion_grid(recording, model.arm, settings) for recording in (reference, other))
     period = period_of(grid)
     shift = _shift(reference_grid, grid, period, other)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.payload.motion_difference import MotionDifference, Whitening, motion_difference
@@ -254,8 +254,16 @@ def payload(
     arm = model if isinstance(model, Arm) else model.arm
     check_links(DynamicRegressor(arm), [] if link is None else [link])
     warnings: tuple[Finding, ...] = ()
-    for recording in (reference, loaded):
+    (reference, dropped), (loaded, dropped_loaded) = with_power(reference, arm), with_power(loaded, arm)
+    for recording, findings in ((reference, dropped), (loaded, dropped_loaded)):
         report = require_usable(recording, arm, progress)
+        if recording.tau is not None and np.any(unmeasured := recording.unmeasured):
+            names = ", ".join(f"tau{j + 1}" for j in np.flatnonzero(unmeasured))
+            raise RecordingError(
+                f"{report.source}: {names} was not measured, but a payload requires the efforts of all joints. Record "
+                "both motions with power on all motors."
+            )
+        warnings += tuple(replace(finding, where=f"{report.source}: {finding.where}") for finding in findings)
         warnings += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
     if isinstance(model, Arm):
         model = identify_dynamic([reference], arm, step_progress(progress, "identifying")).model

@@ -47,6 +47,12 @@ class DriveEfforts:
 
 def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
     """Returns the efforts that `model` predicts for the motion on `grid`."""
+    if grid.segments:
+        parts = [drive_efforts(model, own) for own in grid.segments]
+        return DriveEfforts(
+            np.concatenate([part.other for part in parts]),
+            {key: np.concatenate([part.friction[key] for part in parts]) for key in parts[0].friction},
+        )
     other = model.rigid_body_effort(grid.q, grid.v, grid.vd)
     friction: dict[tuple[str, FrictionPart], NDArray[np.float64]] = {}
     rows = model.arm.effect_coordinates

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.analysis.signals.low_pass import central_difference, low_pass, resample
-from dvrk_drake.analysis.signals.true_time import TrueTime, true_time, velocity_agreement
+from dvrk_drake.analysis.signals.true_time import TrueTime, increasing_times, true_time, velocity_agreement
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import MAX_LOST, MIN_RATE, Recording
 
 #: Rate of the time grid [Hz], high enough to resolve hysteresis when a joint reverses its direction.
 GRID_RATE = 400.0
 #: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
-#: Smallest accepted duration [s] and rate of the rows [Hz].
-MIN_DURATION, MIN_RATE = 5.0, 50.0
+#: Smallest accepted duration of a motion, and of each of its segments between gaps [s].
+MIN_DURATION, MIN_SEGMENT = 5.0, 3.0
 #: Number of rows in one part of `MotionGrid.parts`.
 PART_ROWS = 10_000
 #: Additional rows at both ends of a part, in periods of the effort filter's cut-off. A filter transient decays by a
@@ -107,9 +107,13 @@ class MotionGrid:
         v: Velocities (m, n) of the joints [rad/s, m/s].
         vd: Accelerations (m, n) of the joints [rad/s^2, m/s^2].
         row_times: True times (r,) of all rows of the recording, see `true_time` [s].
-        rate: Mean rate of the rows [Hz].
+        rate: Mean rate of the rows without gaps [Hz].
         clock: True times of the rows that do not repeat the previous row.
+        channels: Matrix (n, n) that maps efforts of the actuators to measured efforts, see
+            `Recording.measured_channels`.
         step: Filtered efforts and regressor columns are computed for every `step`-th row.
+        segments: Motion in each segment between gaps, or () for a motion without gaps. The arrays of the whole motion
+            are those of its segments, one after the other.
     """
 
     arm: Arm
@@ -121,11 +125,40 @@ class MotionGrid:
     row_times: NDArray[np.float64]
     rate: float
     clock: TrueTime
+    channels: NDArray[np.float64]
     step: int = 1
+    segments: tuple[MotionGrid, ...] = ()
+
+    def thinned(self, step: int) -> MotionGrid:
+        """Returns the motion with another `step`."""
+        return replace(self, step=step, segments=tuple(replace(own, step=step) for own in self.segments))
+
+    def at_rest(self) -> MotionGrid:
+        """Returns the positions without velocities and accelerations."""
+        zero = np.zeros_like(self.v)
+        return replace(self, v=zero, vd=zero, segments=tuple(own.at_rest() for own in self.segments))
+
+    def each_segment(self) -> Iterator[tuple[MotionGrid, slice, slice]]:
+        """Yields each segment between gaps, its slice of the grid and its slice of the rows.
+
+        Filters and effects with a state begin anew in each segment.
+        """
+        first, first_row = 0, 0
+        for own in self.segments or (self,):
+            end, end_row = first + len(own.t), first_row + len(own.row_times)
+            yield own, slice(first, end), slice(first_row, end_row)
+            first, first_row = end, end_row
 
     @property
-    def inner(self) -> slice:
-        """Slice of every `step`-th row, without the first and the last `ENDS` seconds."""
+    def longest_segment(self) -> MotionGrid:
+        """Longest segment between gaps."""
+        return max(self.segments or (self,), key=lambda own: len(own.t))
+
+    @property
+    def inner(self) -> slice | NDArray[np.int_]:
+        """Index of every `step`-th row, without the first and the last `ENDS` seconds of each segment."""
+        if self.segments:
+            return np.concatenate([rows.start + own.inner_rows for own, _, rows in self.each_segment()])
         ends = round(ENDS * self.rate)
         return slice(ends, len(self.row_times) - ends, self.step)
 
@@ -141,6 +174,10 @@ class MotionGrid:
         not affect the provided rows. Regressors of a long motion are computed part by part, because they do not fit
         into the memory.
         """
+        if self.segments:
+            for own in self.segments:
+                yield from own.parts()
+            return
         inner, count = self.inner_rows, len(self.row_times)
         overlap = round(max(ENDS, PART_OVERLAP / self.settings.effort_cut_off) * self.rate)
         delays = self.settings.effort_delay
@@ -154,6 +191,8 @@ class MotionGrid:
 
     def at_rows(self, x: NDArray[np.float64], actuator: int) -> NDArray[np.float64]:
         """Interpolates x (m, ...) from the grid to the rows (r, ...), with the delay of the actuator's effort."""
+        if self.segments:
+            return np.concatenate([own.at_rows(x[of_grid], actuator) for own, of_grid, _ in self.each_segment()])
         index = (self.row_times - self.settings.effort_delay[actuator] - self.t[0]) * GRID_RATE
         before = np.clip(np.floor(index).astype(int), 0, len(x) - 2)
         share = np.clip(index - before, 0.0, 1.0).reshape(-1, *[1] * (x.ndim - 1))
@@ -165,8 +204,14 @@ class MotionGrid:
 
     def filter_rows(self, x: NDArray[np.float64], rows: slice | NDArray[np.int_]) -> NDArray[np.float64]:
         """Applies the low-pass filter of the efforts to x (r, ...) and returns some of the rows."""
+        return self.low_passed(x)[rows]
+
+    def low_passed(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Applies the low-pass filter of the efforts to x (r, ...)."""
+        if self.segments:
+            return np.concatenate([own.low_passed(x[of_rows]) for own, _, of_rows in self.each_segment()])
         flat = low_pass(x.reshape(len(x), -1), self.rate, self.settings.effort_cut_off)
-        return flat.reshape(x.shape)[rows]
+        return flat.reshape(x.shape)
 
     def efforts_at_rows(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolates efforts (m, n) of the actuators from the grid to the rows (r, n), with the effort delays."""
@@ -193,7 +238,8 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
     """Resamples a motion to the grid.
 
     Positions are filtered and differentiated in actuator coordinates, because each actuator has its own encoder and
-    cut-off. Recorded velocities are used only to estimate the true times of the rows, see `true_time`.
+    cut-off. Recorded velocities are used only to estimate the true times of the rows, see `true_time`. The segments
+    between gaps are resampled and filtered separately.
 
     Args:
         recording: Motion with t and efforts, in joint or actuator coordinates.
@@ -205,19 +251,57 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
         RecordingError: The recording does not match the arm, has no times, is too short, or its rate is too low.
     """
     recording.check_fits(arm)
+    channels = np.eye(arm.num_joints) if recording.tau is None else recording.measured_channels(arm)
     recording = recording.in_actuator_coordinates(arm)
-    clock = clock or true_time(recording)
-    duration = float(clock.t[-1] - clock.t[0])
-    rate = (len(recording) - 1) / duration if duration > 0 else 0.0
-    if duration < MIN_DURATION or rate < MIN_RATE:
-        intervals = np.diff(clock.t)
-        gap = float(np.max(intervals, initial=0.0))
-        row = int(clock.rows[int(np.argmax(intervals))]) if len(intervals) else 0
-        longest = f", with {gap:.1f} s without rows after {recording.where(row)}" if gap > 0.5 * duration > 0 else ""
+    increasing_times(recording)
+    rows = recording.segments()
+    clocks = [clock or true_time(recording)] if len(rows) == 1 else [true_time(recording.select(own)) for own in rows]
+    _check_duration(clocks, rows, recording)
+    grids = []
+    for own, times in zip(rows, clocks, strict=True):
+        segment = recording if len(rows) == 1 else recording.select(own)
+        grids.append(_segment_grid(segment, times, arm, settings, channels))
+    if len(grids) == 1:
+        return grids[0]
+    whole = TrueTime(
+        np.concatenate([own.start + times.rows for own, times in zip(rows, clocks, strict=True)]),
+        np.concatenate([times.t for times in clocks]),
+        max(times.jitter for times in clocks),
+        any(times.reconstructed for times in clocks),
+    )
+    rate = sum(len(g.row_times) - 1 for g in grids) / sum((len(g.row_times) - 1) / g.rate for g in grids)
+    # The rates of the segments of one recording differ only by lost rows.
+    segments = tuple(replace(g, rate=rate) for g in grids)
+    t, q, v, vd, row_times = (
+        np.concatenate([getattr(g, name) for g in grids]) for name in ("t", "q", "v", "vd", "row_times")
+    )
+    return MotionGrid(arm, settings, t, q, v, vd, row_times, rate, whole, channels, segments=segments)
+
+
+def _check_duration(clocks: list[TrueTime], rows: list[slice], recording: Recording) -> None:
+    """Raises RecordingError if a motion or one of its segments between gaps is too short, or the rate is too low."""
+    durations = [float(times.t[-1] - times.t[0]) for times in clocks]
+    total = sum(durations)
+    rate = (len(recording) - len(rows)) / total if total > 0 else 0.0
+    source = recording.source or "recording"
+    if total < MIN_DURATION or rate < (1 - MAX_LOST) * MIN_RATE:
+        gaps = f", in {len(rows)} segments between gaps of t" if len(rows) > 1 else ""
         raise RecordingError(
-            f"{recording.source or 'recording'}: the motion lasts {duration:.1f} s at {rate:.0f} Hz{longest}. A "
-            f"dynamic model requires at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
+            f"{source}: the motion lasts {total:.1f} s at {rate:.3g} Hz{gaps}. A dynamic model requires at least "
+            f"{MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         )
+    if min(durations) < (MIN_SEGMENT if len(rows) > 1 else 0.0):
+        k = int(np.argmin(durations))
+        raise RecordingError(
+            f"{recording.where(rows[k].start)}: only {durations[k]:.3g} s of motion between two gaps of t; required: "
+            f"{MIN_SEGMENT:g} s. Remove these {rows[k].stop - rows[k].start} rows."
+        )
+
+
+def _segment_grid(
+    recording: Recording, clock: TrueTime, arm: Arm, settings: SignalSettings, channels: NDArray[np.float64]
+) -> MotionGrid:
+    """Resamples a motion without gaps, in actuator coordinates."""
     t = _even_times(clock, GRID_RATE)
     raw = resample(clock.t, recording.q[clock.rows], t)
     a = low_pass(raw, GRID_RATE, settings.position_cut_off)
@@ -232,6 +316,7 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
         v=to_joint.velocity(central_difference(a, GRID_RATE)),
         vd=to_joint.velocity(central_difference(central_difference(slow, GRID_RATE), GRID_RATE)),
         row_times=clock.t[np.maximum(last, 0)],
-        rate=rate,
+        rate=(len(recording) - 1) / float(clock.t[-1] - clock.t[0]),
         clock=clock,
+        channels=channels,
     )

@@ -85,6 +85,19 @@ def repeatability_floor(
         return np.asarray(np.sqrt(np.mean(difference**2, axis=0) / 2) / size)
 
 
+def motion_floor(tau: NDArray[np.float64], grid: MotionGrid, period: float) -> NDArray[np.float64]:
+    """Returns the repeatability (n,) of the measured efforts in the longest segment of a motion, nan if not measured.
+
+    Args:
+        tau: Efforts (m, n) of the actuators at the rows of the recording [N m, N].
+        grid: Resampled motion.
+        period: Period of the motion [s].
+    """
+    longest = max((rows for _, _, rows in grid.each_segment()), key=lambda rows: rows.stop - rows.start)
+    efforts = (tau @ grid.channels.T)[longest]
+    return repeatability_floor(efforts, grid.rate, period, grid.settings.effort_cut_off)
+
+
 #: Number of folds for cross-validation.
 FOLDS = 12
 #: Duration next to a held-out fold that is not used for the fit [s]. Low-pass filtering correlates these rows with the
@@ -93,8 +106,8 @@ GAP = 0.1
 
 
 def period_of(grid: MotionGrid) -> float | None:
-    """Returns the period of the motion [s], or None if the motion does not repeat."""
-    return find_period(grid.arm.transmission.position(grid.q), GRID_RATE)
+    """Returns the period of the motion [s] in its longest segment, or None if the motion does not repeat."""
+    return find_period(grid.arm.transmission.position(grid.longest_segment.q), GRID_RATE)
 
 
 def phase_folds(
@@ -116,6 +129,10 @@ def phase_folds(
             (column 1).
     """
     t = grid.row_times[grid.inner]
+    if period is None and grid.segments:
+        # Without the gaps, so that each fold has rows.
+        intervals = np.diff(t)
+        t = np.concatenate([[0.0], np.cumsum(np.minimum(intervals, np.median(intervals)))])
     length = period if period is not None else float(t[-1] - t[0]) * (1 + 1e-9)
     phase = ((t - t[0]) % length) / length * folds
     fold = np.minimum(phase.astype(int), folds - 1)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.signals.motion_faults import source_fault, time_fault
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
@@ -253,11 +254,17 @@ def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = F
         with_low_speed_segments: True to extract low-speed segments if a motion has too few static poses.
 
     Raises:
-        RecordingError: The recording does not match the arm, has no efforts, or is a motion with decreasing times.
+        RecordingError: The recording does not match the arm, has no efforts, or is a motion with decreasing times or
+            with a fault (`source_fault`, `time_fault`).
         IdentificationError: Low-speed segments are requested, but there are none.
     """
-    recording.check_fits(arm)
-    _check_times(recording, arm)
+    fault = source_fault(recording, arm)
+    if fault is None:
+        recording.check_fits(arm)
+        _check_times(recording, arm)
+        fault = time_fault(recording, arm)
+    if fault is not None:
+        raise RecordingError(f"{recording.source or 'recording'}: refused: {fault.where}: {fault.what}. {fault.advice}")
     poses = static_poses(recording, arm)
     if poses is not None and len(poses) >= MIN_POSES:
         return Poses(poses, None, f"Static poses found in the motion: {len(poses)}, in {len(recording)} rows.")

@@ -109,6 +109,7 @@ def identify_static(
 
     if method not in get_args(Method):
         raise IdentificationError(f'method is "{method}"; allowed: {", ".join(get_args(Method))}')
+    known = None if recording.tau is None else recording.measured_joints(arm)
     recording = usable_poses(recording, arm, averaged=method == "robust" and measured is None)
     tau = recording.measured_effort()
     gravity_model = compile_static_model(arm)
@@ -119,6 +120,8 @@ def identify_static(
     if measured is None:
         measured = np.ones(tau.shape, dtype=bool)
     usable = usable_measurements(tau.shape, excluded) & measured
+    if known is not None:
+        usable &= known
     effects: tuple[ActuatorEffect, ...] = ()
     feedforward_scale = np.ones(arm.num_joints)
     if method == "paper":

@@ -137,6 +137,7 @@ def validate_static(
     if recording.coordinates == "actuator":
         # An excluded measurement of a joint excludes the measurements of all actuators that drive the joint.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
+    usable = usable & ~recording.unmeasured
     commanded = np.any(predicted != 0, axis=0)
     errors = _joint_errors(arm, measured, residuals, measured_joints, usable, commanded)
     return StaticValidation(

@@ -37,10 +37,13 @@ def friction_over_speed(efforts: MotionEfforts) -> go.Figure | None:
     names = list(dict.fromkeys(e.coordinate for e in effects))
     figure = _grid(names)
     transmitted = model.transmitted_effort(grid.q, grid.v, grid.vd)
-    shapes = effect_shapes(model.regressor, [ActuatorEffect.of(e) for e in effects], grid.q, grid.v, transmitted)
+    of_segments = [
+        effect_shapes(model.regressor, [ActuatorEffect.of(e) for e in effects], g.q, g.v, transmitted[own])
+        for g, own, _ in grid.each_segment()
+    ]
     along: dict[str, NDArray[np.float64]] = {name: np.zeros(len(grid.t)) for name in names}
-    for e, shape in zip(effects, shapes, strict=True):
-        along[e.coordinate] = along[e.coordinate] + e.coefficient * shape
+    for e, *shapes in zip(effects, *of_segments, strict=True):
+        along[e.coordinate] = along[e.coordinate] + e.coefficient * np.concatenate(shapes)
     for k, name in enumerate(names):
         h = arm.effect_coordinates[name]
         speed = efforts.v @ h

@@ -263,3 +263,21 @@ def test_recordings_are_thinned_to_similar_rates(days):
     grids = thinned([motion_grid(recording, ARM, default_settings(ARM)) for recording in (slow, fast)])
     assert [grid.step for grid in grids] == [1, 5]
     assert abs(len(grids[0].inner_rows) - len(grids[1].inner_rows)) < 5
+
+
+def test_identifies_joints_beside_an_unmeasured_one(days):
+    """The jaw and the wrist yaw of a PSM share motors, so the yaw is identified from its joint effort. With a gap."""
+    _, _, recordings = days
+    whole = recordings[1]
+    tau = np.where(np.arange(7) == 6, 0.0, whole.tau)
+    cut = dataclasses.replace(whole, tau=tau).select(np.r_[0:1300, 1340 : len(whole)])
+    result = dvrk.identify(cut, ARM)
+    (motion,) = result.motions
+    assert len(motion.grid.segments) == 2 and len(motion.measured) == len(cut) - 800
+    errors = motion.held_out_errors
+    assert np.all(errors[:6] < 0.15) and np.isnan(errors[6])
+    assert [joint.name for joint in result.model.joints if joint.feedforward_scale == 0] == ["jaw"]
+    assert {"gaps", "no effort"} <= {finding.kind for finding in result.warnings}
+    validation = dvrk.validate(result.model, whole)
+    assert validation.verdicts["jaw"] == "off" and validation.relative_errors["wrist_pitch"] < 0.15
+    np.testing.assert_allclose(dvrk.validate(result.model, cut).predicted, motion.predicted, rtol=0, atol=1e-3)

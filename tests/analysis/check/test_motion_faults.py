@@ -1,0 +1,228 @@
+"""Faults of whole motions: units of time, rates, two sources, wrapped angles, gaps, and efforts without power."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.check import channel_check
+from dvrk_drake.analysis.check.channel_check import MIN_MIRROR_GAIN
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.check.recording_check import check_recording, with_power
+from dvrk_drake.analysis.identification import identify
+from dvrk_drake.analysis.signals.motion_faults import source_fault, time_fault
+from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.validation import predict
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.recordings.recording import Recording
+
+ARM, PSM = load_arm("mtmr"), load_arm("psm")
+
+
+def motion_fault(recording, arm):
+    return source_fault(recording, arm) or time_fault(recording, arm)
+
+
+def motion(rate=100.0, seconds=12.0, arm=ARM, speed=1.0, velocities=False):
+    """Returns a smooth motion with friction-like efforts and noise."""
+    t = np.arange(round(seconds * rate)) / rate
+    w = speed * (1 + 0.2 * np.arange(arm.num_joints))
+    middle, reach = (arm.position_upper + arm.position_lower) / 2, 0.2 * (arm.position_upper - arm.position_lower)
+    q, v = middle + reach * np.sin(w * t[:, None]), reach * w * np.cos(w * t[:, None])
+    noise = np.random.default_rng(0).normal(size=q.shape)
+    tau = arm.effort_limits * (0.1 * np.cos(q) + 0.05 * np.tanh(v / 0.05) + 0.002 * noise)
+    return Recording(q=q, tau=tau, qd=v if velocities else None, t=t, source="motion.csv")
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9), ("hours", 1 / 3600), ("days", 1 / 86400)],
+)
+def test_names_the_unit_of_wrong_times(unit, factor, rate):
+    whole = motion(rate)
+    assert motion_fault(whole, ARM) is None
+    # A time since 1970, as in a bag, and lost rows.
+    rows = np.delete(np.arange(len(whole)), slice(300, 320))
+    other = replace(whole, t=(1.7e9 + whole.t) * factor).select(rows)
+    fault = motion_fault(other, ARM)
+    assert fault.kind == "wrong time" and f"t may be in {unit}: {rate:g} Hz" in fault.what
+    assert [f.kind for f in check_recording(other, ARM).refusals] == ["wrong time"]
+    for call in (lambda: identify(other, ARM), lambda: predict(IdentifiedModel.from_arm(ARM), other)):
+        with pytest.raises(RecordingError, match=f"t may be in {unit}"):
+            call()
+
+
+def test_finds_the_unit_of_times_of_one_moving_joint():
+    whole = motion(velocities=True)
+    still = np.where(np.arange(7) == 1, 1.0, 0.0)
+    one = replace(whole, q=whole.q * still + 0.1 * (1 - still), qd=whole.qd * still, t=1e3 * whole.t)
+    (refusal,) = check_recording(one, ARM).refusals
+    assert "t may be in milliseconds: 100 Hz" in refusal.what
+
+
+@pytest.mark.parametrize("rate", [3.0, 12.0, 19.0])
+def test_slow_rates_are_named(rate):
+    fault = motion_fault(motion(rate, 200.0), ARM)
+    assert fault.kind == "too slow" and f"the rate of {rate:.3g} Hz is too slow" in fault.what
+    assert "50 Hz or more" in fault.advice
+
+
+def test_static_poses_with_times_have_no_fault():
+    """In small steps of one joint, they have no fault if no other unit of the times fits."""
+    q = ARM.sample_poses(200, np.random.default_rng(1), 0.1)
+    assert motion_fault(Recording(q=q, t=np.arange(200.0)), ARM) is None
+    raster = np.tile(q[:1], (200, 1))
+    raster[:, 0] = np.linspace(-0.5, 0.5, 200)
+    assert motion_fault(Recording(q=raster, t=60.0 * np.arange(200)), ARM) is None
+    fault = motion_fault(Recording(q=raster, t=10.0 * np.arange(200)), ARM)
+    assert "If the arm was at rest in each row, remove the column t" in fault.advice
+
+
+def test_accepts_49_9_hz_and_lost_rows():
+    settings = default_settings(ARM)
+    for recording in (motion(49.9), motion(50.0).select(np.delete(np.arange(600), [100, 400]))):
+        assert motion_grid(recording, ARM, settings).rate == pytest.approx(49.9, abs=0.11)
+    with pytest.raises(RecordingError, match=r"lasts 12.0 s at 47 Hz\. A dynamic model requires .* 50 Hz"):
+        motion_grid(motion(47.0), ARM, settings)
+
+
+@pytest.mark.parametrize("order", ["alternating", "random", "two of three"])
+@pytest.mark.parametrize("signal", ["q", "tau", "half tau"])
+def test_two_publishers_on_one_topic_are_named(signal, order):
+    whole, count = motion(), 1200
+    rows = np.arange(count)
+    second = {
+        "alternating": rows % 2 == 0,
+        "random": np.random.default_rng(3).random(count) < 0.5,
+        "two of three": rows % 3 > 0,
+    }[order][:, None]
+    other = {"q": whole.q + 0.1, "tau": -whole.tau, "half tau": 0.5 * whole.tau}[signal]
+    name = "q" if signal == "q" else "tau"
+    mixed = replace(whole, **{name: np.where(second, other, getattr(whole, name))})
+    (refusal,) = check_recording(mixed, ARM).refusals
+    assert refusal.kind == "two sources" and refusal.where == name and "two publishers on one topic" in refusal.advice
+    with pytest.raises(RecordingError, match="two publishers"):
+        identify(mixed, ARM)
+
+
+def test_noise_and_quantisation_are_not_two_publishers():
+    whole = motion()
+    generator = np.random.default_rng(4)
+    noisy = whole.tau + 0.5 * np.std(whole.tau, axis=0) * generator.normal(size=whole.tau.shape)
+    coarse = np.round(noisy / (0.5 * np.std(noisy, axis=0))) * 0.5 * np.std(noisy, axis=0)
+    for tau in (noisy, coarse):
+        assert motion_fault(replace(whole, tau=tau), ARM) is None
+    repeated = np.arange(1200) // 2 * 2
+    assert motion_fault(replace(whole.select(repeated), t=whole.t), ARM) is None
+
+
+@pytest.mark.parametrize("in_motors", [False, True])
+def test_a_wrapped_angle_is_named(in_motors):
+    whole = motion(velocities=True)
+    recording = whole.in_actuator_coordinates(ARM) if in_motors else whole
+    q = recording.q.copy()
+    q[:, 6] = np.where(q[:, 6] > 1.0, q[:, 6] - 2 * np.pi, q[:, 6])
+    wrapped = replace(recording, q=q)
+    (refusal,) = check_recording(wrapped, ARM).refusals
+    assert refusal.kind == "wrapped angle" and refusal.what.startswith("q7 jumps by a multiple of 2 pi in ")
+    # Poses may differ by 2 pi, and a joint may turn by 2 pi in a gap.
+    assert motion_fault(replace(wrapped, t=None, qd=None), ARM) is None
+
+
+def test_drops_rows_without_power():
+    whole = motion()
+    tau = whole.tau.copy()
+    tau[1000:] = 0.0
+    tau[17] = 0.0
+    powered, (finding,) = with_power(replace(whole, tau=tau), ARM)
+    assert len(powered) == 999 and np.all(np.any(powered.tau, axis=1))
+    assert (finding.severity, finding.size) == ("warning", 201.0)
+    assert "all efforts are exactly 0 in 201 of 1200 rows, first at motion.csv, row 18" in finding.what
+    tau[::2] = 0.0
+    _, (finding,) = with_power(replace(whole, tau=tau), ARM)
+    assert "two publishers" in finding.advice
+    off = replace(whole, tau=0 * tau)
+    assert with_power(off, ARM) == (off, ())
+    assert [f.kind for f in check_recording(off, ARM).refusals] == ["no effort"]
+
+
+def test_a_motor_that_is_switched_off_is_refused():
+    whole = motion()
+    tau = whole.tau.copy()
+    tau[700:, 3] = 0.0
+    refusals = [f for f in check_recording(replace(whole, tau=tau), ARM).refusals if f.kind == "no power"]
+    assert [f.what for f in refusals] == [
+        "tau4 is exactly 0 in 500 successive rows while the joint moves, first at motion.csv, row 701"
+    ]
+
+
+def test_constant_efforts_are_not_measured():
+    whole = motion()
+    tau = whole.tau.copy()
+    tau[:, 6], tau[:, 5] = 0.01, 0.0
+    powered, findings = with_power(replace(whole, tau=tau), ARM)
+    assert findings == ()
+    np.testing.assert_array_equal(powered.unmeasured, [False] * 5 + [True] * 2)
+
+
+@pytest.mark.parametrize(("arm", "joint"), [(PSM, 6), (PSM, 5), (ARM, 3), (ARM, 1), (ARM, 6)])
+def test_channels_use_only_measured_efforts(arm, joint):
+    """The channels are the same for every effort of the joint that was not measured, and contain all other efforts."""
+    tau = np.random.default_rng(5).normal(size=(2, 7)) + np.zeros((7, 1, 1))
+    tau = tau[0]
+    recording = Recording(q=np.zeros((2, 7)), tau=np.where(np.arange(7) == joint, 0.0, tau))
+    channels = recording.measured_channels(arm)
+    seen = [
+        (arm.transmission.inverse.pull_back_effort(tau + change * np.eye(7)[joint]) @ channels.T) for change in (0, 1)
+    ]
+    np.testing.assert_allclose(seen[0], seen[1], rtol=0, atol=1e-12)
+    assert np.linalg.matrix_rank(channels) == 6 and not channels[joint].any()
+    np.testing.assert_array_equal(recording.measured_joints(arm), np.arange(7) != joint)
+    motors = replace(recording, coordinates="actuator")
+    np.testing.assert_array_equal(motors.measured_channels(arm), np.diag(np.arange(7) != joint))
+
+
+def test_filters_and_states_begin_anew_after_a_gap():
+    """Each segment has the results of a recording of this segment alone."""
+    whole, settings = motion(seconds=20.0), default_settings(ARM)
+    rows = [np.arange(0, 900), np.arange(1000, 2000)]
+    cut = whole.select(np.concatenate(rows))
+    grid = motion_grid(cut, ARM, settings)
+    alone = [motion_grid(whole.select(own), ARM, settings) for own in rows]
+    for name in ("t", "q", "v", "vd", "row_times"):
+        np.testing.assert_allclose(
+            getattr(grid, name), np.concatenate([getattr(g, name) for g in alone]), rtol=0, atol=1e-9
+        )
+    model = IdentifiedModel.from_arm(ARM, dynamics=True).dynamic_model
+    dry = [model.effort(g.q, g.v, g.vd) for g in alone]
+    expected = [g.filter_efforts(g.efforts_at_rows(x)) for g, x in zip(alone, dry, strict=True)]
+    found = grid.filter_efforts(grid.efforts_at_rows(np.concatenate(dry)))
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        grid.row_times[grid.inner], np.concatenate([g.row_times[g.inner] for g in alone]), rtol=0, atol=1e-9
+    )
+    parts = [part.filter_rows(part.at_rows(part.t**2, 0), own) for part, own in grid.thinned(3).parts()]
+    expected = [part.filter_rows(part.at_rows(part.t**2, 0), own) for g in alone for part, own in g.thinned(3).parts()]
+    np.testing.assert_allclose(np.concatenate(parts), np.concatenate(expected), rtol=0, atol=1e-6)
+
+
+def test_drops_short_segments_between_gaps():
+    whole = motion(seconds=20.0)
+    cut = whole.select(np.r_[0:900, 1000:1100, 1200:2000])
+    with pytest.raises(RecordingError, match=r"row 901: only 0.99 s of motion between two gaps of t"):
+        motion_grid(cut, ARM, default_settings(ARM))
+    kept, (finding,) = with_power(cut, ARM)
+    assert len(kept) == 1700 and "100 of 1800 rows are in 1 segment shorter than 3 s" in finding.what
+    assert motion_grid(kept, ARM, default_settings(ARM)).inner_rows.size == 1300
+
+
+@pytest.mark.parametrize("segments", [1, 4])
+def test_gain_does_not_grow_with_the_length(segments):
+    """Repetitions of a motion have the same errors of the arm model, so they are no further evidence."""
+    almost = Finding("refusal", "inverted channel", "pitch", "inverted", "", (1,), 0.4 * MIN_MIRROR_GAIN)
+    assert channel_check._best_hypothesis([[almost]] * segments) == []
+    (found,) = channel_check._best_hypothesis([[replace(almost, size=1.1 * MIN_MIRROR_GAIN)]] * segments)
+    assert found.size == pytest.approx(1.1 * MIN_MIRROR_GAIN)
