@@ -16,14 +16,13 @@ from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.signals.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import usable_poses
+from dvrk_drake.analysis.verdict import MIN_RANGE
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import COORDINATES_HELP, REST_SPEED, Recording
 
-#: Smallest range of the positions of a joint that moves [rad], [m].
-MIN_RANGE = 0.02, 0.002
 #: Smallest share of the range between its limits that a joint must cover for accurate estimates of its parameters.
 MIN_COVERAGE = 0.1
 #: Smallest reported excess of a position beyond a limit [rad], [m].
