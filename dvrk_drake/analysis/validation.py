@@ -80,10 +80,10 @@ def _refuse_motion(model: IdentifiedModel, recording: Recording) -> None:
     if motion := recording.motion(model.arm):
         why = "the model is static: it has no inertia and no friction"
         if model.dynamics is not None:
-            why = f"the recording is no motion for a dynamic model ({MIN_ROWS} rows with t, less than {MAX_PERIOD} s apart)"
+            why = f"it is no motion for a dynamic model: {MIN_ROWS} rows with t, less than {MAX_PERIOD} s apart"
         raise RecordingError(
-            f"{recording.source or 'recording'}: the arm moves ({motion}), but {why}. Validate with poses at rest, with "
-            f"a recording that has at least {MIN_POSES} static poses, or with --low-speed-segments."
+            f"{recording.source or 'recording'}: the arm moves ({motion}), but {why}. Validate with poses at rest, "
+            f"with a recording that has at least {MIN_POSES} static poses, or with --low-speed-segments."
         )
 
 

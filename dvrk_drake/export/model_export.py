@@ -10,9 +10,9 @@ from typing import Literal, get_args
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies, model_bodies
 from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_psm_gravity_compensation import KinematicCompensation, is_psm, kinematic_compensation
 from dvrk_drake.export.sdf import refuse_existing_meshes, write_sdf
 from dvrk_drake.export.urdf import write_urdf

@@ -38,7 +38,6 @@ from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, write_recording
 
-
 ARM = load_arm("mtmr")
 LIMITS = Tolerance(friction=0.4, stiffness=0.6)
 
