@@ -286,6 +286,8 @@ def predict(
     write_csv(output, names, np.hstack(list(columns.values())))
     print_warnings(make_console(), prediction.warnings)
     print_written(output, f"{len(tau)} rows, {read.coordinates} coordinates")
+    if prediction.half_width is not None:
+        print(loaded.interval_scope, flush=True)
 
 
 @app.command(group=IDENTIFY)

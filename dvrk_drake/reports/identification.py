@@ -426,7 +426,10 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     console.print()
     if not verbose:
         return
-    print_note(console, "inside: share of the measured efforts inside the 95 % prediction interval of the model.")
+    print_note(
+        console,
+        f"inside: share of the measured efforts inside the prediction interval. {validation.model.interval_scope}",
+    )
     print_note(console, f"{rule_text()} Low-pass filter: {validation.cut_off:g} Hz.")
     table = make_table("Largest shares of the squared error", "", "share", "cause", "share", "cause")
     for a in validation.actuators:

@@ -20,8 +20,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
 #: Angle above which a difference from the assumed direction is reported [rad]. Poses of upright MTMs give up to 4.2
-#: deg (mtm_2015_apr18_all80). At 5 deg, about 0.09 N m of the 1 N m on the shoulder of an MTM act on the outer yaw. This
-#: is its dry friction.
+#: deg (mtm_2015_apr18_all80). At 5 deg, about 0.09 N m of the 1 N m on the shoulder of an MTM act on the outer yaw,
+#: which is its dry friction.
 LARGE_TILT = np.deg2rad(5.0)
 #: Largest half width of the 95 % interval of an estimate that can be used [rad].
 MAX_HALF_WIDTH = LARGE_TILT
