@@ -75,7 +75,7 @@ def test_friction_and_offsets_of_another_day_are_estimated(name):
     assert 0.1 < np.sqrt(np.mean(z**2)) < 2
 
 
-def test_unchanged_actuators_keep_errors_and_asymmetric_friction_is_refitted():
+def test_asymmetric_friction_is_refitted():
     """The first actuator has the same friction on both days. That of the second depends on the direction."""
     model, truth, generator = days("psm")
     section = model.dynamics

@@ -71,7 +71,7 @@ def test_printed_rule_contains_the_thresholds():
 
 
 @pytest.mark.parametrize("name", ["mtmr", "psm"])
-def test_tolerances_are_the_dry_friction_and_the_effort_at_15_mrad(name):
+def test_tolerances_are_dry_friction_and_effort_at_15_mrad(name):
     arm = load_arm(name)
     of_joints, of_actuators = tolerances(arm, "joint"), tolerances(arm, "actuator")
     np.testing.assert_allclose([t.friction for t in of_joints], arm.dry_friction(), atol=1e-12)

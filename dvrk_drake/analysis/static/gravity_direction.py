@@ -49,12 +49,12 @@ class GravityDirection(NamedTuple):
 
     @property
     def is_large(self) -> bool:
-        """Whether the 95 % interval of the tilt is above `LARGE_TILT`."""
+        """True if the 95 % interval of the tilt is above `LARGE_TILT`."""
         return self.tilt - self.half_width > LARGE_TILT
 
     @property
     def is_determined(self) -> bool:
-        """Whether the poses determine the direction, see `MAX_HALF_WIDTH`."""
+        """True if the poses determine the direction, see `MAX_HALF_WIDTH`."""
         return self.half_width <= MAX_HALF_WIDTH
 
 
