@@ -70,7 +70,8 @@ def tolerances(arm: Arm, coordinates: Coordinates) -> list[Tolerance]:
 def coverage(arm: Arm, travel: NDArray[np.float64], coordinates: Coordinates) -> NDArray[np.float64]:
     """Returns the share (n,) of the range between the limits that a recording covers, 0 for a joint that did not move.
 
-    A revolute joint needs at most one revolution, because gravity torques repeat.
+    At most half a revolution of a revolute joint counts as its range, because the gravity torque changes its sign after
+    half a revolution.
 
     Args:
         arm: Arm that was recorded.
@@ -78,7 +79,7 @@ def coverage(arm: Arm, travel: NDArray[np.float64], coordinates: Coordinates) ->
         coordinates: Coordinates of the result.
     """
     to_output = np.abs(arm.transmission.matrix) if coordinates == "actuator" else np.eye(arm.num_joints)
-    width = np.minimum(arm.position_upper - arm.position_lower, arm.per_joint(2 * np.pi, np.inf))
+    width = np.minimum(arm.position_upper - arm.position_lower, arm.per_joint(np.pi, np.inf))
     moved = to_output @ travel > arm.per_joint(*MIN_RANGE)
     return np.asarray(np.where(moved, (to_output @ travel) / (to_output @ width), 0.0))
 

@@ -70,13 +70,11 @@ def print_identification(
 
 def _print_coverage(console: Console, verdicts: Mapping[str, Verdict], covered: Sequence[float]) -> None:
     """Prints the joints of which too little of the range is covered for the verdict "good"."""
-    few = [
-        f"{name} ({100 * share:.0f} %)"
-        for (name, verdict), share in zip(verdicts.items(), covered, strict=True)
-        if verdict == "usable" and share < MIN_COVERAGE
-    ]
+    judged = zip(verdicts.items(), covered, strict=True)
+    few = [name for (name, verdict), share in judged if verdict == "usable" and share < MIN_COVERAGE]
     if few:
-        text = f"At most usable, because less than {100 * MIN_COVERAGE:g} % of the range is covered: {', '.join(few)}."
+        limit = f"less than {100 * MIN_COVERAGE:g} % of the range (at most 180 deg) is covered"
+        text = f"At most usable, because {limit}: {', '.join(few)}."
         console.print(text, markup=False)
 
 
