@@ -81,7 +81,7 @@ def estimate_gravity(recording: Recording, arm: Arm) -> GravityDirection:
     problem = StaticProblem(arm, q, tau, usable_measurements(tau.shape, find_excluded(recording, arm)))
     regressor, assumed = DynamicRegressor(arm), arm.gravity / np.linalg.norm(arm.gravity)
     size = float(np.linalg.norm(arm.gravity))
-    axes = [regressor.with_gravity(size * axis) for axis in np.eye(3)]
+    axes = [regressor.with_gravity((size * axis).tolist()) for axis in np.eye(3)]
     poses = arm.sample_poses(100, np.random.default_rng(0))
     sampled = np.array([r.regressor(poses, 0 * poses, 0 * poses) for r in axes])
     independent, _ = independent_columns(sampled.reshape(-1, sampled.shape[-1]))
