@@ -20,7 +20,7 @@ TILTED = [4.905, 0.0, -8.4957]
 
 
 def poses(gravity, seed=0, count=40, share=1.0, noise=0.001):
-    """Returns poses of an arm with this gravity vector and links that are up to 20 % heavier than in the SDF.
+    """Returns poses of an arm with this gravity vector and links that are 10 % heavier than in the SDF.
 
     The poses cover a share of the range of each joint.
     """
@@ -28,11 +28,12 @@ def poses(gravity, seed=0, count=40, share=1.0, noise=0.001):
     q = ARM.sample_poses(count, generator, margin=0.02)
     q = q.mean(axis=0) + share * (q - q.mean(axis=0))
     regressor = DynamicRegressor(ARM).with_gravity(gravity)
-    heavier = regressor.values * generator.uniform(1.0, 1.2)
+    heavier = regressor.values * 1.1
     tau = regressor.torque(q, 0 * q, 0 * q, heavier) + 0.02 * ARM.effort_limits
     return Recording(q=q, tau=tau + noise * ARM.effort_limits * generator.normal(size=q.shape), source="poses.csv")
 
 
+@pytest.mark.slow
 def test_interval_contains_the_tilt():
     """If 95 % of the intervals contain the tilt, fewer than 5 of 8 do so in 4e-4 of all cases."""
     found = [estimate_gravity(poses(TILTED, seed), ARM) for seed in range(8)]
@@ -51,6 +52,7 @@ def test_upright_arm_is_not_reported():
         assert direction.tilt < LARGE_TILT and not direction.is_large
 
 
+@pytest.mark.slow
 def test_forgotten_tilt_is_reported_and_estimated(tmp_path, capsys):
     recording = poses(TILTED)
     (warning,) = [w for w in dvrk.identify(recording, ARM).warnings if w.kind == "base tilt"]
@@ -67,9 +69,7 @@ def test_forgotten_tilt_is_reported_and_estimated(tmp_path, capsys):
     assert "Gravity in the base frame, estimated from the poses: (" in " ".join(output.out.split())
     loaded = dvrk.IdentifiedModel.load(model)
     np.testing.assert_allclose(loaded.arm.gravity, TILTED, atol=9.81 * np.deg2rad(3.0))
-    # The model predicts other poses better than the model that was identified without the tilt.
-    other = poses(TILTED, seed=0)
-    assert dvrk.validate(loaded, other).verdict == "good"
+    assert dvrk.validate(loaded, poses(TILTED, seed=7)).verdict == "good"
     assert main([*words, "--overwrite", "--gravity", "0", "4.9"]) == 2
     assert "--gravity needs three numbers [m/s^2], or the word estimate" in refusal(capsys.readouterr().err)
 
@@ -79,4 +79,4 @@ def test_narrow_poses_do_not_determine_the_direction():
     with pytest.raises(IdentificationError, match=r"do not determine the direction of gravity: .* Measure the tilt"):
         dvrk.identify(recording, ARM, estimate_gravity=True)
     upright = poses(ARM.gravity, share=0.05, noise=0.01)
-    assert not [w for w in dvrk.identify(upright, ARM).warnings if w.kind == "base tilt"]
+    assert not estimate_gravity(upright, ARM).is_large

@@ -32,6 +32,7 @@ def test_blocks_are_successive_and_of_similar_size():
     assert blocks(8, 10).tolist() == list(range(8))
 
 
+@pytest.mark.slow
 def test_cross_validation_holds_out_neighbouring_poses():
     """A sweep with a smooth error that no effect represents: the error at a pose is predicted from its neighbours."""
     arm = dvrk.load_arm("psm").with_locked_joints({"roll": 0.0, "wrist_pitch": 0.0, "wrist_yaw": 0.0, "jaw": 0.0})
