@@ -12,7 +12,7 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.recordings.recording import Recording
 
 
-def test_standard_errors_have_a_correction_for_degrees_of_freedom():
+def test_standard_errors_consider_degrees_of_freedom():
     """Twelve poses and five parameters: without the correction, the ratio would be sqrt(7 / 12) = 0.76."""
     generator, sigma = np.random.default_rng(0), 0.1
     errors, variances = [], []
