@@ -56,6 +56,10 @@ class ScenarioError(DvrkDrakeError):
     """Error for a scenario that cannot be read or simulated."""
 
 
+class SimulationError(DvrkDrakeError):
+    """Error for a simulation that diverged, or whose solver failed."""
+
+
 class CollectionError(DvrkDrakeError):
     """Error for poses that the arm cannot reach, or for a run of `collect` that cannot be started or continued."""
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from dvrk_drake.analysis.dynamic.estimates import DRY_KINDS
+from dvrk_drake.analysis.static.linear_fit import blocks
 from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -183,7 +184,7 @@ def _fit(candidates: list[_Candidate], residual: NDArray[np.float64], usable: ND
 
 def _held_out_error(candidates: list[_Candidate], residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
     """Returns the mean squared error in held-out blocks of successive poses, relative to the residual."""
-    block = np.arange(len(residual)) * _BLOCKS // len(residual)
+    block = blocks(len(residual), _BLOCKS)
     error = residual.copy()
     for k in range(_BLOCKS):
         own = block == k

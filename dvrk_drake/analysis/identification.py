@@ -13,11 +13,13 @@ from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
 from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT, MAX_HALF_WIDTH, GravityDirection
+from dvrk_drake.analysis.static.gravity_direction import estimate_gravity as gravity_direction
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import DvrkDrakeError, RecordingError
+from dvrk_drake.errors import DvrkDrakeError, IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
@@ -32,6 +34,7 @@ def identify(
     *,
     method: Method = "robust",
     low_speed_segments: bool = False,
+    estimate_gravity: bool = False,
     progress: Progress | None = None,
 ) -> StaticIdentification | DynamicIdentification:
     """Checks a recording and identifies the arm's model from it, as `dvrk-drake identify` does.
@@ -54,6 +57,8 @@ def identify(
         method: Method for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
         low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
             poses.
+        estimate_gravity: True to estimate the direction of gravity in the base frame, for a base with an unknown tilt.
+            The vector of `arm` is the initial estimate. Motions of an MTM always give this estimate.
         progress: Callback that receives the name of the step ("checking the recording" or "identifying") and the
             finished share of the step (0 to 1).
 
@@ -80,6 +85,8 @@ def identify(
         ...     print(warning)
         >>> result.save("model.yaml")
     """
+    if estimate_gravity:
+        arm = replace(arm, identification=replace(arm.identification, base_may_tilt=True))
     if not isinstance(recording, Recording):
         if len(recording) != 1:
             if method != "robust" or low_speed_segments:
@@ -95,12 +102,48 @@ def identify(
         if poses.moves:
             motion = identify_dynamic([poses.recording], arm, share)
             return replace(motion, warnings=(*dropped, *report.warnings, *_unexplained(motion)))
+        direction = None if poses.measured is not None else gravity_direction(poses.recording, arm)
+        if estimate_gravity:
+            arm = _with_estimated_gravity(arm, direction, report.source)
         static = identify_static(poses.recording, arm, method, share, poses.measured)
     except DvrkDrakeError as error:
         error.findings = (*dropped, *report.warnings)
         raise
-    warnings = (*dropped, *report.warnings, *_friction_in_segments(static, poses.measured))
-    return replace(static, warnings=warnings, note=poses.note, num_rows=len(poses.recording))
+    note = poses.note
+    if estimate_gravity:
+        note = f"{note} Gravity in the base frame, estimated from the poses: {direction} from the arm file.".strip()
+    tilted = _tilt_warning(direction, report.source) if direction and not estimate_gravity else ()
+    warnings = (*dropped, *report.warnings, *tilted, *_friction_in_segments(static, poses.measured))
+    return replace(static, warnings=warnings, note=note, num_rows=len(poses.recording))
+
+
+def _with_estimated_gravity(arm: Arm, direction: GravityDirection | None, source: str) -> Arm:
+    if direction is None:
+        raise IdentificationError(
+            f"{source}: low-speed segments do not determine the direction of gravity, because they contain friction. "
+            "Give the gravity vector, or record poses at rest."
+        )
+    if not direction.is_determined:
+        raise IdentificationError(
+            f"{source}: the poses do not determine the direction of gravity: {direction} from the arm file; at most +- "
+            f"{np.rad2deg(MAX_HALF_WIDTH):g} deg is allowed. Measure the tilt of the base and give the gravity vector, "
+            "or record more poses over larger ranges."
+        )
+    return arm.with_gravity(direction.gravity.tolist())
+
+
+def _tilt_warning(direction: GravityDirection, source: str) -> tuple[Finding, ...]:
+    if not direction.is_large:
+        return ()
+    what = (
+        f"the base seems to be tilted by more than {np.rad2deg(LARGE_TILT):g} deg. Gravity estimated from the poses: "
+        f"{direction} from the assumed direction. Cable terms of the model replace part of the tilt, so the model is "
+        "wrong at other poses and in an exported file"
+    )
+    advice = "Measure the tilt and identify again with --gravity X Y Z."
+    if direction.is_determined:
+        advice = "Identify again with --gravity X Y Z, or with --gravity estimate."
+    return (Finding("warning", "base tilt", source, what, advice),)
 
 
 def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progress | None) -> DynamicIdentification:

@@ -19,7 +19,7 @@ from dvrk_drake.analysis.signals.drive_efforts import (
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of, phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.dynamic_section import DynamicSection
+from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -35,6 +35,9 @@ SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
 _RELATIVE_ERROR = 0.1
 #: Assumed correlation time of the residuals [s]. Residuals are correlated because they are mainly model errors.
 _CORRELATION_TIME = 0.1
+#: Duration of a block whose residuals are assumed to be independent of those of other blocks [s], see
+#: `estimates.CORRELATION_TIME`.
+_BLOCK = 1.0
 #: Smallest share of the time during which an actuator must move in each direction. Otherwise, its friction is not
 #: fitted.
 MIN_SHARE = 0.1
@@ -52,7 +55,7 @@ class RecalibratedActuator:
     Attributes:
         name: Name of the joint of the actuator.
         before: Relative error of the model before recalibration [1].
-        after: Cross-validated relative error after refitting friction and offset [1].
+        after: Cross-validated relative error of the new model [1]. It equals `before` if `kept` is False.
         kept: True if the new model has the refitted friction and offset.
         reason: Reason why the new model has the earlier friction and offset, "" if `kept` is True.
         dry: Factor by which the dry friction of the actuator changes [1], None if the model has no such friction.
@@ -137,7 +140,8 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
 
     Rigid bodies, springs and cables do not change. The errors are cross-validated over `FOLDS` folds of the motion. If
     the error of an actuator does not decrease, the offset of this actuator and the friction at all of its coordinates
-    keep their values. The remaining factors and offsets are fitted again. The last fit uses the whole recording.
+    keep their values. The remaining factors and offsets are fitted again. The last fit uses the whole recording. The
+    errors, standard errors and prediction intervals of the new model are those of this fit on the recording.
 
     Raises:
         RecordingError: The recording is not a motion of this arm, efforts have the wrong sign, no actuator moves in
@@ -154,12 +158,12 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
         )
     refuse_opposite_efforts(recording, fit.names, fit.tau, fit.expected)
     before = fit.error(fit.unchanged)
-    first = fit.cross_validated_error(excited)
-    free, after = excited.copy(), first
+    free = excited.copy()
+    after = fit.relative(held_out := fit.held_out_residuals(free))
     while np.any(worse := free & ~(after < before)):
         free &= ~worse
-        after = fit.cross_validated_error(free)
-    if not np.mean(np.minimum(before, after)[fit.measured]) < MAX_ERROR:
+        after = fit.relative(held_out := fit.held_out_residuals(free))
+    if not np.mean(after[fit.measured]) < MAX_ERROR:
         raise RecordingError(
             f"{recording.source or 'recording'}: the mean relative error over the actuators is "
             f"{100 * np.mean(after):.0f} % with fitted friction ({100 * np.mean(before):.0f} % before); at most "
@@ -174,7 +178,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
             RecalibratedActuator(
                 name=name,
                 before=float(before[i]),
-                after=float(first[i]),
+                after=float(after[i]),
                 kept=bool(free[i]),
                 reason=reason,
                 dry=fit.scale(x, f"actuator.{name}", "dry"),
@@ -187,9 +191,10 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
         for k, (coordinate, part) in enumerate(fit.keys)
         if not coordinate.startswith("actuator.")
     }
-    section = _section(model.dynamic_model.section, fit, x)
+    section = _section(model.dynamic_model.section, fit, x, fit.standard_errors(free, held_out))
+    section.actuators = fit.statistics(x, held_out)
     return Recalibration(
-        model=_with_section(model, section, recording),
+        model=model.recalibrated(section, recording.source),
         actuators=actuators,
         shared=shared,
         seconds=float(len(fit.tau) / fit.rate),
@@ -209,7 +214,7 @@ def cross_validated_errors(
         ModelError: The model has no dynamics.
     """
     fit = _Fit(model.dynamic_model, recording, folds)
-    return fit.error(fit.unchanged), fit.cross_validated_error(fit.excited)
+    return fit.error(fit.unchanged), fit.relative(fit.held_out_residuals(fit.excited))
 
 
 class _Fit:
@@ -235,32 +240,77 @@ class _Fit:
         self._fold, self._edge = phase_folds(grid, period_of(grid), folds)
         self.excited = _moves_in_both_directions(model, grid) & self.measured
         self.unchanged = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
+        size = np.where(self.measured, np.sqrt(np.mean(self.tau**2, axis=0)), 1.0)
+        self._deviation = np.concatenate([np.full(len(self.keys), SCALE_DEVIATION), OFFSET_DEVIATION * size])
+        # Rows within the correlation time are not independent.
+        self._weight = self.measured / (_RELATIVE_ERROR * size) ** 2 / (self.rate * _CORRELATION_TIME)
 
     def error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the relative errors (n,) for x (k + n,)."""
-        return self._relative(np.sum(self._residuals(x) ** 2, axis=0))
+        return self.relative(self._residuals(x))
 
-    def cross_validated_error(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Returns the relative errors (n,) on held-out folds.
+    def held_out_residuals(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Returns the residuals (r, n) of held-out folds [N m, N].
 
         The fit that predicts a fold does not use the rows next to this fold.
         """
-        squares = np.zeros(len(self.names))
+        residuals = np.empty_like(self.tau)
         for fold in range(self._folds):
             held_out = self._fold == fold
             adjacent = (self._edge[:, 0] & (self._fold == (fold + 1) % self._folds)) | (
                 self._edge[:, 1] & (self._fold == (fold - 1) % self._folds)
             )
-            squares += np.sum(self._residuals(self.solve(free, ~held_out & ~adjacent))[held_out] ** 2, axis=0)
-        return self._relative(squares)
+            residuals[held_out] = self._residuals(self.solve(free, ~held_out & ~adjacent))[held_out]
+        return residuals
 
     def _residuals(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         k = len(self.keys)
         return np.asarray(self.tau - self.other - self.friction @ x[:k] - x[k:])
 
-    def _relative(self, squares: NDArray[np.float64]) -> NDArray[np.float64]:
+    def relative(self, residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the relative RMS values (n,) of residuals (r, n) [1]."""
         size = np.sum(self.tau**2, axis=0)
+        squares = np.sum(residuals**2, axis=0)
         return np.sqrt(np.divide(squares, size, out=np.zeros_like(size), where=size > 0))
+
+    def statistics(self, x: NDArray[np.float64], held_out: NDArray[np.float64]) -> list[ActuatorStatistics]:
+        """Returns the statistics of the actuators for the fit x (k + n,) and its held-out residuals (r, n)."""
+        of_fit = (np.sqrt(np.mean(values**2, axis=0)) for values in (self.tau, self._residuals(x), held_out))
+        return [ActuatorStatistics(name, *map(float, own)) for name, *own in zip(self.names, *of_fit, strict=True)]
+
+    def standard_errors(self, free: NDArray[np.bool_], held_out: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the standard errors (k + n,) of x, 0 for the values that are not fitted.
+
+        They are those of a jackknife over blocks of `_BLOCK` seconds (cluster-robust covariance), because the residuals
+        are correlated.
+
+        Args:
+            free: See `solve`.
+            held_out: Residuals (r, n) of held-out folds [N m, N].
+        """
+        k, fixed = len(self.keys), self._fixed(free)
+        H, P = self._information(np.ones(len(self.tau), dtype=bool))[0], np.diag(self._deviation**-2.0)
+        block = np.arange(len(self.tau)) // max(int(_BLOCK * self.rate), 1)
+        scores = np.hstack([np.einsum("rik,ri->rk", self.friction, self._weight * held_out), self._weight * held_out])
+        of_blocks = np.array([np.sum(scores[block == b], axis=0) for b in range(block[-1] + 1)])
+        A = np.linalg.inv(H[np.ix_(~fixed, ~fixed)])
+        middle = (of_blocks.T @ of_blocks + P)[np.ix_(~fixed, ~fixed)]
+        errors = np.zeros(k + len(self.names))
+        errors[~fixed] = np.sqrt(np.diag(A @ middle @ A))
+        return errors
+
+    def _fixed(self, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
+
+    def _information(self, rows: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the Hessian H (k + n, k + n) of half the cost and the right-hand side b of H x = b."""
+        n = len(self.names)
+        H, b = np.diag(self._deviation**-2.0), self.unchanged / self._deviation**2
+        for i in range(n):
+            X = np.hstack([self.friction[rows, i], np.tile(np.eye(n)[i], (int(np.sum(rows)), 1))])
+            H += self._weight[i] * X.T @ X
+            b += self._weight[i] * X.T @ (self.tau - self.other)[rows, i]
+        return H, b
 
     def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Returns x (k + n,), fitted to some rows of the motion.
@@ -270,17 +320,8 @@ class _Fit:
                 fitted only if all actuators that move the coordinate are in the mask.
             rows: Mask (r,) of the rows.
         """
-        k, n = len(self.keys), len(self.names)
-        fixed = np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
-        size = np.where(self.measured, np.sqrt(np.mean(self.tau**2, axis=0)), 1.0)
-        deviation = np.concatenate([np.full(k, SCALE_DEVIATION), OFFSET_DEVIATION * size])
-        H, b = np.diag(deviation**-2.0), self.unchanged / deviation**2
-        for i in np.flatnonzero(self.measured):
-            X = np.hstack([self.friction[rows, i], np.tile(np.eye(n)[i], (int(np.sum(rows)), 1))])
-            # Rows within the correlation time are not independent.
-            weight = 1 / (_RELATIVE_ERROR * size[i]) ** 2 / (self.rate * _CORRELATION_TIME)
-            H += weight * X.T @ X
-            b += weight * X.T @ (self.tau - self.other)[rows, i]
+        k, n, fixed = len(self.keys), len(self.names), self._fixed(free)
+        H, b = self._information(rows)
         x = self.unchanged.copy()
         R = np.linalg.cholesky(H[np.ix_(~fixed, ~fixed)]).T
         right = b[~fixed] - H[np.ix_(~fixed, fixed)] @ x[fixed]
@@ -301,25 +342,31 @@ def _moves_in_both_directions(model: DynamicModel, grid: MotionGrid) -> NDArray[
     return np.asarray((share >= MIN_SHARE) & (speed >= model.arm.per_joint(*REST_SPEED)))
 
 
-def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64]) -> DynamicSection:
-    """Returns the section of the model with the refitted friction and offsets x (k + n,)."""
-    scales = dict(zip(fit.keys, x[: len(fit.keys)], strict=True))
-    offsets = {f"actuator.{name}": float(c) for name, c in zip(fit.names, x[len(fit.keys) :], strict=True) if c}
+def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64], errors: NDArray[np.float64]) -> DynamicSection:
+    """Returns the section of the model with the refitted friction and offsets.
+
+    The error of one of several friction effects that share a factor contains the earlier error of its share.
+
+    Args:
+        section: Section before the refit.
+        fit: Fit.
+        x: Refitted factors and changes of offsets (k + n,).
+        errors: Standard errors (k + n,) of x, 0 for values that were not fitted.
+    """
+    offsets = {f"actuator.{name}": i for i, name in enumerate(fit.names, start=len(fit.keys)) if errors[i]}
+    parts = [(e.coordinate, FRICTION_PARTS.get(e.kind)) for e in section.effects]
     effects = []
-    for effect in section.effects:
+    for effect, part in zip(section.effects, parts, strict=True):
         coefficient, error = effect.coefficient, effect.standard_error
-        if effect.kind in FRICTION_PARTS:
-            scale = float(scales.get((effect.coordinate, FRICTION_PARTS[effect.kind]), 1.0))
-            coefficient, error = scale * coefficient, scale * error
-        elif effect.kind == "offset":
-            coefficient += offsets.pop(effect.coordinate, 0.0)
-        effects.append(replace(effect, coefficient=coefficient, standard_error=error))
-    effects += [DriveEffect(coordinate, "offset", 0.0, c) for coordinate, c in offsets.items()]
+        if part in fit.keys and errors[i := fit.keys.index(part)]:
+            coefficient, error = x[i] * coefficient, x[i] * error if parts.count(part) > 1 else 0.0
+            error = np.hypot(error, errors[i] * effect.coefficient)
+        elif effect.kind == "offset" and effect.coordinate in offsets:
+            i = offsets.pop(effect.coordinate)
+            coefficient, error = coefficient + x[i], errors[i]
+        effects.append(replace(effect, coefficient=float(coefficient), standard_error=float(error)))
+    effects += [
+        DriveEffect(coordinate, "offset", 0.0, float(x[i]), standard_error=float(errors[i]))
+        for coordinate, i in offsets.items()
+    ]
     return replace(section, effects=effects)
-
-
-def _with_section(model: IdentifiedModel, section: DynamicSection, recording: Recording) -> IdentifiedModel:
-    provenance = replace(
-        model.provenance, method=f"{model.provenance.method}, recalibrated on {recording.source or 'a recording'}"
-    )
-    return replace(model, dynamics=section, provenance=provenance, validation=None)

@@ -157,7 +157,7 @@ class Prediction:
     Attributes:
         tau: Predicted efforts (m, n), in the coordinates of the recording [N m, N].
         half_width: Half widths (n,) of the 95 % prediction intervals (`DynamicModel.half_width`), in the coordinates of
-            the recording [N m, N]. None for holding torques.
+            the recording [N m, N]. None for holding torques. `IdentifiedModel.interval_scope` states their day.
         warnings: Findings of `check`. `str` of a finding is one line.
     """
 

@@ -11,11 +11,13 @@ from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation, predict_motion, validate_motion
 from dvrk_drake.analysis.results import Prediction
 from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.analysis.static.validation import StaticValidation, predict_static, validate_static
 from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Recording
 
 
 def validate(
@@ -40,7 +42,7 @@ def validate(
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute
-            `findings` of the error contains the reasons.
+            `findings` of the error contains the reasons. Or the arm moves, but the model has no dynamics.
         IdentificationError: `low_speed_segments` is True, but the motion has no low-speed segments.
 
     Example:
@@ -64,8 +66,9 @@ def validate(
         errors = validation.relative_errors
         found = unexplained_effort({name: errors[name] for name, v in validation.verdicts.items() if v == "do not use"})
     else:
+        _refuse_motion(model, poses.recording)
         validation = validate_static(model, poses.recording, poses.measured)
-        found = _static_model_warning(poses.recording.motion(arm), report.source)
+        found = ()
     share(1.0)
     if validation.of_same_recording:
         what = "the model was identified from this recording, so the errors are those of the fit"
@@ -73,12 +76,16 @@ def validate(
     return replace(validation, warnings=(*dropped, *report.warnings, *found), note=poses.note)
 
 
-def _static_model_warning(motion: str, source: str) -> tuple[Finding, ...]:
-    if not motion:
-        return ()
-    what = f"the arm moves in this recording ({motion}), but the model is static"
-    advice = "A static model has no inertia and no friction. Validate with poses at rest."
-    return (Finding("warning", "motion", source, what, advice),)
+def _refuse_motion(model: IdentifiedModel, recording: Recording) -> None:
+    """Raises RecordingError if the arm moves, because holding torques can be compared only at rest."""
+    if motion := recording.motion(model.arm):
+        why = "the model is static: it has no inertia and no friction"
+        if model.dynamics is not None:
+            why = f"it is no motion for a dynamic model: {MIN_ROWS} rows with t, less than {MAX_PERIOD} s apart"
+        raise RecordingError(
+            f"{recording.source or 'recording'}: the arm moves ({motion}), but {why}. Validate with poses at rest, "
+            f"with a recording that has at least {MIN_POSES} static poses, or with --low-speed-segments."
+        )
 
 
 def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Prediction:

@@ -1,89 +1,143 @@
 """Judges whether the model torque of a joint may be commanded, from the error of the model on a recording.
 
-docs/benchmarks.md contains the evidence for the thresholds.
+The thresholds follow from the two uses of a model. With gravity compensation only, dry friction must hold the joint
+despite the error. With position control, the error must not deflect the joint by more than 15 mrad at its stiffness.
+docs/benchmarks.md contains the evidence for the largest ratios.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.dynamics.friction_compensation import HOLDING_ERROR_FACTOR, HOLDING_TRAVEL
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.recordings.recording import MIN_RANGE, Coordinates
 
 Requirement = Literal["good", "usable"]
 
-#: Largest ratio of the RMS error to the RMS measured effort for the verdict "good".
-GOOD_RATIO = 0.35
-#: Largest ratio for the verdict "usable" at rest. The ratio of zero torque is 1.
-USABLE_RATIO_AT_REST = 1.0
-#: Largest ratio for the verdict "usable" in motion, where the model includes friction.
-USABLE_RATIO_IN_MOTION = 0.5
-#: Largest RMS error, as a share of the effort limit, for the verdict "usable" at any ratio. Friction holds the joint at
-#: rest despite such an error.
-SMALL_ERROR = 0.02
+#: Largest ratio of the RMS error to the RMS measured effort. The ratio of zero torque is 1. In motions, 0.34 is the
+#: largest published ratio on another motion, and 0.54 is that of a PSM's pitch with a payload that is not modelled.
+LARGEST_RATIO = 0.5
+#: Largest ratio for an error that the dry friction holds. Torques that are independent of the measurement reach this
+#: ratio at ten poses by chance, at two standard deviations: sqrt(1 - 4 / 10) = 0.77.
+LARGEST_RATIO_IN_FRICTION = 0.75
+#: Smallest covered share of the range of a joint for the verdict "good". With a smaller share, most of the torques
+#: within the limits would be extrapolated.
+MIN_COVERAGE = 0.5
+#: Torque below which a model commands no torque, as a share of the dry friction. If a pose is approached from both
+#: sides by a short distance, about 12 % of the dry friction remains in the measurement, so the error of a smaller
+#: torque cannot be measured.
+NEGLIGIBLE = 0.15
 
 
-def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, commanded: bool = True) -> Verdict:
+class Tolerance(NamedTuple):
+    """Largest errors of the torque of a joint at which the joint can be used [N m, N].
+
+    Attributes:
+        friction: Dry friction, which holds the joint at rest despite the error. If the arm file states no friction, it
+            is the same as `stiffness`.
+        stiffness: Torque of the joint's proportional gain at a deflection of `HOLDING_TRAVEL`.
+    """
+
+    friction: float
+    stiffness: float
+
+
+def tolerances(arm: Arm, coordinates: Coordinates) -> list[Tolerance]:
+    """Returns the tolerances (n,) of the joints or actuators of an arm.
+
+    An effort error at one actuator deflects all joints that this actuator drives.
+    """
+    J, rows = arm.transmission.matrix, arm.effect_coordinates
+    at_15_mrad = arm.gains.kp * arm.per_joint(*HOLDING_TRAVEL)
+    drives = J if coordinates == "actuator" else np.eye(arm.num_joints)
+    with np.errstate(divide="ignore"):
+        stiffness = np.min(np.where(drives != 0, at_15_mrad / np.abs(drives), np.inf), axis=1)
+    dry = [e.coefficient * rows[e.coordinate] for e in arm.effects.friction if e.kind != "viscous"]
+    friction = np.abs(np.reshape(dry, (-1, arm.num_joints)) @ (np.eye(len(J)) if coordinates == "actuator" else J))
+    found = [(f or k, k) for f, k in zip(friction.sum(axis=0), stiffness, strict=True)]
+    return [Tolerance(float(f), float(k)) for f, k in found]
+
+
+def coverage(arm: Arm, travel: NDArray[np.float64], coordinates: Coordinates) -> NDArray[np.float64]:
+    """Returns the share (n,) of the range between the limits that a recording covers, 0 for a joint that did not move.
+
+    At most half a revolution of a revolute joint counts as its range, because the gravity torque changes its sign after
+    half a revolution.
+
+    Args:
+        arm: Arm that was recorded.
+        travel: Ranges (n,) of the recorded positions of the joints [rad, m].
+        coordinates: Coordinates of the result.
+    """
+    to_output = np.abs(arm.transmission.matrix) if coordinates == "actuator" else np.eye(arm.num_joints)
+    width = np.minimum(arm.position_upper - arm.position_lower, arm.per_joint(np.pi, np.inf))
+    moved = to_output @ travel > arm.per_joint(*MIN_RANGE)
+    return np.asarray(np.where(moved, (to_output @ travel) / (to_output @ width), 0.0))
+
+
+def judge(effort: float, error: float, tolerance: Tolerance, covered: float, *, commanded: bool = True) -> Verdict:
     """Returns the verdict on one joint.
 
     Args:
         effort: RMS measured effort [N m, N], which is also the RMS error of zero torque. 0 if no effort was measured.
         error: RMS of measured minus predicted effort [N m, N], NaN if unknown.
-        effort_limit: Effort limit of the joint [N m, N].
-        in_motion: True if the recording is a motion and the model has dynamics.
-        commanded: False if identification disabled the feedforward of this joint.
+        tolerance: Tolerances of the joint.
+        covered: Share of the joint's range that the recording covers, 0 if the joint did not move, see `coverage`.
+        commanded: False if the model commands no torque, because identification disabled the feedforward of this joint
+            or its torque is negligible (`NEGLIGIBLE`).
     """
     if not commanded:
         return "off"
-    if not (np.isfinite(effort) and np.isfinite(error) and effort > 0):
+    if not (np.isfinite(effort) and np.isfinite(error) and effort > 0 and covered > 0):
         return "not judged"
-    if error <= GOOD_RATIO * effort:
+    is_good = HOLDING_ERROR_FACTOR * error <= min(tolerance) and covered >= MIN_COVERAGE
+    if is_good and error <= LARGEST_RATIO * effort:
         return "good"
-    usable = USABLE_RATIO_IN_MOTION if in_motion else USABLE_RATIO_AT_REST
-    return "usable" if error <= max(usable * effort, SMALL_ERROR * effort_limit) else "do not use"
+    rests = error <= tolerance.friction
+    is_small = error <= (LARGEST_RATIO_IN_FRICTION if rests else LARGEST_RATIO) * effort
+    return "usable" if is_small and error <= max(tolerance) else "do not use"
 
 
 def reason(
-    verdict: Verdict, effort: float, error: float, effort_limit: float, *, in_motion: bool, prismatic: bool = False
+    verdict: Verdict, effort: float, error: float, tolerance: Tolerance, covered: float, *, prismatic: bool = False
 ) -> str:
-    """Returns the reason for a verdict of `judge` in one sentence.
+    """Returns the numbers behind a verdict of `judge` in a few sentences.
 
     Args:
         verdict: Verdict on the joint.
-        effort, error, effort_limit, in_motion: See `judge`.
+        effort, error, tolerance, covered: See `judge`.
         prismatic: True for a prismatic joint, whose error is in N.
     """
     if verdict == "off":
         if effort == 0:
             return "The model commands no torque, because no effort was measured."
-        return "The model commands no torque, because the recording does not separate gravity from friction."
+        return "The model commands no torque, because the joint has none or it is not separated from friction."
     if verdict == "not judged":
-        return "No effort was measured, or no error is known."
-    ratio, limit = error / effort, USABLE_RATIO_IN_MOTION if in_motion else USABLE_RATIO_AT_REST
-    share = f"The error is {100 * ratio:.0f} % of the measured effort"
-    if verdict == "good":
-        return f"{share} (good: up to {100 * GOOD_RATIO:g} %)."
-    if verdict == "usable" and ratio > limit:
-        unit = "N" if prismatic else "N m"
-        absolute = f"{error:.2g} {unit} or {100 * error / effort_limit:.1f} % of the effort limit"
-        return f"{share}, but it is small: {absolute} (usable: up to {100 * SMALL_ERROR:g} %)."
-    more = "" if verdict == "usable" else f", and {100 * error / effort_limit:.0f} % of the effort limit"
-    return f"{share}{more} (usable: up to {100 * limit:g} %)."
-
-
-def rule_text(in_motion: bool) -> str:
-    """Returns the rule of `judge` as text, with the thresholds."""
-    good, usable, zero = (
-        f"{100 * ratio:g} %" if in_motion else f"{ratio:g}"
-        for ratio in (GOOD_RATIO, USABLE_RATIO_IN_MOTION if in_motion else USABLE_RATIO_AT_REST, 1.0)
-    )
+        return "No effort was measured, the joint did not move, or no error is known."
+    unit, travel = ("N", "1.5 mm") if prismatic else ("N m", "15 mrad")
     return (
-        f"ratio: RMS error / RMS measured effort ({zero} for zero torque). good: ratio up to {good}. usable: ratio up "
-        f"to {usable}, or error up to {100 * SMALL_ERROR:g} % of the effort limit. do not use: all other joints. off: "
-        "the model commands no torque. not judged: no effort was measured."
+        f"The RMS error is {error:.2g} {unit} or {100 * error / effort:.0f} % of the measured effort. Dry friction: "
+        f"{tolerance.friction:.2g} {unit}. Torque of the gains at {travel}: {tolerance.stiffness:.2g} {unit}. Range "
+        f"covered: {100 * covered:.0f} %."
+    )
+
+
+def rule_text() -> str:
+    """Returns the rule of `judge` as text, with the thresholds."""
+    return (
+        f"ratio: RMS error / RMS measured effort (1 for zero torque). good: {HOLDING_ERROR_FACTOR:g} x RMS error is "
+        "below the dry friction, which then holds the joint, and below the torque of the gains at 15 mrad (1.5 mm); "
+        f"ratio up to {LARGEST_RATIO:g}; at least {100 * MIN_COVERAGE:g} % of the range covered. usable: RMS error is "
+        f"below one of both, and ratio up to {LARGEST_RATIO:g}, or {LARGEST_RATIO_IN_FRICTION:g} if the error is below "
+        "the dry friction. do not use: all other joints. off: the model commands no torque, or one below "
+        f"{100 * NEGLIGIBLE:g} % of the dry friction. not judged: no effort was measured, or the joint did not move."
     )
 
 
@@ -103,12 +157,12 @@ def unfit(verdicts: Mapping[str, str], required: Requirement) -> list[str]:
 
 
 def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...]:
-    """Returns a warning for the joints whose relative error in motion exceeds `USABLE_RATIO_IN_MOTION`.
+    """Returns a warning for the joints whose relative error in motion exceeds `LARGEST_RATIO`.
 
     Args:
         errors: Relative error of each joint [1], None if the measured effort is 0.
     """
-    bad = [f"{name} ({100 * e:.0f} %)" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
+    bad = [f"{name} ({100 * e:.0f} %)" for name, e in errors.items() if e is not None and e > LARGEST_RATIO]
     if not bad:
         return ()
     what = "the RMS error of the model exceeds half of the RMS effort"
@@ -118,30 +172,26 @@ def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...
     return (Finding("warning", "unexplained effort", ", ".join(bad), what, advice),)
 
 
+def identified_coverage(model: IdentifiedModel) -> NDArray[np.float64]:
+    """Returns the `coverage` (n,) of the recording of the identification. For a motion, it is that of the actuators."""
+    travel = np.array([j.position_upper - j.position_lower for j in model.joints])
+    return coverage(model.arm, travel, "joint" if model.dynamics is None else "actuator")
+
+
 def cross_validated_verdicts(model: IdentifiedModel) -> dict[str, Verdict]:
     """Returns the verdict on each joint from the cross-validated errors of the identification.
 
     Validation with another recording is a stronger test.
     """
-    limits = model.arm.effort_limits
-    if model.dynamics is not None:
-        return {
-            a.name: judge(
-                a.rms_effort,
-                a.rms_cross_validation,
-                float(limit),
-                in_motion=True,
-                commanded=joint.feedforward_scale > 0,
-            )
-            for a, joint, limit in zip(model.dynamics.actuators, model.joints, limits, strict=True)
-        }
+    numbers = (
+        [(j.rms_zero_torque_included, j.rms_cross_validation_included) for j in model.joints]
+        if model.dynamics is None
+        else [(a.rms_effort, a.rms_cross_validation) for a in model.dynamics.actuators]
+    )
+    limits = tolerances(model.arm, "joint" if model.dynamics is None else "actuator")
     return {
-        j.name: judge(
-            j.rms_zero_torque_included,
-            j.rms_cross_validation_included,
-            float(limit),
-            in_motion=False,
-            commanded=j.feedforward_scale > 0,
+        joint.name: judge(effort, error, limit, float(covered), commanded=joint.feedforward_scale > 0)
+        for joint, (effort, error), limit, covered in zip(
+            model.joints, numbers, limits, identified_coverage(model), strict=True
         )
-        for j, limit in zip(model.joints, limits, strict=True)
     }

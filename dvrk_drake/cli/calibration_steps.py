@@ -11,6 +11,7 @@ from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.cli.support import mounted
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import CollectionError
+from dvrk_drake.export.model_export import controller_format
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.environment import Environment
@@ -138,7 +139,13 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
         words = ("validate", recording, "--model", model, "--save", "--overwrite", "--report", report, *required)
         return Step(title, words, done)
 
-    gravity_file = "--dvrk-gc" if arm.name.startswith("MTM") else "--dvrk-kinematic-gc"
+    format = controller_format(arm)
+    export_gravity = creates(
+        "Export the gravity compensation",
+        "gravity.json",
+        *("export", "--model", DYNAMIC, f"--{format}"),
+        is_required=False,
+    )
     first, second = settings.seed, settings.seed + 1
     recorded = (*parts("motion"), "poses.csv")
     identified = ("identify", *recorded, *common, *gravity, "--report", "model_report.html", "--overwrite")
@@ -163,12 +170,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
             *("validate", "test_poses.csv", "--model", DYNAMIC, "--require", "usable", "--report"),
         ),
         creates("Export the full dynamics", "model.sdf", "export", "--model", DYNAMIC, "--sdf"),
-        creates(
-            "Export the gravity compensation",
-            "gravity.json",
-            *("export", "--model", DYNAMIC, gravity_file),
-            is_required=False,
-        ),
+        *([export_gravity] if format is not None else []),
     ]
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli.app import (
@@ -41,6 +42,30 @@ if TYPE_CHECKING:
     from dvrk_drake.reports.html.page import Page
     from dvrk_drake.reports.html.provenance import Provenance
 
+
+def _gravity(_: object, tokens: Sequence[Token]) -> tuple[float, float, float] | Literal["estimate"]:
+    """Converts the words after --gravity. Raises ValueError unless they are three numbers or "estimate"."""
+    words = [token.value for token in tokens]
+    if words == ["estimate"]:
+        return "estimate"
+    try:
+        x, y, z = map(float, words)
+    except ValueError:
+        raise ValueError("--gravity needs three numbers [m/s^2], or the word estimate") from None
+    return x, y, z
+
+
+OwnGravity = Annotated[
+    tuple[float, float, float] | Literal["estimate"] | None,
+    Parameter(
+        metavar="X Y Z",
+        converter=_gravity,
+        n_tokens=-1,
+        consume_multiple=True,
+        help="Gravity vector in the base frame of the arm [m/s^2], e.g. for a tilted base. The word estimate instead "
+        "of the numbers estimates the direction from the recording. Default: the vector in the arm file.",
+    ),
+]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 LowSpeedSegments = Annotated[
     bool, Parameter(show_default=False, help="Treat low-speed segments of a motion as static poses.")
@@ -60,7 +85,7 @@ def identify(
     file: FileOptions = _FILE,
     method: Literal["robust", "paper"] = "robust",
     low_speed_segments: LowSpeedSegments = False,
-    gravity: Gravity = None,
+    gravity: OwnGravity = None,
     locked: Locked = None,
     plots: Plots = None,
     report: Report = None,
@@ -83,14 +108,21 @@ def identify(
     paths = (recording, *others)
     check_output(output, *paths, overwrite=overwrite)
     check_report(report, *paths, overwrite=overwrite)
-    recorded_arm = mounted(dvrk.load_arm(arm), gravity, locked)
+    recorded_arm = mounted(dvrk.load_arm(arm), None if gravity == "estimate" else gravity, locked)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
         read = []
         for path in paths:
             read.append(file.read(path, recorded_arm, steps))
             print_notes(path, read[-1].notes)
-        result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
+        result = dvrk.identify(
+            read,
+            recorded_arm,
+            method=method,
+            low_speed_segments=low_speed_segments,
+            estimate_gravity=gravity == "estimate",
+            progress=steps,
+        )
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     result.save(output, overwrite=True)
     if folder is not None:
@@ -254,6 +286,8 @@ def predict(
     write_csv(output, names, np.hstack(list(columns.values())))
     print_warnings(make_console(), prediction.warnings)
     print_written(output, f"{len(tau)} rows, {read.coordinates} coordinates")
+    if prediction.half_width is not None:
+        print(loaded.interval_scope, flush=True)
 
 
 @app.command(group=IDENTIFY)

@@ -160,7 +160,8 @@ class DynamicModel:
         """Half widths (n,) of the 95 % prediction intervals of the actuator efforts after low-pass filtering [N m, N].
 
         They are 1.96 times the RMS error on held-out parts of the recording, and apply to similar motions of the same
-        day. They are 0 for a model without this error.
+        day. For a model of several recordings, the held-out parts are whole recordings, so the variance between their
+        days is included. They are 0 for a model without this error.
         """
         errors = {a.name: a.rms_cross_validation for a in self.section.actuators}
         return np.array([NORMAL_95 * errors.get(name, 0.0) for name in self.arm.joint_names])

@@ -11,15 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, joint_row
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, is_prismatic, joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm import Arm
 
-#: Largest travel before sliding [rad, m] of the presliding effects that are assumed to hold the arm at rest.
-HOLDING_TRAVEL = 0.015
-#: Largest `ActuatorEffect.scale` [rad/s, m/s] of the Coulomb effects that are assumed to hold the arm at rest.
-HOLDING_SPEED = 0.25
+#: Largest travel before sliding [rad], [m] of the presliding effects that are assumed to hold the arm at rest.
+HOLDING_TRAVEL = 0.015, 0.0015
+#: Largest `ActuatorEffect.scale` [rad/s], [m/s] of the Coulomb effects that are assumed to hold the arm at rest.
+HOLDING_SPEED = 0.25, 0.025
 #: Largest share of the friction that may be compensated. On another day, an arm may have a third less friction than
 #: identified (docs/dynamics.md). The compensation must never exceed the actual friction.
 MAX_RATIO = 0.6
@@ -110,12 +110,18 @@ class Friction:
     def holds(self) -> NDArray[np.bool_]:
         """Mask (k,), True for effects that hold the arm at rest within `HOLDING_TRAVEL`."""
         max_scale = {"coulomb": HOLDING_SPEED, "presliding": HOLDING_TRAVEL}
-        return np.array([e.scale <= max_scale.get(e.kind, -1.0) for e in self.effects], bool)
+        return np.array([e.scale <= self._for(e, *max_scale.get(e.kind, (-1.0, -1.0))) for e in self.effects], bool)
 
     @property
     def springs_back(self) -> NDArray[np.bool_]:
         """Mask (k,), True for presliding effects that can move a released arm back by more than `HOLDING_TRAVEL`."""
-        return np.array([e.kind == "presliding" and e.scale > HOLDING_TRAVEL for e in self.effects], bool)
+        return np.array(
+            [e.kind == "presliding" and e.scale > self._for(e, *HOLDING_TRAVEL) for e in self.effects], bool
+        )
+
+    def _for(self, effect: ActuatorEffect, revolute: float, prismatic: float) -> float:
+        """Returns the value for the type of the effect's coordinate."""
+        return prismatic if is_prismatic(self.arm, effect.coordinate) else revolute
 
 
 def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:

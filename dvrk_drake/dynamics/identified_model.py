@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 #: Format of the files that `IdentifiedModel.save` writes.
 #: Versions 2 to 4 have no locked joints. In version 2, `arm` is a name or an absolute path.
 FORMAT = FileFormat("dvrk_drake identified model", 5, oldest=2)
+#: Text between the method of an identification and the recording of the last recalibration.
+_RECALIBRATED = ", recalibrated on "
 #: Allowed range of measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
 
@@ -347,6 +349,20 @@ class IdentifiedModel(_Identified):
         replaced = {e.coordinate for e in self.effects if e.kind == "offset"}
         of_motion = (self.dynamics.effects[i] for i in self.dynamic_model.holding_effects)
         return [*(e for e in of_motion if e.kind != "offset" or e.coordinate not in replaced), *self.effects]
+
+    @property
+    def interval_scope(self) -> str:
+        """Sentence on the recordings, and therefore the days, whose errors the 95 % prediction intervals contain."""
+        recordings = self.provenance.method.partition(_RECALIBRATED)[2] or self.provenance.recording or "one recording"
+        return (
+            f"The 95 % prediction intervals contain only the errors within and between the recordings of the model "
+            f"({recordings}). They are valid for similar motions on the same days. On another day, recalibrate."
+        )
+
+    def recalibrated(self, dynamics: DynamicSection, recording: str) -> "IdentifiedModel":
+        """Returns the model with a section of dynamics that was refitted to a recording, without its validation."""
+        method = f"{self.provenance.method.partition(_RECALIBRATED)[0]}{_RECALIBRATED}{recording or 'a recording'}"
+        return replace(self, dynamics=dynamics, provenance=replace(self.provenance, method=method), validation=None)
 
     @property
     def theta(self) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ScenarioError
+from dvrk_drake.errors import ScenarioError, SimulationError
 from dvrk_drake.experiments.scenario import Scenario, Target
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.loop_closure import Closure
@@ -104,6 +104,7 @@ def simulate(
     Raises:
         ScenarioError: An argument is invalid, e.g. a pose is outside the limits, or a setting is given together with a
             scenario.
+        SimulationError: The simulation diverged.
         ArmError: An effect does not exist.
 
     Example:
@@ -210,12 +211,23 @@ def sample_times(duration: float, period: float) -> NDArray[np.float64]:
 def advance(
     simulator: Simulator, times: NDArray[np.float64], progress: Callable[[float], object] = lambda share: None
 ) -> None:
-    """Advances a simulation to each of `times` (m,) [s] and calls `progress` with the finished share, 0..1."""
+    """Advances a simulation to each of `times` (m,) [s] and calls `progress` with the finished share, 0..1.
+
+    Raises:
+        SimulationError: A solver of Drake failed, or a system met numbers that it cannot compute with.
+    """
     for t in times:
-        if t > 0:
-            simulator.AdvanceTo(t)
-        else:  # AdvanceTo(0) would perform the first step of the plant
-            simulator.Initialize()
+        try:
+            if t > 0:
+                simulator.AdvanceTo(t)
+            else:  # AdvanceTo(0) would perform the first step of the plant
+                simulator.Initialize()
+        except (RuntimeError, np.linalg.LinAlgError, FloatingPointError) as error:
+            # A RuntimeError that a system in Python raised has its frames in the traceback. Drake's own has none.
+            if isinstance(error, RuntimeError) and error.__traceback__ and error.__traceback__.tb_next is not None:
+                raise
+            at = simulator.get_context().get_time()
+            raise SimulationError(f"the simulation failed at {at:.4g} s: {' '.join(str(error).split())}") from error
         progress(t / times[-1])
 
 

@@ -31,6 +31,7 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import shared_plant
 
@@ -129,6 +130,11 @@ def _sideways_tilt(gravity: NDArray[np.float64]) -> float:
     return float(np.arcsin(abs(gravity[0]) / np.linalg.norm(gravity)))
 
 
+def is_psm(arm: Arm) -> bool:
+    """Returns whether the format supports the arm: a PSM with the links of this package."""
+    return arm.joint_names[:3] == ARM_JOINTS and shared_plant(arm).HasBodyNamed("back_crank_link")
+
+
 def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = None) -> KinematicCompensation:
     """Converts the gravity torque of yaw, pitch and insertion to the controller's chain, for a straight instrument.
 
@@ -146,7 +152,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     """
     arm = model.arm
     plant = shared_plant(arm)
-    if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
+    if not is_psm(arm):
         raise ModelError(
             f"{arm.name} is not a PSM. The format dvrk-kinematic-gc supports only a PSM; for an MTM, use dvrk-gc"
         )

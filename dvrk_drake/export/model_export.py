@@ -10,11 +10,13 @@ from typing import Literal, get_args
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies, model_bodies
 from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.export.dvrk_psm_gravity_compensation import KinematicCompensation, kinematic_compensation
+from dvrk_drake.export.dvrk_psm_gravity_compensation import KinematicCompensation, is_psm, kinematic_compensation
 from dvrk_drake.export.sdf import MeshFormat, refuse_existing_meshes, write_sdf
 from dvrk_drake.export.urdf import touching_shapes, write_urdf
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import refuse_existing
 
 Format = Literal["sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc"]
@@ -64,6 +66,13 @@ class ModelExport:
             self.compensation.save(path, arm.name, f"dvrk-drake export of {self.origin}")
         elif self.compensation is not None:
             self.compensation.save(path)
+
+
+def controller_format(arm: Arm) -> Format | None:
+    """Returns the format of the dVRK controller's gravity-compensation file for an arm, None if there is none."""
+    if arm.joint_names == MTM_JOINTS:
+        return "dvrk-gc"
+    return "dvrk-kinematic-gc" if is_psm(arm) else None
 
 
 def prepare_export(

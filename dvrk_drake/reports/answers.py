@@ -59,9 +59,15 @@ def answer_of(
         step = _after_identification(result, verdicts, model_path, file_options)
     verdict, names = worst(verdicts)
     which = "" if verdict == "good" or len(names) == len(verdicts) else f" ({', '.join(names)})"
-    off = [name for name, v in verdicts.items() if v == "off"]
-    disabled = f" Feedforward disabled: {', '.join(off)}." if off else ""
-    return Answer(verdict, f"Verdict: {verdict}{which}. {_error(result)}".rstrip() + disabled, *step)
+    off = ""
+    for text, is_disabled in (("Feedforward disabled", True), ("Negligible model torque", False)):
+        names = [
+            j.name
+            for j in result.model.joints
+            if verdicts[j.name] == "off" and is_disabled == (j.feedforward_scale == 0)
+        ]
+        off += f" {text}: {', '.join(names)}." if names else ""
+    return Answer(verdict, f"Verdict: {verdict}{which}. {_error(result)}".rstrip() + off, *step)
 
 
 def _after_identification(

@@ -18,7 +18,7 @@ from dvrk_drake.analysis.results import Identification, Validation
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
-from dvrk_drake.analysis.verdict import cross_validated_verdicts, rule_text
+from dvrk_drake.analysis.verdict import MIN_COVERAGE, cross_validated_verdicts, identified_coverage, rule_text
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect
 from dvrk_drake.dynamics.dynamic_section import CorrelatedEstimates, DynamicSection
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
@@ -64,7 +64,18 @@ def print_identification(
         _print_pose_errors(console, result, verdicts, verbose)
         if verbose:
             _print_pose_details(console, result)
+    _print_coverage(console, verdicts, identified_coverage(result.model).tolist())
     _print_locked_joints(console, result.model.arm)
+
+
+def _print_coverage(console: Console, verdicts: Mapping[str, Verdict], covered: Sequence[float]) -> None:
+    """Prints the joints of which too little of the range is covered for the verdict "good"."""
+    judged = zip(verdicts.items(), covered, strict=True)
+    few = [name for (name, verdict), share in judged if verdict == "usable" and share < MIN_COVERAGE]
+    if few:
+        limit = f"less than {100 * MIN_COVERAGE:g} % of the range (at most 180 deg) is covered"
+        text = f"At most usable, because {limit}: {', '.join(few)}."
+        console.print(text, markup=False)
 
 
 def _print_locked_joints(console: Console, arm: Arm) -> None:
@@ -103,6 +114,9 @@ def print_validation(
         _print_motion_validation(console, validation, verbose)
     elif isinstance(validation, StaticValidation):
         _print_pose_validation(console, validation, verbose)
+    if isinstance(validation, DynamicValidation | StaticValidation):
+        judged = validation.actuators if isinstance(validation, DynamicValidation) else validation.joints
+        _print_coverage(console, validation.verdicts, [joint.coverage for joint in judged])
     _print_locked_joints(console, validation.model.arm)
 
 
@@ -410,8 +424,11 @@ def _print_motion_validation(console: Console, validation: DynamicValidation, ve
     console.print()
     if not verbose:
         return
-    print_note(console, "inside: share of the measured efforts inside the 95 % prediction interval of the model.")
-    print_note(console, f"{rule_text(in_motion=True)} Low-pass filter: {validation.cut_off:g} Hz.")
+    print_note(
+        console,
+        f"inside: share of the measured efforts inside the prediction interval. {validation.model.interval_scope}",
+    )
+    print_note(console, f"{rule_text()} Low-pass filter: {validation.cut_off:g} Hz.")
     table = make_table("Largest shares of the squared error", "", "share", "cause", "share", "cause")
     for a in validation.actuators:
         causes = [(share, label) for share, label in zip(a.shares, SHARE_LABELS, strict=True) if share is not None]
@@ -441,7 +458,7 @@ def _print_pose_validation(console: Console, validation: StaticValidation, verbo
     console.print()
     if not verbose:
         return
-    print_note(console, rule_text(in_motion=False))
+    print_note(console, rule_text())
     if validation.excluded:
         table = make_table("RMS effort and error [N m; N], all measurements", "", "measured", "error", "ratio")
         for j in validation.joints:

@@ -63,6 +63,38 @@ def test_friction_and_offsets_of_another_day_are_estimated(name):
         [true[f"actuator.{a.name}", "viscous"] / old[f"actuator.{a.name}", "viscous"] for a in result.actuators]
     )
     np.testing.assert_allclose(found, expected, atol=0.1)
+    # The statistics and intervals of the new model are those of the fit that it contains.
+    for a, own in zip(result.actuators, result.model.dynamics.actuators, strict=True):
+        assert own.rms_cross_validation == pytest.approx(a.after * own.rms_effort, abs=1e-12)
+    similar = validate_motion(result.model, motion(truth, generator, seconds=16.0))
+    assert all(a.inside > 0.9 for a in similar.actuators)
+    truly = {(e.coordinate, e.kind): e.coefficient for e in truth.section.effects}
+    refitted = result.model.dynamics.effects
+    assert all(e.standard_error > 0 for e in refitted)
+    z = np.array([(e.coefficient - truly[e.coordinate, e.kind]) / e.standard_error for e in refitted])
+    assert 0.1 < np.sqrt(np.mean(z**2)) < 2
+
+
+def test_asymmetric_friction_is_refitted():
+    """The first actuator has the same friction on both days. That of the second depends on the direction."""
+    model, truth, generator = days("psm")
+    section = model.dynamics
+    first, second = "actuator.yaw", "actuator.pitch"
+    forward = [dataclasses.replace(e, kind=f"{e.kind} forward") for e in section.effects if e.coordinate == second]
+    forward = [e for e in forward if e.kind == "presliding forward"]
+    section = dataclasses.replace(section, effects=section.effects + forward)
+    today = [e for e in section.effects if e.coordinate == first]
+    today += [
+        dataclasses.replace(e, coefficient=(1.4 if FRICTION_PARTS[e.kind] == "dry" else 1.0) * e.coefficient)
+        for e in section.effects
+        if e.coordinate != first
+    ]
+    truth = DynamicModel(model.arm, dataclasses.replace(section, effects=today))
+    result = refit_friction(dataclasses.replace(model, dynamics=section), motion(truth, generator))
+    (refitted,) = [e for e in result.model.dynamics.effects if e.kind == "presliding forward"]
+    assert refitted.coefficient == pytest.approx(1.4 * forward[0].coefficient, rel=0.1, abs=1e-6)
+    for a in result.actuators:
+        assert a.kept or a.after == a.before
 
 
 def test_rigid_bodies_and_holding_torques_are_unchanged():

@@ -14,6 +14,7 @@ from models_in_directives import OTHER_ARM
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import calibrate, main
+from dvrk_drake.cli.calibration_steps import CalibrationSettings, calibration_steps
 from dvrk_drake.dynamics.identified_model import ValidationSummary
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.recordings.motion_parts import MotionPartFile, Rehearsal
@@ -100,6 +101,21 @@ def ran(monkeypatch):
 
     monkeypatch.setattr(calibrate, "_run", run)
     return commands
+
+
+@pytest.mark.parametrize(
+    ("like", "joints", "option"),
+    [
+        ("mtmr", {}, "--dvrk-gc"),
+        ("psm", {}, "--dvrk-kinematic-gc"),
+        ("psm", {"joint_names": tuple("abcdefg")}, None),
+    ],
+)
+def test_gravity_file_is_chosen_by_the_joints_of_the_arm(tmp_path, like, joints, option):
+    """The names of the arms say nothing: the first arm of dVRK owners may be called anything."""
+    arm = replace(dvrk.load_arm(like), name="MTM of the left cart" if like == "psm" else "master", **joints)
+    steps = calibration_steps(tmp_path, CalibrationSettings(arm=like), arm)
+    assert [step.words[3] for step in steps if "gravity.json" in step.words] == ([option] if option else [])
 
 
 def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):

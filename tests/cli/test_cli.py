@@ -292,14 +292,13 @@ def test_commands_accept_an_arm_file(folder, tmp_path, capsys):
     assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "model", "--arm", tmp_path / "other.yaml")
 
 
-def test_validate_warns_about_a_motion_and_writes_null(folder, tmp_path, capsys):
+def test_validate_writes_null_for_a_joint_without_effort(folder, tmp_path):
     recording = read_recording(folder / "other.csv")
     tau = recording.tau.copy()
     tau[:, 6] = 0.0
-    write_recording(Recording(q=recording.q, tau=tau, t=0.005 * np.arange(len(tau))), tmp_path / "moving.csv")
-    command = ["validate", str(tmp_path / "moving.csv"), "--model", f"{folder}/model.yaml"]
+    write_recording(Recording(q=recording.q, tau=tau), tmp_path / "other.csv")
+    command = ["validate", str(tmp_path / "other.csv"), "--model", f"{folder}/model.yaml"]
     assert main([*command, "--json", str(tmp_path / "v.json")]) == 0
-    assert "the arm moves in this recording" in capsys.readouterr().out
     assert json.loads((tmp_path / "v.json").read_text())["joints"][6]["relative_error"] is None
 
 

@@ -3,13 +3,17 @@
 import numpy as np
 import pytest
 from command_output import refusal
+from pydrake.symbolic import Variable
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import SymbolicVectorSystem
 from repository import ROOT
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ScenarioError
+from dvrk_drake.errors import ScenarioError, SimulationError
 from dvrk_drake.experiments.scenario import Scenario, Target, load_scenario
-from dvrk_drake.experiments.simulation import simulate
+from dvrk_drake.experiments.simulation import advance, simulate
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
@@ -233,3 +237,36 @@ def test_targets_require_mode_hold():
     scenario.controller.mode = "gravity"
     with pytest.raises(ScenarioError, match=r'targets require controller\.mode "hold"'):
         scenario.check()
+
+
+class Failing(LeafSystem):
+    """System whose output raises an error at 0.3 s."""
+
+    def __init__(self, error):
+        super().__init__()
+        self._error = error
+        self.DeclarePeriodicPublishEvent(0.1, 0.0, self._publish)
+
+    def _publish(self, context):
+        if context.get_time() > 0.25:
+            raise self._error
+
+
+def diverging():
+    """Returns a simulation without a solution beyond 1 s: the state of xd = x^2 is 1 / (1 - t)."""
+    x = Variable("x")
+    simulator = Simulator(SymbolicVectorSystem(state=[x], dynamics=[x**2]))
+    simulator.get_mutable_context().SetContinuousState([1.0])
+    return simulator
+
+
+def test_divergence_is_distinguished_from_programming_errors():
+    times = np.arange(0.0, 2.0, 0.1)
+    with pytest.raises(SimulationError, match=r"^the simulation failed at 1 s: .*step smaller than minimum"):
+        advance(diverging(), times)
+    for error in (np.linalg.LinAlgError("Singular matrix"), FloatingPointError("overflow")):
+        with pytest.raises(SimulationError, match=r"^the simulation failed at 0.3 s: (Singular matrix|overflow)"):
+            advance(Simulator(Failing(error)), times)
+    for error in (ValueError("operands could not be broadcast"), RuntimeError("dictionary changed size")):
+        with pytest.raises(type(error), match=str(error)):
+            advance(Simulator(Failing(error)), times)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.results import Validation
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
 from dvrk_drake.analysis.signals.repetition import motion_floor, period_of
-from dvrk_drake.analysis.verdict import judge, rule_text
+from dvrk_drake.analysis.verdict import Tolerance, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.recordings.recording import GAP, MIN_GAP, Recording
 
@@ -74,6 +74,7 @@ class ActuatorError:
         repeatability: Relative RMS difference of the efforts between periods (see `repeatability_floor`) [1], or None
             if the motion does not repeat.
         verdict: Verdict on the actuator, see `judge`.
+        coverage: Share of the range between the limits that the motion covers, see `verdict.coverage` [1].
         inside: Share of the efforts inside the 95 % prediction interval (`DynamicModel.half_width`) [1], or None if the
             model has no interval.
     """
@@ -85,6 +86,7 @@ class ActuatorError:
     shares: ErrorShares
     repeatability: float | None
     verdict: Verdict
+    coverage: float
     inside: float | None = None
 
 
@@ -136,7 +138,7 @@ class DynamicValidation(Validation):
         """Returns the output of `validate --json` as a dictionary."""
         return {
             "verdict": self.verdict,
-            "rule": rule_text(in_motion=True),
+            "rule": rule_text(),
             "coordinates": "actuator",
             "cut_off_hz": self.cut_off,
             "mean_relative_error": self.mean_relative_error,
@@ -186,12 +188,12 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     if period is not None:
         floor = [float(x) if np.isfinite(x) else None for x in motion_floor(tau, grid, period)]
     vd = grid.efforts_at_rows(arm.transmission.velocity(grid.vd))[grid.inner]
+    covered = coverage(arm, np.ptp(grid.q, axis=0), "actuator")
     actuators = []
-    for i, name in enumerate(arm.joint_names):
+    for i, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, "actuator"), strict=True)):
         shares = error_shares(measured[:, i] - predicted[:, i], i, a, v[:, i], vd, t, period)
-        limit = float(arm.effort_limits[i])
-        commanded = model.joints[i].feedforward_scale > 0
-        error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], limit, commanded)
+        judged = tolerance, float(covered[i]), model.joints[i].feedforward_scale > 0
+        error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], *judged)
         if np.any(measured[:, i]) and (width := _half_width(dynamics.half_width, grid.channels[i])):
             error = replace(error, inside=float(np.mean(np.abs(measured[:, i] - predicted[:, i]) <= width)))
         actuators.append(error)
@@ -229,14 +231,15 @@ def _actuator_error(
     predicted: NDArray[np.float64],
     shares: ErrorShares,
     repeatability: float | None,
-    effort_limit: float,
+    tolerance: Tolerance,
+    covered: float,
     commanded: bool,
 ) -> ActuatorError:
     error = measured - predicted
     effort, size = float(np.sqrt(np.mean(measured**2))), float(np.sqrt(np.mean(error**2)))
     relative = size / effort if effort > 0 else None
-    verdict = judge(effort, size, effort_limit, in_motion=True, commanded=commanded)
-    return ActuatorError(name, effort, size, relative, shares, repeatability, verdict)
+    verdict = judge(effort, size, tolerance, covered, commanded=commanded)
+    return ActuatorError(name, effort, size, relative, shares, repeatability, verdict, covered)
 
 
 def error_shares(

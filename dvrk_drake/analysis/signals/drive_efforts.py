@@ -17,9 +17,8 @@ FrictionPart = Literal["dry", "viscous"]
 #: Part of the friction, dry or viscous, for each kind of friction effect. All kinds of one part change together, for
 #: example with temperature or lubrication.
 FRICTION_PARTS: dict[str, FrictionPart] = {
-    **dict.fromkeys(
-        ("coulomb", "load coulomb", "position coulomb", "position^2 coulomb", "stribeck", "presliding"), "dry"
-    ),
+    **dict.fromkeys(("coulomb", "coulomb forward", "load coulomb", "position coulomb", "position^2 coulomb"), "dry"),
+    **dict.fromkeys(("stribeck", "presliding", "presliding forward"), "dry"),
     "viscous": "viscous",
 }
 

@@ -147,6 +147,8 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     is_slow &= np.diff(t, append=t[-1])[:, None] < MAX_PERIOD
     is_slow &= np.abs(vd) < SLOW_ACCELERATION * np.quantile(np.abs(vd), 0.99, axis=0)
     segments = [(j, rows) for j in range(arm.num_joints) for rows in _segments_of(is_slow[:, j], j, moving, arm)]
+    # In the order of time, successive segments are neighbours, as in a recording of poses.
+    segments.sort(key=lambda segment: int(segment[1][0]))
     if not segments:
         raise IdentificationError(
             f"{where}: the motion has no low-speed segments (below {100 * SLOW_SPEED:.0f} % of the largest speed and "

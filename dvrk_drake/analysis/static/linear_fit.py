@@ -35,7 +35,7 @@ class RobustFit:
 
     Attributes:
         fit: Last weighted fit.
-        sigma: Standard deviations (n,) of the residuals of each joint.
+        sigma: Standard deviations (n,) of the errors of each joint, with a correction for the degrees of freedom.
         outliers: Mask (m, n) of the outliers, which have zero weight.
     """
 
@@ -110,16 +110,27 @@ def robust_fit(
     sigma = np.maximum(_spread(tau, usable) if start is None else start, sigma_floor)
     weights = usable.astype(float)
     for _ in range(iterations):
-        theta, _covariance = _estimate(X, tau, weights / sigma**2, prior_precision)
+        theta, covariance = _estimate(X, tau, weights / sigma**2, prior_precision)
+        # Number of parameters that the efforts of each joint determine: the trace of its part of the hat matrix.
+        fitted = (weights / sigma**2 * np.sum((X @ covariance) * X, axis=2)).sum(axis=0)
         residuals = tau - X @ theta
         scale = np.maximum(_spread(residuals, usable), sigma_floor)
         u = np.abs(residuals) / scale
         huber = np.where(u <= HUBER_LIMIT, 1.0, HUBER_LIMIT / np.maximum(u, HUBER_LIMIT))
         weights = usable * np.where(u <= REJECTION_LIMIT, huber, 0.0)
-        squares = (weights * residuals**2).sum(axis=0) / np.maximum(weights.sum(axis=0), 1.0)
+        squares = (weights * residuals**2).sum(axis=0) / np.maximum(weights.sum(axis=0) - fitted, 1.0)
         sigma = np.maximum(np.sqrt(squares), sigma_floor)
     fit = weighted_fit(X, tau, weights / sigma**2, prior_precision)
     return RobustFit(fit, sigma, usable & (weights == 0.0))
+
+
+def blocks(count: int, number: int) -> NDArray[np.int_]:
+    """Returns the index (count,) of the block of successive poses to which each pose belongs.
+
+    Successive poses are often neighbours, for example in a sweep, and have similar errors. If they are in different
+    folds, the errors of the model repeat in the held-out fold, and cross-validation does not find them.
+    """
+    return np.arange(count) * min(number, count) // count
 
 
 def rms(values: NDArray[np.float64]) -> float:

@@ -19,7 +19,7 @@ from dvrk_drake.analysis.static.excluded_measurements import (
     find_excluded,
     usable_measurements,
 )
-from dvrk_drake.analysis.static.linear_fit import LinearFit, rms, weighted_fit
+from dvrk_drake.analysis.static.linear_fit import LinearFit, blocks, rms, weighted_fit
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,
@@ -287,12 +287,11 @@ def _segments_support(
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
-    """Returns the residuals (m, n) of a 10-fold cross-validation.
+    """Returns the residuals (m, n) of a 10-fold cross-validation. The folds are blocks of successive poses.
 
     For each fold, the effects are selected and the model is fitted again.
     """
-    poses = len(problem.q)
-    folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
+    folds = blocks(len(problem.q), FOLDS)
     residuals = np.empty_like(problem.tau)
     for fold in range(folds.max() + 1):
         training = problem.subset(folds != fold)

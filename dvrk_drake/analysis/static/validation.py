@@ -15,7 +15,7 @@ from dvrk_drake.analysis.static.excluded_measurements import (
     usable_measurements,
 )
 from dvrk_drake.analysis.static.linear_fit import rms
-from dvrk_drake.analysis.verdict import judge, rule_text
+from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
@@ -37,6 +37,7 @@ class JointError:
         relative_error_included: rms_error_included / rms_torque_included [1], None if rms_torque_included is 0.
         num_excluded: Number of measurements that are excluded because the joint is at a stop or the effort is beyond
             its limit.
+        coverage: Share of the range between the limits that the recording covers, see `verdict.coverage` [1].
         verdict: Verdict from the included measurements, see `judge`.
     """
 
@@ -48,6 +49,7 @@ class JointError:
     rms_error_included: float
     relative_error_included: float | None
     num_excluded: int
+    coverage: float
     verdict: Verdict
 
 
@@ -88,7 +90,7 @@ class StaticValidation(Validation):
         """Returns the output of `validate --json` as a dictionary."""
         return {
             "verdict": self.verdict,
-            "rule": rule_text(in_motion=False),
+            "rule": rule_text(),
             "joints": [asdict(joint) for joint in self.joints],
             "poses": self.poses,
             "excluded": [{"where": measurement.where, "reason": measurement.reason} for measurement in self.excluded],
@@ -138,8 +140,8 @@ def validate_static(
         # An excluded measurement of a joint excludes the measurements of all actuators that drive the joint.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
     usable = usable & ~recording.unmeasured
-    commanded = np.any(predicted != 0, axis=0)
-    errors = _joint_errors(arm, measured, residuals, measured_joints, usable, commanded)
+    covered = coverage(arm, np.ptp(in_joints.q, axis=0), recording.coordinates)
+    errors = _joint_errors(arm, recording, predicted, measured_joints, usable, covered)
     return StaticValidation(
         model=model,
         recording=recording,
@@ -154,18 +156,20 @@ def validate_static(
 
 def _joint_errors(
     arm: Arm,
-    measured: NDArray[np.float64],
-    residuals: NDArray[np.float64],
+    recording: Recording,
+    predicted: NDArray[np.float64],
     measured_joints: NDArray[np.bool_],
     usable: NDArray[np.bool_],
-    commanded: NDArray[np.bool_],
+    covered: NDArray[np.float64],
 ) -> list[JointError]:
+    measured = recording.measured_effort()
     errors = []
-    for j, name in enumerate(arm.joint_names):
+    for j, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, recording.coordinates), strict=True)):
         every, use = measured_joints[:, j], usable[:, j]
-        torque, error = rms(measured[every, j]), rms(residuals[every, j])
-        torque_used, error_used = rms(measured[use, j]), rms(residuals[use, j])
-        limit = float(arm.effort_limits[j])
+        torque, error = (rms(tau[every, j]) for tau in (measured, measured - predicted))
+        torque_used, error_used = (rms(tau[use, j]) for tau in (measured, measured - predicted))
+        is_negligible = rms(predicted[:, j]) <= NEGLIGIBLE * tolerance.friction and error_used <= tolerance.friction
+        commanded = bool(np.any(predicted[:, j])) and not is_negligible
         errors.append(
             JointError(
                 name,
@@ -176,7 +180,8 @@ def _joint_errors(
                 error_used,
                 error_used / torque_used if torque_used > 0 else None,
                 int(np.sum(every & ~use)),
-                judge(torque_used, error_used, limit, in_motion=False, commanded=bool(commanded[j])),
+                float(covered[j]),
+                judge(torque_used, error_used, tolerance, float(covered[j]), commanded=commanded),
             )
         )
     return errors

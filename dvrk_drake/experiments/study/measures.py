@@ -24,14 +24,16 @@ class Measure:
     Attributes:
         kind: Kind of the measure, one of `KINDS`.
         name: Column in the results. Default: the kind.
-        band: Tolerance band [rad, m]. Default: that of the kind.
+        band: Tolerance band of revolute joints [rad]. Default: that of the kind.
+        band_prismatic: Tolerance band of prismatic joints [m]. Default: that of the kind, in proportion to `band`.
         time: Duration of the evaluated interval [s]. Default: that of the kind.
         joints: Names of the evaluated joints. Default: all.
     """
 
     kind: str = ""
     name: str = ""
-    band: float | None = field(default=None, metadata=within(1e-9, 12.6, "rad or m"))
+    band: float | None = field(default=None, metadata=within(1e-9, 12.6, "rad"))
+    band_prismatic: float | None = field(default=None, metadata=within(1e-9, 2.0, "m"))
     time: float | None = field(default=None, metadata=within(1e-5, 3600.0, "s"))
     joints: list[str] = field(default_factory=list)
 
@@ -50,7 +52,8 @@ class Measure:
         """Name of the quantity with its band and time, for tables and figures."""
         joints = f", joints {', '.join(self.joints)}" if self.joints else ""
         name = f"{self.name.replace('_', ' ')}: " if self.name else ""
-        return name + KINDS[self.kind].title.format(band=self._band, time=self._time) + joints
+        revolute, prismatic = self._bands
+        return name + KINDS[self.kind].title.format(rad=revolute, m=prismatic, time=self._time) + joints
 
     @property
     def is_boolean(self) -> bool:
@@ -73,7 +76,7 @@ class Measure:
         if fault := number_fault(self):
             raise StudyError(fault)
         kind = KINDS[self.kind]
-        for name, default in (("band", kind.band), ("time", kind.time)):
+        for name, default in (("band", kind.band), ("band_prismatic", kind.band), ("time", kind.time)):
             value = getattr(self, name)
             if value is not None and default is None:
                 raise StudyError(f"{name} is not a setting of {self.kind}. Remove it.")
@@ -111,11 +114,15 @@ class Measure:
             displacement=(poses[-1] - poses[-2])[columns] if len(poses) > 1 else np.zeros(len(columns)),
             goal=reference[-1, columns],
         )
-        return KINDS[self.kind].compute(run, self._band, self._time)
+        return KINDS[self.kind].compute(run, arm.per_joint(*self._bands)[columns], self._time)
 
     @property
-    def _band(self) -> float:
-        return KINDS[self.kind].band or 0.0 if self.band is None else self.band
+    def _bands(self) -> tuple[float, float]:
+        """Tolerance bands of revolute and prismatic joints [rad], [m]."""
+        revolute, prismatic = KINDS[self.kind].band or (1.0, 1.0)
+        if self.band is not None:
+            revolute, prismatic = self.band, prismatic * self.band / revolute
+        return revolute, prismatic if self.band_prismatic is None else self.band_prismatic
 
     @property
     def _time(self) -> float:
@@ -155,7 +162,7 @@ def _arrival(scenario: Scenario) -> float:
     return max(float(scenario.knots()[0][-1]), *(point.time for point in scenario.hand.path), 0.0)
 
 
-def _settling_time(run: _Run, band: float, time: float) -> float:
+def _settling_time(run: _Run, band: NDArray[np.float64], time: float) -> float:
     outside = np.flatnonzero(np.any(np.abs(run.q - run.goal) > band, axis=1))
     if not len(outside):
         return 0.0
@@ -164,35 +171,35 @@ def _settling_time(run: _Run, band: float, time: float) -> float:
     return max(0.0, float(run.t[outside[-1] + 1]) - run.arrival)
 
 
-def _overshoot(run: _Run, band: float, time: float) -> float:
+def _overshoot(run: _Run, band: NDArray[np.float64], time: float) -> float:
     q = run.q[run.t >= run.departure - 1e-9]
     return max(0.0, float(np.max(np.sign(run.displacement) * (q - run.goal))))
 
 
-def _steady_error(run: _Run, band: float, time: float) -> float:
+def _steady_error(run: _Run, band: NDArray[np.float64], time: float) -> float:
     return float(np.max(np.abs(run.error[run.last(time)].mean(axis=0))))
 
 
-def _drift(run: _Run, band: float, time: float) -> float:
+def _drift(run: _Run, band: NDArray[np.float64], time: float) -> float:
     q = run.q[run.last(time)]
     return float(np.max(np.abs(q - q[0])))
 
 
-def _drift_rate(run: _Run, band: float, time: float) -> float:
+def _drift_rate(run: _Run, band: NDArray[np.float64], time: float) -> float:
     last = run.last(time)
     return float(np.max(np.abs(np.polyfit(run.t[last], run.q[last], 1)[0])))
 
 
-def _effort_share(run: _Run, band: float, time: float) -> float:
+def _effort_share(run: _Run, band: NDArray[np.float64], time: float) -> float:
     return float(np.max(run.effort_share))
 
 
-def _stays_in_band(run: _Run, band: float, time: float) -> bool:
+def _stays_in_band(run: _Run, band: NDArray[np.float64], time: float) -> bool:
     interval = (run.t >= run.arrival - 1e-9) & (run.t <= run.arrival + time + 1e-9)
     return bool(np.all(np.abs(run.error[interval]) <= band))
 
 
-def _leaves_band(run: _Run, band: float, time: float) -> bool:
+def _leaves_band(run: _Run, band: NDArray[np.float64], time: float) -> bool:
     return bool(np.any(np.abs(run.error) > band))
 
 
@@ -200,17 +207,17 @@ class Kind(NamedTuple):
     """Kind of a measure.
 
     Attributes:
-        compute: Function that computes the measure from a run, band and time.
+        compute: Function that computes the measure from a run, the bands (k,) of the joints and the time.
         unit: Unit of the value, "" for shares and boolean measures.
-        band: Default tolerance band [rad, m]; None if the kind has no band.
+        band: Default tolerance bands of revolute and prismatic joints [rad], [m]; None if the kind has no band.
         time: Default duration of the evaluated interval [s]; None if the kind has no such interval.
         worst: Value for a failed run.
-        title: Name of the quantity, with the fields {band} and {time}.
+        title: Name of the quantity, with the fields {rad} and {m} for the bands, and {time}.
     """
 
-    compute: Callable[[_Run, float, float], float | bool]
+    compute: Callable[[_Run, NDArray[np.float64], float], float | bool]
     unit: str
-    band: float | None
+    band: tuple[float, float] | None
     time: float | None
     worst: float | bool
     title: str
@@ -218,7 +225,8 @@ class Kind(NamedTuple):
 
 #: Kinds of measures. They are computed from the true positions and the measured efforts of the evaluated joints at the
 #: recorded times. In mode "hold" the desired pose is that of the controller. In other modes it is the pose at the start
-#: or, with a hand, at the release. Samples before the release are excluded.
+#: or, with a hand, at the release. Samples before the release are excluded. The bands of prismatic joints are 0.1 m
+#: times those of revolute joints, since 0.1 m is a typical distance of a tip from the axes that move it.
 #:
 #: settling_time: Time from the last target until all joints stay within `band` of the final desired pose; infinite if
 #: they do not settle.
@@ -230,12 +238,16 @@ class Kind(NamedTuple):
 #: held: Whether all joints stay within `band` of the desired pose for `time` after the last target or the release.
 #: ran_away: Whether the distance of any joint from the desired pose ever exceeds `band`.
 KINDS = {
-    "settling_time": Kind(_settling_time, "s", 1e-3, None, math.inf, "settling time to a band of {band:g} rad or m"),
+    "settling_time": Kind(
+        _settling_time, "s", (1e-3, 1e-4), None, math.inf, "settling time to a band of {rad:g} rad, {m:g} m"
+    ),
     "overshoot": Kind(_overshoot, "rad", None, None, math.inf, "overshoot"),
     "steady_error": Kind(_steady_error, "rad", None, 1.0, math.inf, "steady-state error, mean of the last {time:g} s"),
     "drift": Kind(_drift, "rad", None, 5.0, math.inf, "drift in the last {time:g} s"),
     "drift_rate": Kind(_drift_rate, "rad/s", None, 5.0, math.inf, "drift rate in the last {time:g} s"),
     "effort_share": Kind(_effort_share, "", None, None, math.inf, "largest effort / effort limit"),
-    "held": Kind(_stays_in_band, "", 0.015, 10.0, False, "runs that stay within {band:g} rad or m for {time:g} s"),
-    "ran_away": Kind(_leaves_band, "", 0.5, None, True, "runs that leave a band of {band:g} rad or m"),
+    "held": Kind(
+        _stays_in_band, "", (0.015, 0.0015), 10.0, False, "runs that stay within {rad:g} rad, {m:g} m for {time:g} s"
+    ),
+    "ran_away": Kind(_leaves_band, "", (0.5, 0.05), None, True, "runs that leave a band of {rad:g} rad, {m:g} m"),
 }

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from dvrk_drake.errors import StudyError
+from dvrk_drake.errors import SimulationError, StudyError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.experiments.study.measures import Measure
@@ -93,11 +93,11 @@ def _loss(future: Future[Row]) -> BaseException | None:
 
 
 def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
-    """Simulates a scenario and computes its measures. If the simulation fails, the row contains the error."""
+    """Simulates a scenario and computes its measures. If the simulation diverges, the row contains the error."""
     try:
         simulation = simulate(scenario)
-    except (RuntimeError, ArithmeticError, ValueError) as error:  # errors raised by Drake and NumPy
-        return Row({}, " ".join(f"{type(error).__name__}: {error}".split()))
+    except SimulationError as error:
+        return Row({}, str(error))
     not_finite = ~np.all(
         np.isfinite(np.hstack([simulation.state_true, simulation.recording.measured_effort()])), axis=1
     )

@@ -179,6 +179,7 @@ def _efforts(efforts: Efforts, *, with_view: bool = True) -> Section:
     title = "Measured, fitted and held-out efforts" if len(efforts.predicted) > 1 else "Measured and predicted efforts"
     if isinstance(efforts, MotionEfforts):
         figure, drawn = efforts_over_time(efforts)
+        drawn = f"{drawn} {efforts.model.interval_scope}"
         cut_off = efforts.grid.settings.effort_cut_off
         caption = f"Efforts of the actuators after low-pass filtering at {cut_off:.3g} Hz"
         grid, tau = efforts.grid, efforts.recording.in_joint_coordinates(arm).measured_effort()

@@ -14,7 +14,7 @@ from dvrk_drake.analysis.dynamic.validation import DynamicValidation
 from dvrk_drake.analysis.results import Identification, Validation
 from dvrk_drake.analysis.static.static_identification import FOLDS, StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
-from dvrk_drake.analysis.verdict import cross_validated_verdicts, reason, rule_text
+from dvrk_drake.analysis.verdict import cross_validated_verdicts, identified_coverage, reason, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import Verdict
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.html.labels import effort_unit, length_unit
@@ -125,14 +125,20 @@ def joint_summaries(result: Result) -> list[JointSummary]:
 
 def verdict_table(result: Result) -> Table:
     """Returns the table of the verdicts with their reasons."""
-    arm, motion = result.model.arm, in_motion(result)
+    arm = result.model.arm
+    if isinstance(result, StaticValidation | DynamicValidation):
+        errors = result.joints if isinstance(result, StaticValidation) else result.actuators
+        covered = [joint.coverage for joint in errors]
+    else:
+        covered = identified_coverage(result.model).tolist()
+    coordinates = result.recording.coordinates if isinstance(result, StaticValidation) else "joint"
+    limits_of_error = tolerances(arm, "actuator" if in_motion(result) else coordinates)
     which = "error on this recording" if isinstance(result, Validation) else "cross-validation error"
     rows: list[tuple[Cell, ...]] = []
     for k, (joint, own) in enumerate(zip(joint_summaries(result), result.model.joints, strict=True)):
         limit = float(arm.effort_limits[k])
-        why = reason(
-            joint.verdict, joint.effort, joint.error, limit, in_motion=motion, prismatic=bool(arm.prismatic[k])
-        )
+        judged = joint.effort, joint.error, limits_of_error[k], covered[k]
+        why = reason(joint.verdict, *judged, prismatic=bool(arm.prismatic[k]))
         ratio = f"{100 * joint.error / joint.effort:.1f} %" if joint.effort > 0 else ""
         scale = f"{own.feedforward_scale:.2f}"
         error = f"{joint.error:.3g}" if np.isfinite(joint.error) else ""
@@ -144,7 +150,7 @@ def verdict_table(result: Result) -> Table:
         ("joint", *columns, "verdict"),
         rows,
         caption=f"Verdict on each joint from the {which}",
-        note=_capitalized(rule_text(motion)),
+        note=_capitalized(rule_text()),
     )
 
 

@@ -100,6 +100,28 @@ def test_early_arrival_has_no_settling_time_or_overshoot():
     assert Measure("overshoot")(*run) == 0.0
 
 
+@pytest.mark.parametrize(
+    ("measure", "revolute", "prismatic"),
+    [
+        (Measure("held"), 0.015, 0.0015),
+        (Measure("held", band=0.03), 0.03, 0.003),
+        (Measure("held", band=0.03, band_prismatic=0.01), 0.03, 0.01),
+        (Measure("ran_away"), 0.5, 0.05),
+    ],
+)
+def test_bands_of_prismatic_joints_are_in_metres(measure, revolute, prismatic):
+    psm = load_arm("psm")
+    scenario = Scenario(arm="psm", duration=20.0)
+    scenario.controller.mode = "gravity"
+    assert f"{revolute:g} rad, {prismatic:g} m" in measure.title
+    for joint, band in (("pitch", revolute), ("insertion", prismatic)):
+        for factor in (0.99, 1.01):
+            q = np.zeros((len(T), 7))
+            q[1:, psm.joint_names.index(joint)] = factor * band
+            run = Simulation(Recording(q=q, qd=0 * q, tau=0 * q, t=T), state(q), None, None)
+            assert measure(scenario, run) is ((factor > 1) == (measure.kind == "ran_away"))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_failed_run_has_worst_value(kind):
     scenario, simulation = stepped(0.4 * np.clip(T / 2, 0, 1))
@@ -115,8 +137,9 @@ def test_failed_run_has_worst_value(kind):
     [
         (Measure("settle"), 'kind is "settle"; allowed: settling_time, overshoot'),
         (Measure("overshoot", band=0.1), "band is not a setting of overshoot"),
+        (Measure("drift", band_prismatic=0.1), "band_prismatic is not a setting of drift"),
         (Measure("ran_away", time=1.0), "time is not a setting of ran_away"),
-        (Measure("held", band=-1.0), "band is -1; allowed: 1e-09..12.6 rad or m"),
+        (Measure("held", band=-1.0), "band is -1; allowed: 1e-09..12.6 rad"),
         (Measure("held", time=math.nan), "time is nan; allowed: 1e-05..3600 s"),
         (Measure("held", time=18.5), r"time of held is 18.5 s; allowed: 0.02..18 s"),
         (Measure("drift", time=0.001), r"time of drift is 0.001 s; allowed: 0.02..18 s"),

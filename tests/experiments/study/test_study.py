@@ -12,7 +12,7 @@ from rich.console import Console
 from scipy.stats import norm
 
 import dvrk_drake.experiments.study.study as study_module
-from dvrk_drake.errors import StudyError
+from dvrk_drake.errors import SimulationError, StudyError
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study import run_study
@@ -46,7 +46,7 @@ def formula(monkeypatch):
 
     def simulate(scenario):
         if scenario.seed % 7 == 0:
-            raise RuntimeError("the solver\nfailed, at 0.3 s")
+            raise SimulationError("the simulation failed at 0.3 s: no convergence")
         t = np.arange(21) * 0.1
         rate = (1 + scenario.controller.parameter_error) * (scenario.seed % 1000) / 5e4
         q = np.array(scenario.start) + rate * t[:, None]
@@ -89,6 +89,16 @@ class WorkerLossExecutor(ThreadPoolExecutor):
         return future
 
 
+def test_programming_error_is_no_failed_run(tmp_path, monkeypatch):
+    def simulate(scenario):
+        raise ValueError("operands could not be broadcast")
+
+    monkeypatch.setattr(study_module, "simulate", simulate)
+    message = r"24 of 24 cases are missing \(case 0: ValueError: operands could not be broadcast\)"
+    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match=message):
+        run_study(make_study(), executor, tmp_path / "results.csv")
+
+
 @pytest.fixture
 def reference(tmp_path):
     path = tmp_path / "reference.csv"
@@ -108,7 +118,7 @@ def test_table_has_one_reproducible_row_per_case(reference):
     np.testing.assert_array_equal(starts[::4], MTM.sample_poses(6, np.random.default_rng(3)))
     for row in rows:
         if int(row["seed"]) % 7 == 0:
-            assert row["error"] == "RuntimeError: the solver failed, at 0.3 s"
+            assert row["error"] == "the simulation failed at 0.3 s: no convergence"
             assert row["held"] == row["drift"] == ""
         elif int(row["seed"]) % 11 == 0:
             assert row["error"] == "diverged: not finite from 0.9 s on"
@@ -275,7 +285,7 @@ def test_report_lists_all_measures_and_errors(tmp_path, monkeypatch):
     text = console.export_text()
     for word in ("held exact: ", "; wrong, a lot: ", " of 12 runs", "24 of 24 runs"):
         assert word in text
-    assert "drift" in text and "RuntimeError: the solver failed" in text
+    assert "drift" in text and "the simulation failed at 0.3 s" in text
     with checked_figures(monkeypatch):
         plot_study(tmp_path / "study.png", study, rows)
     assert (tmp_path / "study.png").stat().st_size > 10_000

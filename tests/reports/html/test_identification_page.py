@@ -10,7 +10,7 @@ from report_checks import check_report
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.static.static_identification import identify_static
-from dvrk_drake.analysis.verdict import GOOD_RATIO, judge, reason
+from dvrk_drake.analysis.verdict import Tolerance, judge, reason
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import bounding_boxes
@@ -235,14 +235,11 @@ def test_verdicts_have_the_words_and_reasons_of_the_rule(motion):
     words = {row[0]: row[-1] for row in table.rows}
     assert {name: label.word for name, label in words.items()} == motion.verdicts
     assert all(isinstance(label, Verdict) and label.reason.endswith(".") for label in words.values())
-    for effort, error in ((1.0, 0.3), (1.0, 0.4), (1.0, 2.0), (0.01, 0.05), (0.0, 1.0)):
-        verdict = judge(effort, error, 10.0, in_motion=True)
-        text = reason(verdict, effort, error, 10.0, in_motion=True)
-        if verdict == "good":
-            assert f"{100 * GOOD_RATIO:g} %" in text
-        if verdict in ("usable", "do not use"):
-            assert "usable: up to" in text
-    assert "separate gravity" in reason("off", 1.0, 1.0, 10.0, in_motion=False)
+    judged = 1.0, 0.3, Tolerance(0.4, 0.6), 0.5
+    text = reason(judge(*judged), *judged)
+    assert text.startswith("The RMS error is 0.3 N m or 30 % of the measured effort. Dry friction: 0.4 N m.")
+    assert text.endswith("at 15 mrad: 0.6 N m. Range covered: 50 %.")
+    assert "not separated from friction" in reason("off", *judged)
 
 
 @pytest.mark.parametrize(
