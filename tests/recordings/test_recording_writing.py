@@ -112,3 +112,31 @@ def test_new_file_has_the_permissions_of_the_umask(tmp_path):
         os.umask(old)
     assert (tmp_path / "out.bin").read_bytes() == b"\x00\xff"
     assert stat.S_IMODE((tmp_path / "out.bin").stat().st_mode) == 0o640
+
+
+def test_umask_of_the_process_is_not_changed(tmp_path, monkeypatch):
+    """Files that other threads create in the meantime would be writable by everyone."""
+    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail("the umask is changed"))
+    with atomic_write(tmp_path / "out.csv") as stream:
+        stream.write("new")
+    assert (tmp_path / "out.csv").read_text() == "new"
+
+
+def test_content_is_on_the_disk_before_the_file_is_replaced(tmp_path, monkeypatch):
+    calls, path = [], tmp_path / "out.csv"
+    fsync, replace_file = os.fsync, os.replace
+
+    def synced(handle):
+        is_folder = stat.S_ISDIR(os.fstat(handle).st_mode)
+        calls.append("folder" if is_folder else os.fstat(handle).st_size)
+        fsync(handle)
+
+    def replaced(source, target):
+        calls.append("replaced")
+        replace_file(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    with atomic_write(path) as stream:
+        stream.write("12345")
+    assert calls == [5, "replaced", "folder"]
