@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.array_file import is_array_file, read_array_file
 from dvrk_drake.recordings.cisst_collector import is_collector_file, read_collector
 from dvrk_drake.recordings.csv_recording import read_csv
+from dvrk_drake.recordings.csv_rows import GZIP_MAGIC, is_utf16
 from dvrk_drake.recordings.file_options import FileCoordinates, FileOptions
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
 from dvrk_drake.recordings.recording import Recording
@@ -149,8 +151,21 @@ def detect_format(path: Path) -> Format:
             f"{path} is a folder without a recording; allowed: ROS 2 bag (with metadata.yaml), MATLAB files (.mat), "
             "NumPy archives (.npz). To read a bag without metadata.yaml, give the path of its .mcap or .db3 file."
         )
-    if found is FORMATS[-1] and b"\0" in head:
+    if head.startswith(GZIP_MAGIC):
+        head = _decompressed(path, head)
+    if found is FORMATS[-1] and b"\0" in head and not is_utf16(head):
         raise RecordingError(
             f"{path}: unknown format; allowed: CSV, ROS bag, MATLAB file, NumPy archive, cisst collector, LCM log"
         )
     return found
+
+
+def _decompressed(path: Path, head: bytes) -> bytes:
+    """Returns the beginning of the content of a gzip file. `head` is the beginning of the file."""
+    try:
+        content = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(head, _HEAD)
+    except zlib.error as error:
+        raise RecordingError(f"{path} is not a complete gzip file: {error}") from error
+    if b"\0" in content and not is_utf16(content):
+        raise RecordingError(f"{path}: only a CSV may be compressed with gzip. Decompress the file first with gunzip.")
+    return content
