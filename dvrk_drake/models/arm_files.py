@@ -78,6 +78,13 @@ def load_arm(name: str | Path) -> Arm:
     return _load_arm(str(path))
 
 
+def is_package_arm(arm: Arm | str) -> bool:
+    """Returns whether an arm, or its name, has the name of an arm of this package."""
+    name = arm if isinstance(arm, str) else arm.name
+    # The name in an arm file of this package is the name of the file in capital letters.
+    return name.upper() in map(str.upper, known_arms())
+
+
 @cache
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     """Loads an arm by name or absolute path. `state` (time of change, size) is the version of the YAML file."""

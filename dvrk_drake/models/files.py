@@ -122,8 +122,8 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
 def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
     """Opens a temporary file. It replaces `path` if the `with` block succeeds, and is deleted otherwise.
 
-    If `path` is a link, its target is replaced. An existing file keeps its permissions, and a new file gets those of the
-    umask. The content is on the disk before the file is replaced.
+    If `path` is a link, its target is replaced. An existing file keeps its permissions, and a new file gets those of
+    the umask. The content is on the disk before the file is replaced.
 
     Args:
         path: Path of the output file.

@@ -92,7 +92,9 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
             raise RecordingError(
                 f"{file}: {part.note}; {files[0]}: {parts[0].note}. All files of a folder must have the same arrays."
             )
+    order = options.joint_order(path)
     blocks = {quantity: np.concatenate([part.blocks[quantity] for part in parts]) for quantity in parts[0].blocks}
+    blocks = {quantity: block if quantity == "t" else block[:, order] for quantity, block in blocks.items()}
     label, preallocated = parts[0].label, parts[0].preallocated
     notes = [parts[0].note if len(files) == 1 else f"{len(files)} files; {parts[0].note} of each file"]
     if "t" in blocks and len(files) > 1:

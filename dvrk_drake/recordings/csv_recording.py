@@ -12,26 +12,33 @@ Layouts without a header, for an arm with n joints:
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
 from pathlib import Path
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import is_package_arm
 from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, read_numbers
 from dvrk_drake.recordings.file_options import FileOptions
-from dvrk_drake.recordings.recording import Recording, column_names
+from dvrk_drake.recordings.recording import UNITS, Recording
 
 #: Nominal sampling rate of the motions of WPI [Hz].
 WPI_RATE = 200.0
 _WPI_JOINTS = 7
+#: Columns with the same text in each row. `write_recording` and `collect` write them.
+_STATEMENTS = ("coordinates", "arm")
+#: Name of a column with its unit, e.g. "q1 [rad]".
+_UNIT = re.compile(r"(?P<name>\S+)\s*[\[(](?P<unit>[^\])]*)[\])]")
 
 
 def read_csv(path: Path, options: FileOptions) -> Recording:
     """Reads a recording from a CSV.
 
-    For 21 columns without a header, the default coordinates are "wpi" and the default rate is `WPI_RATE`. For all other
-    files, the default coordinates are "joint". Without times and rate, they contain static poses.
+    For an arm of this package and 21 columns without a header, the default coordinates are "wpi" and the default rate
+    is `WPI_RATE`. The default coordinates of all other files are those in the column `coordinates`, or else "joint".
+    Without times and rate, they contain static poses. The names of the columns may contain units.
 
     Args:
         path: Path of the file.
@@ -49,12 +56,16 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         cells, where = [cell.strip() for cell in cells], f"{path}, line {line}"
         if is_headerless := 2 * sum(map(is_number, cells)) >= len(cells):
             blocks = _layout(path, where, len(cells), arm, n)
+            order = options.joint_order(path)
+            blocks = {prefix: [columns[i] for i in order] for prefix, columns in blocks.items()}
             header = [f"{prefix}{i + 1} (column {n * k + i + 1})" for k, prefix in enumerate(blocks) for i in range(n)]
             first = [(line, cells)]
         else:
-            header, blocks = cells, _columns_of_blocks(where, cells, arm, n)
+            header, units = _split_units(cells)
+            blocks = _columns_of_blocks(where, header, options)
             first = list(itertools.islice(reader, 1))
             _check_arm(path, header, first, arm)
+            _check_units(where, header, units, blocks, arm)
         found = read_numbers(
             reader,
             header,
@@ -64,15 +75,15 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
             header_name="the first row" if is_headerless else "the header",
         )
         sha256 = reader.sha256()
-    is_wpi = is_headerless and len(header) == 3 * _WPI_JOINTS
+    is_wpi = is_headerless and len(header) == 3 * _WPI_JOINTS and (arm is None or is_package_arm(arm))
     recorded = found.blocks["t"][:, 0] if "t" in blocks else None
     t, time_notes = options.sampled_times(path, recorded, found.rows, WPI_RATE if is_wpi else None)
     if is_headerless:
         time_notes = (f"no header: columns read as {', '.join(f'{name}1..{name}{n}' for name in blocks)}", *time_notes)
-    used = {column for columns in blocks.values() for column in columns}
+    used = {header[column] for columns in blocks.values() for column in columns} | {*_STATEMENTS}
     # `collect` writes files without a column t.
     is_pose_file = {"pose1", "utime"} <= set(header)
-    ignored = [name for column, name in enumerate(header) if name and column not in used]
+    ignored = [name for name in header if name and name not in used]
     if t is None and ignored and not is_pose_file:
         time_notes = (f"no column t, read as static poses; ignored columns: {', '.join(ignored)}",)
     recording = Recording(
@@ -84,16 +95,49 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         lines=found.lines,
         sha256=sha256,
         notes=(*time_notes, *found.notes),
+        file_coordinates=_statement(header, first, "coordinates"),  # type: ignore[arg-type]
+        arm_name=_statement(header, first, "arm"),
     )
-    return options.with_coordinates(recording, "wpi" if is_wpi else "joint")
+    return options.with_coordinates(recording, "wpi" if is_wpi else "")
 
 
 def _check_arm(path: Path, header: list[str], first: list[tuple[int, list[str]]], arm: Arm | None) -> None:
-    """Raises RecordingError if the column `arm` of the first row names another arm. `collect` writes this column."""
-    for line, cells in first if arm is not None and "arm" in header else ():
-        name = cells[header.index("arm")].strip() if len(cells) == len(header) else ""
-        if name and arm is not None and name.lower() != arm.name.lower():
-            raise RecordingError(f"{path}, line {line}: the row is of {name[:30]}, but the selected arm is {arm.name}")
+    """Raises RecordingError if the column `arm` of the first row names another arm."""
+    name = _statement(header, first, "arm")
+    if name and arm is not None and name.lower() != arm.name.lower():
+        raise RecordingError(
+            f"{path}, line {first[0][0]}: the row is of {name[:30]}, but the selected arm is {arm.name}"
+        )
+
+
+def _statement(header: list[str], first: list[tuple[int, list[str]]], column: str) -> str:
+    """Returns the text in a column of the first row, or "" without such a column."""
+    if not first or column not in header or len(first[0][1]) != len(header):
+        return ""
+    return first[0][1][header.index(column)].strip()
+
+
+def _split_units(cells: list[str]) -> tuple[list[str], list[str]]:
+    """Returns the names and the units of columns such as "q1 [rad]". The unit is "" if it is not stated."""
+    matches = [_UNIT.fullmatch(cell) for cell in cells]
+    names = [match["name"] if match else cell for match, cell in zip(matches, cells, strict=True)]
+    return names, [match["unit"].strip() if match else "" for match in matches]
+
+
+def _check_units(
+    where: str, header: list[str], units: list[str], blocks: dict[str, list[int]], arm: Arm | None
+) -> None:
+    """Raises RecordingError if the header states a wrong unit. Any joint may be prismatic if `arm` is None."""
+    for prefix, columns in blocks.items():
+        for joint, column in enumerate(columns):
+            revolute, prismatic = UNITS[prefix]
+            accepted = {revolute, prismatic} if arm is None else {prismatic if arm.prismatic[joint] else revolute}
+            unit = re.sub(r"[\s*·.]+", " ", units[column]).replace("Nm", "N m")
+            if unit and unit not in accepted:
+                raise RecordingError(
+                    f"{where}: the unit of {header[column]} is {units[column][:30]}; allowed: "
+                    f"{' or '.join(sorted(accepted))}. Convert the numbers, and correct the header."
+                )
 
 
 def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict[str, list[int]]:
@@ -112,13 +156,13 @@ def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict
     raise RecordingError(message)
 
 
-def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joints: int) -> dict[str, list[int]]:
+def _columns_of_blocks(where: str, header: list[str], options: FileOptions) -> dict[str, list[int]]:
     """Returns a mapping from a prefix (q, qd, tau, t) to its columns in the header."""
     if duplicate := next((name for name, count in Counter(header).items() if name and count > 1), ""):
         raise RecordingError(f"{where}: column {duplicate[:30]} occurs twice")
-    blocks = {}
+    blocks, arm, num_joints = {}, options.arm, options.num_joints
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
-        names = column_names(prefix, num_joints)
+        names = [f"{prefix}{label}" for label in options.joint_labels]
         missing = [name for name in names if name not in header]
         if len(missing) == num_joints and not needed:
             continue
@@ -129,7 +173,7 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
                 f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
                 f"needs {_expected_columns(num_joints)}{_joint_list(arm)}{hint and f'. {hint}'}"
             )
-        if f"{prefix}{num_joints + 1}" in header:
+        if f"{prefix}{num_joints + 1}" in header and not options.joints:
             raise RecordingError(
                 f"{where}: unexpected column {prefix}{num_joints + 1}; "
                 f"the arm has {num_joints} joints{_joint_list(arm)}"

@@ -187,7 +187,9 @@ class _HashedFile:
         except OSError:  # `read` reports the same error
             is_compressed = False
         file.seek(0)
-        self.read = gzip.GzipFile(fileobj=_Source(self._read_raw)).read if is_compressed else self._read_raw
+        self.read: Callable[[int], bytes] = self._read_raw
+        if is_compressed:
+            self.read = gzip.GzipFile(fileobj=_Source(self._read_raw)).read  # type: ignore[call-overload]
 
     def _read_raw(self, size: int = -1) -> bytes:
         block = self._file.read(size)

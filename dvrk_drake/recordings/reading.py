@@ -17,9 +17,9 @@ from dvrk_drake.recordings.array_file import is_array_file, read_array_file
 from dvrk_drake.recordings.cisst_collector import is_collector_file, read_collector
 from dvrk_drake.recordings.csv_recording import read_csv
 from dvrk_drake.recordings.csv_rows import GZIP_MAGIC, is_utf16
-from dvrk_drake.recordings.file_options import FileCoordinates, FileOptions
+from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import FileCoordinates, Recording
 from dvrk_drake.recordings.ros_bag import is_ros_bag, read_ros_bag
 
 #: Number of bytes at the beginning of a text file that must not contain a null byte.
@@ -46,15 +46,20 @@ class Format:
 #: Formats in the order in which they are tried. A file of no other format is a CSV.
 FORMATS = (
     Format("an LCM log", is_lcm_log, read_status_log, frozenset()),
-    Format("a ROS bag", is_ros_bag, read_ros_bag, frozenset({"topic"})),
-    Format("a file of the cisst collector", is_collector_file, read_collector, frozenset({"topic", "coordinates"})),
+    Format("a ROS bag", is_ros_bag, read_ros_bag, frozenset({"topic", "joints"})),
+    Format(
+        "a file of the cisst collector",
+        is_collector_file,
+        read_collector,
+        frozenset({"topic", "joints", "coordinates"}),
+    ),
     Format(
         "a MATLAB file or NumPy archive",
         is_array_file,
         read_array_file,
-        frozenset({"arrays", "rate", "coordinates"}),
+        frozenset({"arrays", "joints", "rate", "coordinates"}),
     ),
-    Format("a CSV", lambda path: not path.is_dir(), read_csv, frozenset({"rate", "coordinates"})),
+    Format("a CSV", lambda path: not path.is_dir(), read_csv, frozenset({"joints", "rate", "coordinates"})),
 )
 
 
@@ -64,6 +69,7 @@ def read_recording(
     coordinates: FileCoordinates | None = None,
     *,
     topic: str | None = None,
+    joints: Mapping[str, str] | None = None,
     arrays: Mapping[str, str] | None = None,
     rate: float | None = None,
     skip_invalid: bool = False,
@@ -83,6 +89,9 @@ def read_recording(
             the motions of WPI, which are in actuator coordinates except for the roll of a PSM. Default: the coordinates
             that the file states, "wpi" for a CSV with 21 columns and no header, or else "joint".
         topic: Topic of a bag or its namespace, see `read_ros_bag`. For the cisst collector: name of the signal.
+        joints: Mapping from the arm's name of a joint to its name in the file, e.g. {"yaw": "outer_yaw"}. In a CSV with
+            a header, the latter is the end of the names of its columns: {"yaw": "2"} selects q2, qd2 and tau2. In other
+            files without joint names, it is the number of the joint, from 1.
         arrays: Mapping from "q", "qd", "tau" and "t" to the names of arrays, see `read_array_file`.
         rate: Sampling rate [Hz] of a motion in a file without times. Default: 200 Hz for a CSV with 21 columns and no
             header; all other files without times contain static poses.
@@ -112,21 +121,21 @@ def read_recording(
     file_format = detect_format(path)
     if coordinates not in (None, "joint") and "coordinates" not in file_format.options:
         raise RecordingError(f"{path}: {file_format.name} is in joint coordinates, not in {coordinates} coordinates")
-    for option, value in (("topic", topic), ("arrays", arrays), ("rate", rate)):
+    for option, value in (("topic", topic), ("joints", joints), ("arrays", arrays), ("rate", rate)):
         if value is not None and option not in file_format.options:
             raise RecordingError(f"{path}: --{option} does not apply to {file_format.name}")
-    return file_format.read(
-        path,
-        FileOptions(
-            arm=arm,
-            coordinates=coordinates,
-            topic=topic,
-            arrays=arrays,
-            rate=rate,
-            skip_invalid=skip_invalid,
-            progress=step_progress(progress, "reading"),
-        ),
+    options = FileOptions(
+        arm=arm,
+        coordinates=coordinates,
+        topic=topic,
+        joints=joints,
+        arrays=arrays,
+        rate=rate,
+        skip_invalid=skip_invalid,
+        progress=step_progress(progress, "reading"),
     )
+    options.check_joints(path)
+    return file_format.read(path, options)
 
 
 def detect_format(path: Path) -> Format:

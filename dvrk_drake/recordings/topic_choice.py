@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import known_arms
+from dvrk_drake.models.arm_files import is_package_arm
 
 #: Name of the topic with the measured joint states, in the namespace of an arm.
 MEASURED_JS = "measured_js"
@@ -80,9 +80,7 @@ def check_namespace(source: str | Path, arm: Arm, topic: str) -> None:
     """
     namespace = f"/{topic.strip('/')}".removesuffix(f"/{MEASURED_JS}")
     own, other = arm.name.rstrip(_DIGITS).upper(), namespace.rpartition("/")[2].rstrip(_DIGITS).upper()
-    # The name in an arm file of this package is the name of the file in capital letters.
-    known = {name.upper() for name in known_arms()}
-    if own != other and {own, other} <= known:
+    if own != other and is_package_arm(own) and is_package_arm(other):
         raise RecordingError(
             f"{source}: {namespace} is the namespace of the arm {other}, not of {arm.name}. Choose --arm "
             f"{other.lower()}, or the namespace of {arm.name} with --topic (topic= in Python)."

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_output import messages, refusal
 from forked import forked_program
+from recordings import csv_block
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -92,12 +93,14 @@ def test_predict_uses_the_coordinates_of_the_recording(folder, tmp_path, coordin
     arm = load_arm("mtmr")
     q = read_recording(folder / "other.csv").q
     recorded = q if coordinates == "joint" else arm.transmission.position(q)
-    write_recording(Recording(q=recorded), tmp_path / "only_q.csv")
+    write_recording(Recording(q=recorded, coordinates=coordinates), tmp_path / "only_q.csv")
     out = tmp_path / "predicted.csv"
     command = ["predict", f"{tmp_path}/only_q.csv", "--model", f"{folder}/model.yaml", "--output", str(out)]
-    assert main([*command, "--coordinates", coordinates]) == 0
-    rows = np.loadtxt(out, delimiter=",", skiprows=1)
-    assert out.read_text().splitlines()[0] == "tau1,tau2,tau3,tau4,tau5,tau6,tau7"
+    assert main(command) == 0
+    rows = csv_block(out, "tau")
+    names = [f"tau{i} [N m]" for i in range(1, 8)]
+    assert out.read_text().splitlines()[0].split(",") == [*names, "coordinates", "arm"]
+    assert out.read_text().splitlines()[1].endswith(f",{coordinates},MTMR")
     expected = IdentifiedModel.load(folder / "model.yaml").holding_torque(q)
     tau = rows if coordinates == "joint" else rows @ arm.transmission.matrix
     np.testing.assert_allclose(tau, expected, atol=1e-12)

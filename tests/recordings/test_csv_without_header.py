@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wpi
@@ -9,23 +11,40 @@ from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wp
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 
+ARM = load_arm("mtml")
+
 
 def test_21_columns_are_motions_of_wpi_at_200_hz(tmp_path):
     rows = wpi_rows()
     path = write_wpi(tmp_path, rows)
-    recording = read_recording(path)
-    np.testing.assert_array_equal(recording.q, rows[:, :7])
-    np.testing.assert_array_equal(recording.qd, rows[:, 7:14])
-    np.testing.assert_array_equal(recording.tau, rows[:, 14:])
+    recording = read_recording(path, ARM).in_actuator_coordinates(ARM)
+    np.testing.assert_allclose(recording.q, rows[:, :7], atol=1e-12)
+    np.testing.assert_allclose(recording.qd, rows[:, 7:14], atol=1e-12)
+    np.testing.assert_allclose(recording.tau, rows[:, 14:], atol=1e-12)
     np.testing.assert_array_equal(recording.t, [0, 0.005, 0.010, 0.015])
-    assert recording.coordinates == "actuator"
+    assert recording.file_coordinates == "wpi"
     assert recording.where(3) == f"{path}, line 4"
     assert recording.notes == (
         "no header: columns read as q1..q7, qd1..qd7, tau1..tau7",
         "4 samples; the file has no times, so t = row / 200 Hz",
-        "in the coordinates wpi; pass --coordinates wpi to every command that reads the converted file",
     )
-    np.testing.assert_array_equal(read_recording(path, rate=10).t, [0, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(read_recording(path, ARM, rate=10).t, [0, 0.1, 0.2, 0.3])
+
+
+def test_wpi_coordinates_need_the_arm(tmp_path):
+    """The roll of a PSM is in joint coordinates, so these are not actuator coordinates."""
+    path = write_wpi(tmp_path, wpi_rows())
+    assert_refused(r"motion\.csv: the coordinates wpi depend on the arm; give --arm", read_recording, path)
+    assert read_recording(path, coordinates="actuator").coordinates == "actuator"
+
+
+def test_other_arms_with_seven_joints_have_no_wpi_file(tmp_path):
+    arm = replace(load_arm("psm"), name="PANDA")
+    path = write_wpi(tmp_path, 1e-2 * wpi_rows())
+    recording = read_recording(path, arm)
+    np.testing.assert_array_equal(recording.q, 1e-2 * wpi_rows()[:, :7])
+    assert (recording.t, recording.coordinates, recording.file_coordinates) == (None, "joint", "")
+    assert read_recording(path, arm, "wpi", rate=200).file_coordinates == "wpi"
 
 
 def test_wpi_motions_have_the_roll_of_the_joint(tmp_path):
@@ -42,7 +61,7 @@ def test_wpi_motions_have_the_roll_of_the_joint(tmp_path):
 
 def test_14_columns_are_static_poses(tmp_path):
     rows = wpi_rows()[:, :14]
-    recording = read_recording(write_wpi(tmp_path, rows), load_arm("mtml"))
+    recording = read_recording(write_wpi(tmp_path, rows), ARM)
     np.testing.assert_array_equal(recording.q, rows[:, :7])
     np.testing.assert_array_equal(recording.tau, rows[:, 7:])
     assert (recording.qd, recording.t, recording.coordinates) == (None, None, "joint")
@@ -61,7 +80,9 @@ def test_files_of_the_dvrk_collection_script_have_three_joints(tmp_path):
 
 def test_crlf_byte_order_mark_blank_lines_and_spaces(tmp_path):
     line = ", ".join(str(i) for i in range(21))
-    recording = read_recording(write_text(tmp_path, f"\ufeff\r\n{line}\r\n\r\n{line}\r\n \r\n"))
+    recording = read_recording(
+        coordinates="actuator", path=write_text(tmp_path, f"\ufeff\r\n{line}\r\n\r\n{line}\r\n \r\n")
+    )
     np.testing.assert_array_equal(recording.lines, [2, 4])
     np.testing.assert_array_equal(recording.t, [0, 0.005])
 
@@ -95,7 +116,7 @@ def test_faults_name_file_line_and_column(tmp_path, case):
 @pytest.mark.parametrize("rate", [0, -200, np.nan, np.inf])
 def test_other_rates_are_refused(tmp_path, rate):
     path = write_wpi(tmp_path, wpi_rows())
-    assert_refused("rate is .* Hz; allowed: a positive number", read_recording, path, rate=rate)
+    assert_refused("rate is .* Hz; allowed: a positive number", read_recording, path, ARM, rate=rate)
 
 
 def test_skips_invalid_rows_and_keeps_times(tmp_path):
@@ -104,7 +125,7 @@ def test_skips_invalid_rows_and_keeps_times(tmp_path):
     rows[3, 20] = np.inf
     path = write_wpi(tmp_path, rows)
     path.write_text(path.read_text().replace("nan", ""))
-    recording = read_recording(path, skip_invalid=True)
+    recording = read_recording(path, ARM, skip_invalid=True)
     np.testing.assert_array_equal(recording.t, [0, 0.01, 0.02])
     np.testing.assert_array_equal(recording.lines, [1, 3, 5])
     assert "2 of 5 rows skipped (empty, NaN or infinite): lines 2, 4" in recording.notes
@@ -118,7 +139,7 @@ def test_a_real_motion_without_header_and_time_is_restored(shared_data, tmp_path
     original = shared_data / "trajectories" / "mtm_one.csv"
     lines = original.read_text().splitlines()[1:]
     path = write_text(tmp_path, "\n".join(line.split(",", 1)[1] for line in lines))
-    restored, expected = read_recording(path), read_recording(original, coordinates="actuator")
+    restored, expected = (read_recording(file, coordinates="actuator") for file in (path, original))
     for name in ("q", "qd", "tau"):
         np.testing.assert_array_equal(getattr(restored, name), getattr(expected, name))
     np.testing.assert_allclose(restored.t, expected.t, rtol=0, atol=1e-12)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
+from recordings import csv_block
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic, motion_problem
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
@@ -233,7 +234,7 @@ def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsy
     for name in ("with.csv", "without.csv"):
         output = str(tmp_path / f"of_{name}")
         assert main(["predict", paths[name], "--model", paths["model.yaml"], "--output", output]) == 0
-        predicted.append(np.loadtxt(output, delimiter=",", skiprows=1))
+        predicted.append(csv_block(output, "tau", "lower", "upper"))
         assert "always 0" not in capsys.readouterr().out
     np.testing.assert_allclose(*predicted, rtol=0, atol=1e-12 * np.abs(predicted).max())
     assert main(["validate", paths["without.csv"], "--model", paths["model.yaml"]]) == 2
