@@ -61,7 +61,7 @@ def load_arm(name: str | Path) -> Arm:
     name = os.fspath(name)
     if "\0" in name:
         raise ArmError(f"{name!r} is not a valid file name")
-    if not name.endswith((".yaml", ".yml")):
+    if not name.lower().endswith((".yaml", ".yml")):
         if name.lower() not in known_arms() and os.path.isfile(name):
             raise ArmError(
                 f"{name} is not an arm file: its name does not end in .yaml; known arms: {', '.join(known_arms())}, or "
@@ -114,7 +114,7 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
 
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
     what = f"{'an' if kind == 'instrument' else 'a'} {kind} file"
-    if name.endswith((".yaml", ".yml")):
+    if name.lower().endswith((".yaml", ".yml")):
         if "\0" in name:
             raise ArmError(f"{arm_path}: {kind} {name!r} is not a valid file name")
         path = Path(os.path.realpath(arm_path.parent / name))

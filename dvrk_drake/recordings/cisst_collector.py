@@ -37,7 +37,7 @@ _ORIGIN = re.compile(r"StateDataCollection-(?P<component>.+)-(?P<table>[^-]+)-\d
 
 def is_collector_file(path: Path) -> bool:
     """Returns whether a path is a description file of the collector, or a file with such a description."""
-    return path.suffix == ".desc" or (path.suffix == ".csv" and path.with_suffix(".desc").is_file())
+    return path.suffix.lower() == ".desc" or (path.suffix.lower() == ".csv" and path.with_suffix(".desc").is_file())
 
 
 def read_collector(path: Path, options: FileOptions) -> Recording:
@@ -59,7 +59,9 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
             has other joints.
     """
     arm = options.required_arm(path)
-    description, data = path.with_suffix(".desc"), path.with_suffix(".csv")
+    is_description = path.suffix.lower() == ".desc"
+    description = path if is_description else path.with_suffix(".desc")
+    data = path.with_suffix(".csv") if is_description else path
     origin, fields = _read_description(description)
     names = [re.sub(r":\{.*\}$", "", field) for field in fields]
     separate = f"{arm.separate_joint}/measured_js"

@@ -34,7 +34,8 @@ _MAX_DENSITY = 1.5
 _MAX_EXCESS = 3
 #: Beginning of the names of the joints of a PSM of dVRK before 2024, e.g. "outer_yaw" for "yaw".
 _OLD_PREFIX = "outer_"
-_BLOCKS = ("position", "velocity", "effort")
+#: Fields of a message with one number per joint.
+MESSAGE_BLOCKS = ("position", "velocity", "effort")
 
 
 class JointState(NamedTuple):
@@ -84,8 +85,8 @@ def collect_joint_states(
     """
     names: tuple[str, ...] = ()
     stamps, numbers = array("q"), array("q")
-    blocks = {name: array("d") for name in _BLOCKS}
-    missing: dict[str, list[int]] = {name: [] for name in _BLOCKS}
+    blocks = {name: array("d") for name in MESSAGE_BLOCKS}
+    missing: dict[str, list[int]] = {name: [] for name in MESSAGE_BLOCKS}
     unstamped, invalid = 0, 0
     for message in messages:
         where = f"{path}: {item(message.number)}"
@@ -100,7 +101,7 @@ def collect_joint_states(
                 f"{where} has the joints {', '.join(message.name)}, but the first one has {', '.join(names)}. Choose a "
                 "topic with one publisher."
             )
-        rows = {name: np.asarray(getattr(message, name), float) for name in _BLOCKS}
+        rows = {name: np.asarray(getattr(message, name), float) for name in MESSAGE_BLOCKS}
         absent = [name for name, row in rows.items() if not len(row)]
         if "position" in absent:
             raise RecordingError(f"{where} has no positions")
@@ -134,11 +135,11 @@ def collect_joint_states(
             raise RecordingError(f"{path}: {item(absent_in[0])} has no {name}, but {item(has)} has. Cut the recording.")
     stamp_array, number_array = np.frombuffer(stamps, np.int64), np.frombuffer(numbers, np.int64)
     order, time_notes = _order_in_time(path, topic, stamp_array, number_array, item)
-    q, qd, tau = (
-        np.frombuffer(blocks[name]).reshape(len(stamps), -1)[order] if name in blocks else None for name in _BLOCKS
+    table = {name: np.frombuffer(block).reshape(len(stamps), -1)[order] for name, block in blocks.items()}
+    return JointStates(
+        *(topic, names, stamp_array[order], table["position"], table.get("velocity"), table.get("effort")),
+        *(number_array[order], (*notes, *time_notes)),
     )
-    assert q is not None
-    return JointStates(topic, names, stamp_array[order], q, qd, tau, number_array[order], (*notes, *time_notes))
 
 
 def joint_recording(

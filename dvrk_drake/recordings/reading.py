@@ -152,7 +152,7 @@ def detect_format(path: Path) -> Format:
                 head = file.read(_HEAD)
             except OSError as error:
                 raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-        if not head.strip() and path.suffix != ".csv":
+        if not head.strip() and path.suffix.lower() != ".csv":
             raise RecordingError(f"{path} is empty")
     found = next((known for known in FORMATS if known.matches(path)), None)
     if found is None:

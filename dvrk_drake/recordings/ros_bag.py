@@ -10,6 +10,7 @@ import hashlib
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -96,12 +97,17 @@ class _Bag:
         from rosbags.typesys import Stores, get_typestore
 
         self.path = path
+        self._link_folder: TemporaryDirectory[str] | None = None
         if not path.is_dir():
             with path.open("rb") as file:
                 start = file.read(16)
             suffix = next(suffix for magic, suffix in _MAGIC.items() if start.startswith(magic))
             if path.suffix != suffix:
-                raise RecordingError(f"{path}: this is a ROS bag whose name must end in {suffix}; rename the file")
+                # The library reads only files with the usual suffix.
+                self._link_folder = TemporaryDirectory()
+                path = Path(self._link_folder.name) / f"bag{suffix}"
+                path.symlink_to(self.path.resolve())
+        self._opened = path
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
         except Exception as error:
@@ -117,6 +123,11 @@ class _Bag:
 
     def __exit__(self, *exc_info: object) -> None:
         self._reader.close()
+        self._remove_link()
+
+    def _remove_link(self) -> None:
+        if self._link_folder is not None:
+            self._link_folder.cleanup()
 
     def joint_state_topics(self) -> dict[str, _Connections]:
         """Returns the connections of each topic with JointState messages, by topic."""
@@ -141,7 +152,9 @@ class _Bag:
         # Errors of these types have texts about the program instead of the bag.
         is_internal = isinstance(error, (TypeError, KeyError, IndexError, AssertionError, AttributeError, struct.error))
         text = "damaged" if is_internal else " ".join(str(error).split()) or "damaged"
-        repair = {".bag": "rosbag reindex", ".mcap": "mcap recover"}.get(self.path.suffix, "ros2 bag reindex")
+        text = text.replace(str(self._opened), str(self.path))
+        self._remove_link()
+        repair = {".bag": "rosbag reindex", ".mcap": "mcap recover"}.get(self._opened.suffix, "ros2 bag reindex")
         return RecordingError(
             f"{self.path}: the bag cannot be read ({text}). It may be incomplete; `{repair}` can repair it."
         )

@@ -1,4 +1,4 @@
-"""CSV files without a header: layouts by their number of columns, times, and one line for each fault."""
+"""CSV files of other programs: layouts without a header, columns of messages, times, and one line for each fault."""
 
 from __future__ import annotations
 
@@ -143,3 +143,68 @@ def test_a_real_motion_without_header_and_time_is_restored(shared_data, tmp_path
     for name in ("q", "qd", "tau"):
         np.testing.assert_array_equal(getattr(restored, name), getattr(expected, name))
     np.testing.assert_allclose(restored.t, expected.t, rtol=0, atol=1e-12)
+
+
+def message_rows(layout, names, stamps, blocks):
+    """Returns the text of a CSV with JointState messages in the layout of a program."""
+    n = len(names)
+    numbered = {"bagpy": "{}_{}", "echo": "field.{}{}"}.get(layout)
+    fields = ("position", "velocity", "effort")
+    if layout == "collection":
+        header = "# Topic: /MTMR/measured_js\n# Type: sensor_msgs/msg/JointState\n"
+        header += "timestamp,header.stamp.sec,header.stamp.nanosec,header.frame_id,name," + ",".join(fields)
+    elif layout == "bagpy":
+        header = "Time,header.seq,header.stamp.secs,header.stamp.nsecs,header.frame_id,name"
+    else:
+        header = "%time,field.header.seq,field.header.stamp,field.header.frame_id"
+        header += "".join(f",field.name{i}" for i in range(n))
+    if numbered:
+        header += "".join("," + numbered.format(field, i) for field in fields for i in range(n))
+    lines = [header]
+    for k, stamp in enumerate(stamps):
+        values = [block[k].tolist() for block in blocks]
+        sec, nanosec, quoted = stamp // 10**9, stamp % 10**9, f'"{list(names)}"'
+        flat = ",".join(repr(x) for row in values for x in row)
+        lines.append(
+            {
+                "collection": f"{stamp},{sec},{nanosec},,{quoted}," + ",".join(f'"{row}"' for row in values),
+                "bagpy": f"{stamp / 1e9},{k},{sec},{nanosec},,{quoted},{flat}",
+                "echo": f"{stamp},{k},{stamp},,{','.join(names)},{flat}",
+            }[layout]
+        )
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("layout", ["collection", "bagpy", "echo"])
+def test_columns_of_messages_are_read_like_a_bag(tmp_path, layout):
+    arm, blocks = load_arm("mtmr"), np.random.default_rng(0).uniform(-0.2, 0.2, (3, 5, 7))
+    stamps = 1_700_000_000_000_000_001 + 10_000_000 * np.arange(5)
+    text = message_rows(layout, arm.joint_names[::-1], stamps.tolist(), blocks)
+    read = read_recording(write_text(tmp_path, text), arm)
+    for name, block in zip(("q", "qd", "tau"), blocks, strict=True):
+        np.testing.assert_array_equal(getattr(read, name), block[:, ::-1])
+    np.testing.assert_allclose(read.t, 0.01 * np.arange(5), atol=1e-12)
+    first = text.count("#") + 2
+    np.testing.assert_array_equal(read.lines, range(first, first + 5))
+    assert (read.file_coordinates, read.notes) == ("joint", ())
+    if layout == "collection":
+        assert_refused(
+            "/MTMR is the namespace of the arm MTMR, not of MTML. Choose --arm mtmr.$", read_recording, read.source, ARM
+        )
+    broken = write_text(tmp_path, text.replace(repr(float(blocks[2, 3, 4])), "off"))
+    assert_refused(f"line {first + 3}: .*effort.* is not a number: 'off'", read_recording, broken, arm)
+    wrong = text.replace("header.stamp", "stamp").replace("field.stamp", "stamp")
+    assert_refused(
+        "these are columns of JointState messages .* the times `header.stamp` are missing",
+        *(read_recording, write_text(tmp_path, wrong), arm),
+    )
+
+
+def test_a_header_in_a_comment_is_read(tmp_path):
+    """np.savetxt writes the header as a comment."""
+    names = ["t", *(f"q{i}" for i in range(1, 8))]
+    table = np.random.default_rng(0).normal(size=(3, 8))
+    np.savetxt(tmp_path / "motion.csv", table, delimiter=",", header=",".join(names))
+    read = read_recording(tmp_path / "motion.csv")
+    np.testing.assert_array_equal(np.column_stack([read.t, read.q]), table)
+    np.testing.assert_array_equal(read.lines, [2, 3, 4])

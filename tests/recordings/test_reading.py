@@ -115,7 +115,7 @@ def test_joints_of_files_without_names_can_be_stated(tmp_path):
         np.testing.assert_array_equal(read.tau, -q[:, order])
         for number, match in (
             ("2", "--joints: 2 is used for two joints of MTML"),
-            ("8", "column q8|no joint 8; it has"),
+            ("8", "column q8|no joint 8; it"),
         ):
             assert_refused(match, read_recording, file, arm, joints={"outer_yaw": number})
     named = write_text(tmp_path, "".join(f"q_{name}," for name in arm.joint_names) + "t\n1,2,3,4,5,6,7,0\n")

@@ -11,9 +11,12 @@ import pytest
 from forked import public_folder, run_unprivileged
 from recordings import HEADER, Q_NAMES, ROW, SIX, TAU_NAMES, random_recording, six_joint_arm, write_text
 
+from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings import csv_rows
 from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Recording
 
 
 def test_reads_columns_by_name_in_any_order_and_ignores_others(tmp_path):
@@ -202,3 +205,19 @@ def test_time_to_read_a_recorded_file_is_close_to_that_of_numpy(tmp_path):
     ratio = seconds(lambda: read_recording(path)) / seconds(lambda: np.loadtxt(path, delimiter=",", skiprows=1))
     # The goal is 0.4 s for 60,000 rows, for which np.loadtxt takes 0.2 s.
     assert ratio < 2
+
+
+def test_an_empty_recording_is_refused_with_one_line():
+    empty = Recording(q=np.empty((0, 7)), tau=np.empty((0, 7)))
+    for function in (empty.check_fits, lambda arm: check_recording(empty, arm)):
+        with pytest.raises(RecordingError, match=r"^recording has no rows$"):
+            function(load_arm("mtml"))
+
+
+def test_limits_of_an_arm_with_only_prismatic_joints_are_checked():
+    psm = load_arm("psm")
+    arm = replace(psm, prismatic=np.ones(7, bool))
+    with pytest.raises(
+        RecordingError, match=r"yaw \(q1\) = 90 is outside .* m of PSM\. Are the positions in millimetres"
+    ):
+        Recording(q=np.full((3, 7), 90.0)).check_fits(arm)

@@ -12,6 +12,7 @@ from forked import public_folder, run_unprivileged
 from recordings import random_recording, write_text
 
 from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import write_recording
@@ -136,3 +137,11 @@ def test_content_is_on_the_disk_before_the_file_is_replaced(tmp_path, monkeypatc
     with atomic_write(path) as stream:
         stream.write("12345")
     assert calls == [5, "replaced", "folder"]
+
+
+def test_suffix_of_a_bag_may_be_in_any_case(tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "motion.MCAP"
+    recording = random_recording()
+    write_recording(recording, path, arm)
+    assert path.read_bytes().startswith(b"\x89MCAP0\r\n")
+    np.testing.assert_allclose(read_recording(path, arm).q, recording.q, atol=1e-12)
