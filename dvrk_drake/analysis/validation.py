@@ -15,7 +15,7 @@ from dvrk_drake.analysis.static.validation import StaticValidation, predict_stat
 from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import FileCoordinates, Recording, file_transmission
+from dvrk_drake.recordings.recording import Coordinates, Recording, file_transmission
 
 
 def validate(
@@ -84,7 +84,7 @@ def predict(
     model: IdentifiedModel,
     recording: Recording,
     *,
-    coordinates: FileCoordinates | None = None,
+    coordinates: Coordinates | None = None,
     progress: Progress | None = None,
 ) -> Prediction:
     """Predicts the efforts at the rows of a recording, as `dvrk-drake predict` does.

@@ -168,7 +168,7 @@ class FileOptions:
         Literal["joint", "actuator", "wpi"] | None,
         Parameter(
             help="Coordinates of q, qd and tau. wpi: actuator, except for the roll of a PSM. Default: as stated by "
-            "the file, wpi for a CSV with 21 columns and no header, or else joint."
+            "the file, wpi for a CSV of an arm of this package with 21 columns and no header, or else joint."
         ),
     ] = None
     topic: Annotated[

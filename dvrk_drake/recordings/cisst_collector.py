@@ -22,7 +22,7 @@ from dvrk_drake.models.locked_joints import check_held
 from dvrk_drake.recordings.csv_rows import CsvReader, read_numbers
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.joint_states import MAX_LATE, arm_joint_names
-from dvrk_drake.recordings.recording import FileCoordinates, Recording
+from dvrk_drake.recordings.recording import Coordinates, Recording
 
 #: Lines of a description before the names of the columns.
 _HEAD = 7
@@ -199,7 +199,7 @@ def _order(
     return list(range(count))
 
 
-def _stated_coordinates(origin: str, signal: str) -> FileCoordinates:
+def _stated_coordinates(origin: str, signal: str) -> Coordinates:
     match = _ORIGIN.match(origin)
     is_actuator = match is not None and match["table"].endswith("Read") and signal == "measured_js"
     return "actuator" if is_actuator else "joint"

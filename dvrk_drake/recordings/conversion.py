@@ -13,7 +13,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import FileCoordinates, Recording, write_recording
+from dvrk_drake.recordings.recording import Coordinates, Recording, write_recording
 
 
 def convert(
@@ -21,7 +21,7 @@ def convert(
     output: str | Path,
     *,
     arm: Arm | None = None,
-    coordinates: FileCoordinates | None = None,
+    coordinates: Coordinates | None = None,
     topic: str | None = None,
     joints: Mapping[str, str] | None = None,
     arrays: Mapping[str, str] | None = None,

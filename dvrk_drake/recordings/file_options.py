@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import COORDINATES_HELP, FileCoordinates, Recording, file_transmission
+from dvrk_drake.recordings.recording import Coordinates, Recording
 
 #: Number of joints of a file that is read without an arm.
 _DEFAULT_JOINTS = 7
@@ -24,7 +24,7 @@ class FileOptions:
     """Options of a reader. For the attributes, see the arguments of `read_recording`."""
 
     arm: Arm | None = None
-    coordinates: FileCoordinates | None = None
+    coordinates: Coordinates | None = None
     topic: str | None = None
     joints: Mapping[str, str] | None = None
     arrays: Mapping[str, str] | None = None
@@ -91,10 +91,10 @@ class FileOptions:
             )
         return self.arm
 
-    def with_coordinates(self, recording: Recording, layout: FileCoordinates | Literal[""] = "") -> Recording:
+    def with_coordinates(self, recording: Recording, layout: Coordinates | Literal[""] = "") -> Recording:
         """Returns a recording with the coordinates of these options.
 
-        Data in "wpi" coordinates are converted to joint coordinates of the arm.
+        Data in "wpi" coordinates are converted to joint coordinates of the arm, if it is given.
 
         Args:
             recording: Data of the file. Its attribute `coordinates` is not used. Its attribute `file_coordinates`
@@ -103,11 +103,11 @@ class FileOptions:
                 options state coordinates.
 
         Raises:
-            RecordingError: The file states other coordinates than these options, or the arm for "wpi" is missing.
+            RecordingError: The file states other coordinates than these options.
         """
         stated = recording.file_coordinates
-        if stated and stated not in get_args(FileCoordinates):
-            allowed = ", ".join(get_args(FileCoordinates))
+        if stated and stated not in get_args(Coordinates):
+            allowed = ", ".join(get_args(Coordinates))
             raise RecordingError(f'{recording.where(0)}: coordinates is "{stated[:30]}"; allowed: {allowed}')
         if stated and self.coordinates and stated != self.coordinates:
             raise RecordingError(
@@ -116,16 +116,8 @@ class FileOptions:
             )
         coordinates = self.coordinates or stated or layout
         recording = dataclasses.replace(recording, file_coordinates=coordinates)
-        if coordinates != "wpi":
-            return dataclasses.replace(recording, coordinates=coordinates or "joint")
-        if self.arm is None:
-            raise RecordingError(
-                f"{recording.source}: the coordinates wpi depend on the arm; give --arm (arm= in Python), or state "
-                f"other coordinates: {COORDINATES_HELP}"
-            )
-        recording = dataclasses.replace(recording, coordinates="actuator")
-        wpi = dataclasses.replace(self.arm, transmission=file_transmission(self.arm, "wpi"))
-        return recording.in_joint_coordinates(wpi)
+        recording = dataclasses.replace(recording, coordinates=coordinates or "joint")
+        return recording.in_joint_coordinates(self.arm) if self.arm and coordinates == "wpi" else recording
 
     def sampled_times(
         self, path: Path, t: NDArray[np.float64] | None, rows: NDArray[np.int_], default_rate: float | None = None

@@ -19,7 +19,7 @@ from dvrk_drake.recordings.csv_recording import read_csv
 from dvrk_drake.recordings.csv_rows import GZIP_MAGIC, is_utf16
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
-from dvrk_drake.recordings.recording import FileCoordinates, Recording
+from dvrk_drake.recordings.recording import Coordinates, Recording
 from dvrk_drake.recordings.ros_bag import is_ros_bag, read_ros_bag
 
 #: Number of bytes at the beginning of a text file that must not contain a null byte.
@@ -66,7 +66,7 @@ FORMATS = (
 def read_recording(
     path: str | Path,
     arm: Arm | None = None,
-    coordinates: FileCoordinates | None = None,
+    coordinates: Coordinates | None = None,
     *,
     topic: str | None = None,
     joints: Mapping[str, str] | None = None,
@@ -87,7 +87,8 @@ def read_recording(
             log must have statuses of only one arm.
         coordinates: Coordinates of q, qd and tau in a file that does not state them: "joint", "actuator", or "wpi" for
             the motions of WPI, which are in actuator coordinates except for the roll of a PSM. Default: the coordinates
-            that the file states, "wpi" for a CSV with 21 columns and no header, or else "joint".
+            that the file states, "wpi" for a CSV of an arm of this package with 21 columns and no header, or else
+            "joint".
         topic: Topic of a bag or its namespace, see `read_ros_bag`. For the cisst collector: name of the signal.
         joints: Mapping from the arm's name of a joint to its name in the file, e.g. {"yaw": "outer_yaw"}. In a CSV with
             a header, the latter is the end of the names of its columns: {"yaw": "2"} selects q2, qd2 and tau2. In other
@@ -114,8 +115,8 @@ def read_recording(
         >>> len(recording), recording.coordinates, recording.where(0)
         (8, 'joint', 'poses.csv, line 2')
     """
-    if coordinates is not None and coordinates not in get_args(FileCoordinates):
-        allowed = ", ".join(get_args(FileCoordinates))
+    if coordinates is not None and coordinates not in get_args(Coordinates):
+        allowed = ", ".join(get_args(Coordinates))
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {allowed}')
     path = Path(path)
     file_format = detect_format(path)

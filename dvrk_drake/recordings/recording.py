@@ -21,10 +21,9 @@ from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.linear_map import LinearMap
 
-Coordinates = Literal["joint", "actuator"]
-#: Coordinates of q, qd and tau in a file. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint
+#: Coordinates of q, qd and tau. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint
 #: coordinates (motions of WPI; Wang et al. 2019, table of the PSM).
-FileCoordinates = Literal["joint", "actuator", "wpi"]
+Coordinates = Literal["joint", "actuator", "wpi"]
 
 #: Tolerance of the position limits [rad], [m]. A pose that exceeds a limit by more is refused. Joint stops are
 #: compliant, so real poses may exceed the limits slightly.
@@ -59,7 +58,8 @@ class Recording:
         tau: Efforts (m, n) applied by the motors, or None.
         qd: Velocities (m, n), or None.
         t: Times (m,) [s], or None for static poses.
-        coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
+        coordinates: Coordinates of q, qd and tau: "joint" or "actuator". "wpi" only if a file in these coordinates was
+            read without an arm.
         source: Source of the data, for messages.
         lines: Line number (m,) of each row in the source, or None. They are event numbers for an LCM log, message
             numbers for a ROS bag, and row or pose numbers for arrays.
@@ -67,7 +67,7 @@ class Recording:
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
         line_label: Name of the numbers in `lines`, for messages: "line", "event", "message", "row" or "pose".
         file_coordinates: Coordinates that the source or the user states: "joint", "actuator" or "wpi". "" if they are
-            not stated. The data of a file in the coordinates "wpi" are converted to joint coordinates.
+            not stated. With an arm, the data of a file in the coordinates "wpi" are converted to joint coordinates.
         arm_name: Name of the arm that the source states, or "".
 
     Example:
@@ -88,7 +88,7 @@ class Recording:
     sha256: str = ""
     notes: tuple[str, ...] = ()
     line_label: str = "line"
-    file_coordinates: FileCoordinates | Literal[""] = ""
+    file_coordinates: Coordinates | Literal[""] = ""
     arm_name: str = ""
     # Cache: mapping from a transmission to this recording in the other coordinates.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
@@ -96,7 +96,7 @@ class Recording:
     def __post_init__(self) -> None:
         where = self.source or "recording"
         if self.coordinates not in get_args(Coordinates):
-            raise RecordingError(f'{where}: coordinates is "{self.coordinates}"; allowed: joint, actuator')
+            raise RecordingError(f'{where}: coordinates is "{self.coordinates}"; allowed: joint, actuator, wpi')
         for name in ("q", "qd", "tau", "t"):
             if (values := getattr(self, name)) is not None:
                 object.__setattr__(self, name, np.asarray(values, float))
@@ -187,17 +187,23 @@ class Recording:
         self._check_joint_count(arm)
         if self.coordinates == coordinates:
             return self
+        is_wpi = self.coordinates == "wpi"
         # The same arm with another gravity vector has the same transmission.
         if arm.transmission not in self._converted:
             to_other = arm.transmission if coordinates == "actuator" else arm.transmission.inverse
+            if is_wpi:
+                to_other = file_transmission(arm, "wpi").inverse
             converted = self._converted[arm.transmission] = replace(
                 self,
                 q=to_other.position(self.q),
                 qd=None if self.qd is None else to_other.velocity(self.qd),
                 tau=None if self.tau is None else to_other.inverse.pull_back_effort(self.tau),
-                coordinates=coordinates,
+                coordinates="joint" if is_wpi else coordinates,
             )
-            converted._converted[arm.transmission] = self
+            if not is_wpi:
+                converted._converted[arm.transmission] = self
+        if is_wpi:
+            return self._converted[arm.transmission]._in_coordinates(coordinates, arm)
         return self._converted[arm.transmission]
 
     def check_fits(self, arm: Arm) -> None:
@@ -294,7 +300,7 @@ class Setpoints:
     tau: NDArray[np.float64] | None = None
 
 
-def file_transmission(arm: Arm, coordinates: FileCoordinates) -> LinearMap:
+def file_transmission(arm: Arm, coordinates: Coordinates) -> LinearMap:
     """Returns the map from joint coordinates to the coordinates of a file."""
     if coordinates == "actuator":
         return arm.transmission

@@ -209,9 +209,9 @@ def test_time_to_read_a_recorded_file_is_close_to_that_of_numpy(tmp_path):
 
 def test_an_empty_recording_is_refused_with_one_line():
     empty = Recording(q=np.empty((0, 7)), tau=np.empty((0, 7)))
-    for function in (empty.check_fits, lambda arm: check_recording(empty, arm)):
-        with pytest.raises(RecordingError, match=r"^recording has no rows$"):
-            function(load_arm("mtml"))
+    with pytest.raises(RecordingError, match=r"^recording has no rows$"):
+        empty.check_fits(load_arm("mtml"))
+    assert [finding.what for finding in check_recording(empty, load_arm("mtml")).refusals] == ["recording has no rows"]
 
 
 def test_limits_of_an_arm_with_only_prismatic_joints_are_checked():

@@ -18,7 +18,7 @@ from dvrk_drake.analysis.static.linear_fit import rms
 from dvrk_drake.analysis.verdict import judge, rule_text
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import FileCoordinates, Recording, file_transmission
+from dvrk_drake.recordings.recording import Coordinates, Recording, file_transmission
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class StaticValidation(Validation):
 
 
 def predict_static(
-    model: IdentifiedModel, recording: Recording, coordinates: FileCoordinates | None = None
+    model: IdentifiedModel, recording: Recording, coordinates: Coordinates | None = None
 ) -> NDArray[np.float64]:
     """Returns the predicted holding torques (m, n) at the poses of a recording [N m, N].
 
@@ -132,6 +132,8 @@ def validate_static(
         RecordingError: The recording does not fit the model's arm, or has no efforts.
     """
     arm = model.arm
+    if recording.coordinates == "wpi":
+        recording = recording.in_joint_coordinates(arm)
     measured = recording.measured_effort()
     predicted = predict_static(model, recording)
     residuals = measured - predicted
