@@ -146,12 +146,12 @@ class _Content(NamedTuple):
 
     @property
     def has_positions(self) -> bool:
-        """Whether an array has a recognised name of positions."""
+        """Returns whether an array has a recognised name of positions."""
         return any(name.rpartition(".")[2].lower() in _NAMES["q"] for name in self.arrays)
 
     @property
     def unreadable(self) -> str:
-        """Text on the objects that cannot be read, or ""."""
+        """Returns a text on the objects that cannot be read, or ""."""
         if not self.classes:
             return ""
         return (

@@ -173,7 +173,7 @@ def test_unknown_coordinates_are_refused(tmp_path):
         read_recording(tmp_path / "any.csv", coordinates="motor")
 
 
-def test_rows_after_a_simple_block_keep_their_line_numbers_and_faults(tmp_path, monkeypatch):
+def test_rows_after_simple_blocks_keep_line_numbers(tmp_path, monkeypatch):
     """Blocks of simple rows are parsed together. Rows with quotes and blank lines are parsed one by one."""
     monkeypatch.setattr(csv_rows, "_BLOCK", 4 * len(ROW))
     quoted = '"0.1"' + ROW[3:]

@@ -232,7 +232,7 @@ def test_units_in_the_headings_of_tables_are_printed():
     assert "mass [kg]" in console.export_text()
 
 
-def test_efforts_that_precede_the_motion_are_not_explained_by_friction():
+def test_friction_does_not_explain_leading_efforts():
     """Presliding friction delays the efforts. It cannot make them earlier."""
     lag = np.array([2e-3, -2e-3])
     late, early = _lags(EffortLag(lag, 0.1 * abs(lag), 0 * lag + 2, lag != 0, lag, lag), ("yaw", "pitch"))
