@@ -427,8 +427,9 @@ def test_convert(tmp_path, capsys):
     values = generator.uniform(-0.2, 0.2, (30, 21))
     np.savetxt(tmp_path / "wpi.csv", values, delimiter=",", fmt="%.17g")
     assert main(["convert", str(tmp_path / "wpi.csv"), "--output", str(tmp_path / "ours.csv")]) == 0
-    assert "--coordinates wpi" in capsys.readouterr().out
-    ours = read_recording(tmp_path / "ours.csv", coordinates="actuator")
+    assert "30 rows, wpi coordinates" in capsys.readouterr().out
+    ours = read_recording(tmp_path / "ours.csv")
+    assert ours.coordinates == "wpi"
     np.testing.assert_array_equal(ours.q, values[:, :7])
     np.testing.assert_array_equal(ours.tau, values[:, 14:])
 
