@@ -142,7 +142,7 @@ def write_valid_files(folder: Path) -> None:
     t = np.arange(60) / 200
     q = poses[0] + 0.01 * np.sin(9 * t[:, None])
     qd = 0.09 * np.tile(np.cos(9 * t[:, None]), 7)
-    write_recording(Recording(q=q, qd=qd, tau=0.1 * psm.effort_limits * qd, t=t), folder / "motion.csv")
+    write_recording(Recording(q=q, qd=qd, tau=0.1 * psm.effort_limits * qd, t=t), folder / "motion.csv", psm)
     scipy.io.savemat(folder / "team.mat", {"poses": team_array(6), "note": "text", "other": np.eye(3)})
     rows = 1e-3 * wpi_rows(8)
     (folder / "wpi.csv").write_text("".join(",".join(map(repr, row)) + "\n" for row in rows.tolist()))
@@ -183,7 +183,7 @@ READERS = {
     "poses.yaml": ("yaml", 20, lambda path: load_poses(path, load_arm("psm"))),
     "gc.json": ("json", 30, GravityCompensationFile.load),
     "kinematic.json": ("json", 20, GravityCompensationFile.load),
-    "motion.csv": ("csv", 20, lambda path: read_recording(path, load_arm("psm"), "actuator")),
+    "motion.csv": ("csv", 20, lambda path: read_recording(path, load_arm("psm"))),
     "mtm_2015_good72.csv": ("csv", 20, lambda path: PaperRecordings(path.parent).poses),
     "poses.csv": ("csv", 30, lambda path: read_recording(path, load_arm("mtml")).check_fits(load_arm("mtml"))),
     "team.mat": ("binary", 30, lambda path: convert(path, path.parent / "out.csv")),

@@ -155,9 +155,9 @@ class Prediction:
     """Result of `predict`.
 
     Attributes:
-        tau: Predicted efforts (m, n), in the coordinates of the recording [N m, N].
-        half_width: Half widths (n,) of the 95 % prediction intervals (`DynamicModel.half_width`), in the coordinates of
-            the recording [N m, N]. None for holding torques. `IdentifiedModel.interval_scope` states their day.
+        tau: Predicted efforts (m, n), in the coordinates given to `predict` [N m, N].
+        half_width: Half widths (n,) of the 95 % prediction intervals (`DynamicModel.half_width`), in the same
+            coordinates [N m, N]. None for holding torques. `IdentifiedModel.interval_scope` states their day.
         warnings: Findings of `check`. `str` of a finding is one line.
     """
 

@@ -17,7 +17,7 @@ from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Recording
+from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Coordinates, Recording, file_transmission
 
 
 def validate(
@@ -88,19 +88,26 @@ def _refuse_motion(model: IdentifiedModel, recording: Recording) -> None:
         )
 
 
-def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Prediction:
+def predict(
+    model: IdentifiedModel,
+    recording: Recording,
+    *,
+    coordinates: Coordinates | None = None,
+    progress: Progress | None = None,
+) -> Prediction:
     """Predicts the efforts at the rows of a recording, as `dvrk-drake predict` does.
 
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
         recording: Poses or a motion. Efforts are not required.
+        coordinates: Coordinates of the result: "joint", "actuator" or "wpi". Default: those of the recording.
         progress: Callback that receives the name of the step ("checking the recording" or "predicting") and the
             finished share of the step (0 to 1).
 
     Returns:
-        Result with efforts `tau` (m, n) [N m, N] in the coordinates of the recording, and `warnings`. For a motion and
-        a model with dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification,
-        and `half_width` the half widths of their 95 % prediction intervals. Otherwise, `tau` contains holding torques.
+        Result with efforts `tau` (m, n) [N m, N] in these coordinates, and `warnings`. For a motion and a model with
+        dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification, and
+        `half_width` the half widths of their 95 % prediction intervals. Otherwise, `tau` contains holding torques.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute
@@ -120,15 +127,16 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     moves = find_poses(measured, arm).moves
     if model.dynamics is None or not moves:
         step_progress(progress, "predicting")(0.0)
-        return Prediction(predict_static(model, recording))
+        return Prediction(predict_static(model, recording, coordinates))
     report = require_usable(measured, arm, progress, ignored_kind="no effort" if recording.tau is None else "")
     share = step_progress(progress, "predicting")
     share(0.0)
     tau = predict_motion(model, recording)
     half_width = model.dynamic_model.half_width
-    if recording.coordinates == "joint":
-        tau = arm.transmission.pull_back_effort(tau)
+    if (coordinates := coordinates or recording.coordinates) != "actuator":
+        to_actuator = arm.transmission.matrix @ file_transmission(arm, coordinates).inverse.matrix
+        tau = tau @ to_actuator
         # The errors of the actuators are independent.
-        half_width = np.sqrt(half_width**2 @ arm.transmission.matrix**2)
+        half_width = np.sqrt(half_width**2 @ to_actuator**2)
     share(1.0)
     return Prediction(tau, half_width if np.all(half_width > 0) else None, report.warnings)

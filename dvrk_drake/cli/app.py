@@ -168,7 +168,7 @@ class FileOptions:
         Literal["joint", "actuator", "wpi"] | None,
         Parameter(
             help="Coordinates of q, qd and tau. wpi: actuator, except for the roll of a PSM. Default: as stated by "
-            "the file, wpi for a CSV with 21 columns and no header, or else joint."
+            "the file, wpi for a CSV of an arm of this package with 21 columns and no header, or else joint."
         ),
     ] = None
     topic: Annotated[
@@ -176,6 +176,15 @@ class FileOptions:
         Parameter(
             metavar="TOPIC",
             help="ROS bag: JointState topic or its namespace. Collector: signal. Default: measured_js of the arm.",
+        ),
+    ] = None
+    joints: Annotated[
+        list[str] | None,
+        Parameter(
+            metavar="NAME=NAME_IN_FILE ..",
+            consume_multiple=True,
+            help="Names of joints in the file, e.g. yaw=outer_yaw. CSV with a header: yaw=2 selects q2, qd2 and tau2. "
+            "Default: the names of the arm, or 1, 2, ...",
         ),
     ] = None
     arrays: Annotated[
@@ -207,7 +216,10 @@ class FileOptions:
 
     def as_arguments(self) -> dict[str, Any]:
         """Returns the keyword arguments of `read_recording`."""
-        return vars(self) | {"arrays": None if self.arrays is None else _named_arrays(self.arrays)}
+        return vars(self) | {
+            "joints": _named("joints", self.joints, "yaw=outer_yaw"),
+            "arrays": _named("arrays", self.arrays, "q=position; names: q, qd, tau, t, poses"),
+        }
 
     def as_text(self) -> str:
         """Returns the options for a command line, beginning with a space, or ""."""
@@ -219,13 +231,16 @@ class FileOptions:
         return "".join(f" {word}" for word in words)
 
 
-def _named_arrays(texts: Sequence[str]) -> dict[str, str]:
+def _named(option: str, texts: Sequence[str] | None, example: str) -> dict[str, str] | None:
+    """Returns the mapping of an option with arguments NAME=NAME_IN_FILE, or None without the option."""
     from dvrk_drake.errors import RecordingError
 
+    if texts is None:
+        return None
     pairs = [text.partition("=") for text in texts]
-    if wrong := [text for text, (name, sign, array) in zip(texts, pairs, strict=True) if not (name and sign and array)]:
-        raise RecordingError(f"--arrays {wrong[0]}: allowed: NAME=ARRAY, e.g. q=position; names: q, qd, tau, t, poses")
+    if wrong := [text for text, (name, sign, value) in zip(texts, pairs, strict=True) if not (name and sign and value)]:
+        raise RecordingError(f"--{option} {wrong[0]}: allowed: NAME=NAME_IN_FILE, e.g. {example}")
     names = [name for name, _, _ in pairs]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise RecordingError(f"--arrays: {twice[0]} is given twice; give one array for each quantity")
-    return {name: array for name, _, array in pairs}
+        raise RecordingError(f"--{option}: {twice[0]} is given twice; give one name in the file for each")
+    return {name: value for name, _, value in pairs}

@@ -134,8 +134,7 @@ def excite(
     if csv is not None:
         t = np.arange(round(motion.duration * rate) + 1) / rate
         q, v = motion.evaluate(t)[:2]
-        names = ["t", *(f"{name}{j + 1}" for name in ("q", "qd") for j in range(moved.num_joints))]
-        write_csv(csv, names, np.column_stack([t, q, v]))
+        write_csv(csv, {"t": t, "q": q, "qd": v}, moved, {"coordinates": "joint", "arm": moved.name})
     console = make_console()
     print_answer(
         console,

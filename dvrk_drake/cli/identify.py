@@ -267,25 +267,25 @@ def predict(
     In all other cases, the command predicts the holding efforts.
 
     Args:
-        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the printed coordinates. For a
-            motion, the columns lower1..lowern and upper1..uppern are the limits of the 95 % prediction interval.
+        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the coordinates of the recording.
+            For a motion, it also contains the time t, and the columns lower1..lowern and upper1..uppern are the limits
+            of the 95 % prediction interval.
     """
-    import numpy as np
-
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "predicting") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
-        prediction = dvrk.predict(loaded, read, progress=steps)
-    columns = {"tau": (tau := prediction.tau)}
+        coordinates = read.file_coordinates or read.coordinates
+        prediction = dvrk.predict(loaded, read, coordinates=coordinates, progress=steps)
+    columns = {} if read.t is None else {"t": read.t}
+    columns["tau"] = tau = prediction.tau
     if prediction.half_width is not None:
         columns |= {"lower": tau - prediction.half_width, "upper": tau + prediction.half_width}
-    names = [f"{name}{i + 1}" for name in columns for i in range(tau.shape[1])]
-    write_csv(output, names, np.hstack(list(columns.values())))
+    write_csv(output, columns, loaded.arm, {"coordinates": coordinates, "arm": loaded.arm.name})
     print_warnings(make_console(), prediction.warnings)
-    print_written(output, f"{len(tau)} rows, {read.coordinates} coordinates")
+    print_written(output, f"{len(tau)} rows, {coordinates} coordinates")
     if prediction.half_width is not None:
         print(loaded.interval_scope, flush=True)
 

@@ -33,7 +33,7 @@ def check_report(path: str | None, *inputs: str, overwrite: bool) -> None:
     """
     if path is None:
         return
-    if not path.endswith((".html", ".htm")):
+    if not path.lower().endswith((".html", ".htm")):
         raise DvrkDrakeError(f"{path}: --report writes HTML; the name of the file must end in .html")
     check_output(path, *inputs, overwrite=overwrite)
     with interrupt_ends_process():

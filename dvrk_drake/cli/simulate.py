@@ -118,7 +118,7 @@ def study(
 
     quiet_drake()
     loaded = load_study(study, set or [])
-    if not output.endswith((".csv", ".parquet")):
+    if not output.lower().endswith((".csv", ".parquet")):
         raise StudyError(f"{output}: must end in .csv or .parquet")
     check_output(output, overwrite=True)
     check_report(report, study, overwrite=overwrite)
@@ -248,7 +248,7 @@ def transparency(
         raise ScenarioError("--speed requires --path with a recorded motion")
     compensations = _compensations(moved_arm, model or [], friction_ratio)
     if output is not None:
-        if not output.endswith(".csv"):
+        if not output.lower().endswith(".csv"):
             raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
         check_output(output, path or "", *(model or []), overwrite=overwrite)
     check_report(report, path or "", *(model or []), overwrite=overwrite)

@@ -18,6 +18,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.arm_schema import Gains, load_gains
 from dvrk_drake.models.schema_fault import formerly, within
 from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
@@ -265,10 +266,15 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
         (2.0, 'damped')
     """
     path = Path(arm_or_file)
-    if path.suffix in (".yaml", ".yml"):
+    if path.suffix.lower() in (".yaml", ".yml"):
         content = load_yaml(path, ScenarioError)
         if isinstance(content, dict) and "mechanism" in content:
             content = {"arm": arm_or_file}
+    elif path.suffix:
+        raise ScenarioError(
+            f"{arm_or_file} is not a scenario: its name does not end in .yaml. Give a scenario file, or an arm: "
+            f"{', '.join(known_arms())}"
+        )
     else:
         content = {"arm": arm_or_file}
     if isinstance(content, dict):

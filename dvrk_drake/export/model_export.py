@@ -163,7 +163,7 @@ def export_model(
         (7,)
     """
     if format is None:
-        suffix = Path(path).suffix
+        suffix = Path(path).suffix.lower()
         if suffix not in (".sdf", ".urdf"):
             raise ModelError(f"{path}: the format is not given; give one of {', '.join(get_args(Format))}")
         format = "sdf" if suffix == ".sdf" else "urdf"

@@ -275,7 +275,7 @@ def _local_path(uri: str) -> Path | None:
 
 def _referenced_files(mesh: Path) -> list[str]:
     """Returns the paths of the buffers and images of a glTF file, relative to its folder. Other meshes have none."""
-    if mesh.suffix != ".gltf":
+    if mesh.suffix.lower() != ".gltf":
         return []
     content = read_json_input(mesh, ArmError, MAX_BINARY)
     try:

@@ -61,7 +61,7 @@ def load_arm(name: str | Path) -> Arm:
     name = os.fspath(name)
     if "\0" in name:
         raise ArmError(f"{name!r} is not a valid file name")
-    if not name.endswith((".yaml", ".yml")):
+    if not name.lower().endswith((".yaml", ".yml")):
         if name.lower() not in known_arms() and os.path.isfile(name):
             raise ArmError(
                 f"{name} is not an arm file: its name does not end in .yaml; known arms: {', '.join(known_arms())}, or "
@@ -76,6 +76,13 @@ def load_arm(name: str | Path) -> Arm:
         status = path.stat()
         return _load_arm(str(path), (status.st_mtime_ns, status.st_size))
     return _load_arm(str(path))
+
+
+def is_package_arm(arm: Arm | str) -> bool:
+    """Returns whether an arm, or its name, has the name of an arm of this package."""
+    name = arm if isinstance(arm, str) else arm.name
+    # The name in an arm file of this package is the name of the file in capital letters.
+    return name.upper() in map(str.upper, known_arms())
 
 
 @cached
@@ -107,7 +114,7 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
 
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
     what = f"{'an' if kind == 'instrument' else 'a'} {kind} file"
-    if name.endswith((".yaml", ".yml")):
+    if name.lower().endswith((".yaml", ".yml")):
         if "\0" in name:
             raise ArmError(f"{arm_path}: {kind} {name!r} is not a valid file name")
         path = Path(os.path.realpath(arm_path.parent / name))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import secrets
 import stat
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
@@ -122,7 +122,8 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
 def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
     """Opens a temporary file. It replaces `path` if the `with` block succeeds, and is deleted otherwise.
 
-    If `path` is a link, its target is replaced. An existing file keeps its permissions.
+    If `path` is a link, its target is replaced. An existing file keeps its permissions, and a new file gets those of
+    the umask. The content is on the disk before the file is replaced.
 
     Args:
         path: Path of the output file.
@@ -140,20 +141,27 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
         )
     if exists and not os.access(target, os.W_OK):
         raise DvrkDrakeError(f"{path} cannot be written: the file is read-only")
-    permissions = target.stat().st_mode & 0o777 if exists else 0o666 & ~_umask()
+    temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(8)}")
     try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:100]}.")
+        # The system applies the umask to a new file. The umask belongs to the process, so a thread must not change it.
+        flags, permissions = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600 if exists else 0o666
+        handle = os.open(temporary, flags, permissions)
     except OSError as error:
         raise DvrkDrakeError(f"{path} cannot be written: {error.strerror}") from error
     text: dict[str, Any] = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
     try:
         with os.fdopen(handle, mode, **text) as stream:
+            if exists:
+                os.fchmod(handle, target.stat().st_mode & 0o777)
             yield stream
-        os.chmod(temporary, permissions)
+            # Without fsync, a power failure after the replacement may leave an empty file.
+            stream.flush()
+            os.fsync(handle)
         try:
             os.replace(temporary, target)
         except OSError as error:
             raise DvrkDrakeError(f"{path} cannot be written: {error.strerror}") from error
+        _sync_folder(target.parent)
     except BaseException as error:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
@@ -162,10 +170,14 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
         raise
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _sync_folder(folder: Path) -> None:
+    """Waits until the names of the files in a folder are on the disk. Some file systems do not support this."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 class Reportable:

@@ -20,10 +20,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
+from scipy.io.matlab import MatlabOpaque
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.csv_rows import listed, read_bytes
 from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
 from dvrk_drake.recordings.recording import Recording
 
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -43,6 +45,8 @@ _NAMES = {
 QUANTITIES = tuple(_NAMES)
 #: First dimension of an array of static poses (joints and gripper), and number of joints.
 _POSE_ROWS, _POSE_JOINTS = 8, 7
+#: MATLAB classes of numbers.
+_NUMERIC_CLASSES = ("double", "single", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 #: Maximum number of arrays listed in a message.
 _LISTED = 12
 
@@ -60,6 +64,8 @@ def is_array_file(path: Path) -> bool:
 
 def read_array_file(path: Path, options: FileOptions) -> Recording:
     """Reads a recording from a MATLAB file, a NumPy archive, or all such files of a folder and its subfolders.
+
+    Messages sensor_msgs/JointState in a structure array or cell array of MATLAB are read like a topic of a ROS bag.
 
     An array is m x n, n x m or n x poses x samples, for m rows and n joints. Each sample is one row of the recording.
     Arrays without times contain static poses, unless `options.rate` is given.
@@ -86,13 +92,18 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         options.progress(number / len(files))
         content = read_bytes(file)
         digest.update(content)
-        parts.append(_rows(file, _read_arrays(file, content), options.num_joints, names))
+        contents = _read_content(file, content)
+        if contents.messages and not names and not contents.has_positions and len(files) == 1:
+            return _message_recording(path, contents.messages, options, digest.hexdigest())
+        parts.append(_rows(file, contents, options.num_joints, names))
     for file, part in zip(files, parts, strict=True):
         if (part.blocks.keys(), part.label) != (parts[0].blocks.keys(), parts[0].label):
             raise RecordingError(
                 f"{file}: {part.note}; {files[0]}: {parts[0].note}. All files of a folder must have the same arrays."
             )
+    order = options.joint_order(path)
     blocks = {quantity: np.concatenate([part.blocks[quantity] for part in parts]) for quantity in parts[0].blocks}
+    blocks = {quantity: block if quantity == "t" else block[:, order] for quantity, block in blocks.items()}
     label, preallocated = parts[0].label, parts[0].preallocated
     notes = [parts[0].note if len(files) == 1 else f"{len(files)} files; {parts[0].note} of each file"]
     if "t" in blocks and len(files) > 1:
@@ -120,6 +131,35 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     return options.with_coordinates(recording)
 
 
+class _Content(NamedTuple):
+    """Content of a file.
+
+    Attributes:
+        arrays: Arrays of real numbers by name.
+        messages: Messages sensor_msgs/JointState by the name of their variable.
+        classes: Names of the MATLAB classes of objects that cannot be read.
+    """
+
+    arrays: dict[str, NDArray]
+    messages: dict[str, list[JointState]]
+    classes: list[str]
+
+    @property
+    def has_positions(self) -> bool:
+        """Returns whether an array has a recognised name of positions."""
+        return any(name.rpartition(".")[2].lower() in _NAMES["q"] for name in self.arrays)
+
+    @property
+    def unreadable(self) -> str:
+        """Returns a text on the objects that cannot be read, or ""."""
+        if not self.classes:
+            return ""
+        return (
+            f"objects of the MATLAB class {', '.join(self.classes)} are not read; save their numbers as arrays, e.g. "
+            "q = data.Data; t = data.Time; save('log.mat', 'q', 't', '-v7')"
+        )
+
+
 class _Rows(NamedTuple):
     """Rows of the blocks q, qd, tau (m, n) and t (m,) of one file.
 
@@ -145,10 +185,28 @@ def _collection(folder: Path) -> list[Path]:
     )
 
 
-def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str]) -> _Rows:
+def _message_recording(
+    path: Path, variables: Mapping[str, list[JointState]], options: FileOptions, sha256: str
+) -> Recording:
+    """Returns the recording of the only variable with messages."""
+    if len(variables) > 1:
+        raise RecordingError(
+            f"{path}: several variables have JointState messages: {', '.join(variables)}. Save the messages of one arm."
+        )
+    (name, messages), *_ = variables.items()
+    states = collect_joint_states(
+        path, name, messages, skip_invalid=options.skip_invalid, item=lambda number: f"message {number} of {name}"
+    )
+    return joint_recording(path, states, None, options, sha256, "message")
+
+
+def _rows(path: Path, content: _Content, n: int, names: Mapping[str, str]) -> _Rows:
     """Returns the rows of the named and the recognised arrays."""
+    arrays = content.arrays
     shapes = [f"{name} ({_shape(array)})" for name, array in arrays.items()]
     found = ", ".join(shapes[:_LISTED]) + (", ..." if len(shapes) > _LISTED else "") or "none"
+    if content.unreadable:
+        found += f"; {content.unreadable}"
     for quantity, name in names.items():
         if name not in arrays:
             raise RecordingError(f"{path}: has no array {name} for {quantity}. Arrays of real numbers: {found}.")
@@ -171,7 +229,8 @@ def _rows(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str,
                 f"{path}: {chosen[quantity]} has {len(block)} rows, but {chosen['q']} has {len(blocks['q'])}; all "
                 "arrays must have the same number of rows"
             )
-    return _Rows(blocks, ", ".join(f"{quantity} from array {name}" for quantity, name in chosen.items()))
+    note = ", ".join(f"{quantity} from array {name}" for quantity, name in chosen.items())
+    return _Rows(blocks, f"{note}; {content.unreadable}" if content.unreadable else note)
 
 
 def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str], found: str) -> dict[str, str]:
@@ -276,28 +335,40 @@ def _is_hdf5(content: bytes) -> bool:
     return any(content[start : start + 8] == _HDF5_MAGIC for start in (0, 512))
 
 
-def _read_arrays(path: Path, content: bytes) -> dict[str, NDArray]:
-    """Returns all arrays of real numbers in a file by name. Members of structures have names with dots: "log.q"."""
+def _read_content(path: Path, content: bytes) -> _Content:
+    """Returns the content of a file. Members of structures have names with dots: "log.q"."""
     read = _read_hdf5 if _is_hdf5(content) else _read_npz if content[:4] == _ZIP_MAGIC else _read_mat
     try:
         with warnings.catch_warnings():
             # Raises the warning "returned data may be corrupt" as an error.
             warnings.simplefilter("error", UserWarning)
+            # scipy gives the name "None" to all objects of classes.
+            warnings.filterwarnings("ignore", 'Duplicate variable name "None"')
             found = read(content)
     except Exception as error:
         # For a damaged file the libraries raise errors of many types: ValueError, OSError, zlib.error, KeyError, ...
         text = " ".join(str(error).split())
         raise RecordingError(f"{path}: the file is damaged, or not a MATLAB file or NumPy archive ({text})") from error
-    return {name: value for name, value in found.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"}
+    arrays = {
+        name: value for name, value in found.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
+    }
+    messages = {name: value for name, value in found.items() if isinstance(value, list)}
+    classes = sorted({value for value in found.values() if isinstance(value, str)})
+    return _Content(arrays, messages, classes)
 
 
 def _read_mat(content: bytes) -> dict[str, object]:
+    """Returns arrays by name, messages as lists, and the name of the class of each object."""
     loaded = scipy.io.loadmat(io.BytesIO(content), simplify_cells=False, squeeze_me=False, struct_as_record=True)
     found: dict[str, object] = {}
 
     def visit(name: str, value: object) -> None:
+        if isinstance(value, MatlabOpaque):
+            found[f"object {len(found)}"] = value["s2"][0].decode()
+        elif messages := _messages(value):
+            found[name] = messages
         # A structure is an array (1, 1) of records.
-        if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
+        elif isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
             for member in value.dtype.names:
                 visit(f"{name}.{member}", value[member].item())
         else:
@@ -309,6 +380,40 @@ def _read_mat(content: bytes) -> dict[str, object]:
     return found
 
 
+def _messages(value: object) -> list[JointState]:
+    """Returns the JointState messages in a structure array or a cell array, or an empty list.
+
+    `readMessages(bag, DataFormat="struct")` of MATLAB's ROS Toolbox returns such cell arrays.
+    """
+    if not isinstance(value, np.ndarray) or not (value.dtype.names or value.dtype == object):
+        return []
+    messages = []
+    for number, item in enumerate(value.reshape(-1), 1):
+        fields = _members(item)
+        stamp = _members(_members(fields.get("header")).get("stamp"))
+        if "sec" not in stamp or not {"name", "position"} <= fields.keys():
+            return []
+        sec, nanosec = (
+            int(np.sum(np.asarray(stamp.get(name, 0), np.int64)))
+            for name in ("sec", "nanosec" if "nanosec" in stamp else "nsec")
+        )
+        names = [str(np.asarray(name).item()) for name in np.asarray(fields["name"]).reshape(-1)]
+        blocks = [np.asarray(fields.get(name, ()), float).reshape(-1) for name in MESSAGE_BLOCKS]
+        messages.append(JointState(number, sec * 1_000_000_000 + nanosec, names, *blocks))
+    return messages
+
+
+def _members(value: object) -> dict[str, NDArray]:
+    """Returns the members of a record, or of an array with one record, by their names in lower case."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    return (
+        {name.lower(): value[name] for name in value.dtype.names}
+        if isinstance(value, np.void) and value.dtype.names
+        else {}
+    )
+
+
 def _read_hdf5(content: bytes) -> dict[str, object]:
     # The import takes 0.2 s, and most commands read no file of version 7.3.
     import h5py
@@ -318,10 +423,13 @@ def _read_hdf5(content: bytes) -> dict[str, object]:
     def visit(name: str, item: object) -> None:
         # MATLAB stores references under names that begin with #.
         if isinstance(item, h5py.Dataset) and not name.startswith("#") and "MATLAB_empty" not in item.attrs:
-            is_text = item.attrs.get("MATLAB_class", b"double") in (b"char", b"cell", b"logical")
-            if not is_text:
+            matlab_class = item.attrs.get("MATLAB_class", b"double").decode()
+            if matlab_class in _NUMERIC_CLASSES:
                 # MATLAB stores arrays by columns, HDF5 by rows.
                 found[name.replace("/", ".")] = np.asarray(item).T
+            elif matlab_class not in ("char", "logical"):
+                # The content of an object, or of a cell array, is not an array of numbers.
+                found[f"object {len(found)}"] = matlab_class
 
     with h5py.File(io.BytesIO(content), "r") as file:
         file.visititems(visit)

@@ -20,9 +20,9 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input, read_input
 from dvrk_drake.models.locked_joints import check_held
 from dvrk_drake.recordings.csv_rows import CsvReader, read_numbers
-from dvrk_drake.recordings.file_options import FileCoordinates, FileOptions
-from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.ros_bag import MAX_LATE
+from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.joint_states import MAX_LATE, arm_joint_names
+from dvrk_drake.recordings.recording import Coordinates, Recording
 
 #: Lines of a description before the names of the columns.
 _HEAD = 7
@@ -37,7 +37,7 @@ _ORIGIN = re.compile(r"StateDataCollection-(?P<component>.+)-(?P<table>[^-]+)-\d
 
 def is_collector_file(path: Path) -> bool:
     """Returns whether a path is a description file of the collector, or a file with such a description."""
-    return path.suffix == ".desc" or (path.suffix == ".csv" and path.with_suffix(".desc").is_file())
+    return path.suffix.lower() == ".desc" or (path.suffix.lower() == ".csv" and path.with_suffix(".desc").is_file())
 
 
 def read_collector(path: Path, options: FileOptions) -> Recording:
@@ -50,16 +50,18 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
 
     Args:
         path: Path of the CSV or of its description. Both must be in the same folder.
-        options: Arm (required), coordinates, topic and `skip_invalid`. The default coordinates are "actuator" for the
-            signal "measured_js" of a table whose name ends in "Read", and "joint" for all other signals. The topic is
-            the name of the signal, e.g. "kin/measured_js". Default: the only signal of the arm.
+        options: Arm (required), coordinates, topic, names of the joints, and `skip_invalid`. The default coordinates
+            are "actuator" for the signal "measured_js" of a table whose name ends in "Read", and "joint" for all other
+            signals. The topic is the name of the signal, e.g. "kin/measured_js". Default: the only signal of the arm.
 
     Raises:
         RecordingError: A file is missing, the description is damaged, no signal or several signals fit, or the signal
             has other joints.
     """
     arm = options.required_arm(path)
-    description, data = path.with_suffix(".desc"), path.with_suffix(".csv")
+    is_description = path.suffix.lower() == ".desc"
+    description = path if is_description else path.with_suffix(".desc")
+    data = path.with_suffix(".csv") if is_description else path
     origin, fields = _read_description(description)
     names = [re.sub(r":\{.*\}$", "", field) for field in fields]
     separate = f"{arm.separate_joint}/measured_js"
@@ -68,8 +70,9 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
     labels = _joint_labels(data, _member_columns(names, signal, "Name"))
     jaw = separate if len(joints) == arm.num_joints - 1 and f"{separate}.Position[0]" in names else ""
     stated = _stated_coordinates(origin, signal)
+    known, name_notes = arm_joint_names(f"{description}: {signal}", labels, arm, options.joints)
     order = _order(
-        *(description, signal, labels, len(joints), arm), has_jaw=bool(jaw), is_actuator=stated == "actuator"
+        *(description, signal, list(known), len(joints), arm), has_jaw=bool(jaw), is_actuator=stated == "actuator"
     )
     blocks = {}
     for block, member in _MEMBERS.items():
@@ -81,7 +84,7 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
         if member not in names:
             raise RecordingError(f"{description}: has no column {member}; signals of type prmStateJoint have one")
         blocks[block] = [names.index(member)]
-    held = {label: column for label, column in zip(labels, joints, strict=False) if label in arm.locked_joints}
+    held = {label: column for label, column in zip(known, joints, strict=False) if label in arm.locked_joints}
     blocks["held"] = list(held.values())
     with CsvReader(data, options.progress) as reader:
         found = read_numbers(reader, names, blocks, skip_invalid=options.skip_invalid, header_name=description.name)
@@ -97,7 +100,7 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
             "earlier row. Cut the file where the clock was set."
         )
     new = valid & (t > before)
-    notes = list(found.notes)
+    notes = [*found.notes, *name_notes]
     for count, reason in (
         (np.sum(~valid), "marked invalid"),
         (np.sum(valid & ~new), "not later than the previous row"),
@@ -196,7 +199,7 @@ def _order(
     return list(range(count))
 
 
-def _stated_coordinates(origin: str, signal: str) -> FileCoordinates:
+def _stated_coordinates(origin: str, signal: str) -> Coordinates:
     match = _ORIGIN.match(origin)
     is_actuator = match is not None and match["table"].endswith("Read") and signal == "measured_js"
     return "actuator" if is_actuator else "joint"

@@ -12,9 +12,8 @@ import numpy as np
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress
-from dvrk_drake.recordings.file_options import FileCoordinates
-from dvrk_drake.recordings.reading import detect_format, read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import Coordinates, Recording, write_recording
 
 
 def convert(
@@ -22,8 +21,9 @@ def convert(
     output: str | Path,
     *,
     arm: Arm | None = None,
-    coordinates: FileCoordinates | None = None,
+    coordinates: Coordinates | None = None,
     topic: str | None = None,
+    joints: Mapping[str, str] | None = None,
     arrays: Mapping[str, str] | None = None,
     rate: float | None = None,
     skip_invalid: bool = False,
@@ -36,7 +36,7 @@ def convert(
         output: Path of the file to write: .csv, or .mcap for a bag. An existing file is replaced.
         arm: The data are written in the joint coordinates of this arm. If None, they are written in the coordinates of
             the recording. Required to write a bag, and to read a bag or a file of the cisst collector.
-        coordinates, topic, arrays, rate, skip_invalid, progress: See `read_recording`.
+        coordinates, topic, joints, arrays, rate, skip_invalid, progress: See `read_recording`.
 
     Returns:
         Written recording. Its `source`, `lines` and `notes` refer to the original file.
@@ -46,7 +46,7 @@ def convert(
             or has another suffix, or the arm cannot reach the poses.
         DvrkDrakeError: The output cannot be written.
     """
-    if Path(output).suffix not in (".csv", ".mcap"):
+    if Path(output).suffix.lower() not in (".csv", ".mcap"):
         raise RecordingError(f"{output}: the name of the output must end in .csv or .mcap (MCAP bag)")
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
         raise RecordingError(f"{output} is the input recording. Choose another output file.")
@@ -55,31 +55,25 @@ def convert(
         arm,
         coordinates,
         topic=topic,
+        joints=joints,
         arrays=arrays,
         rate=rate,
         skip_invalid=skip_invalid,
         progress=progress,
     )
-    # A file with "wpi" coordinates was converted when it was read.
-    is_assumed = coordinates is None and recording.coordinates == "joint" and not recording._converted
     if arm is not None:
         recording = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
     write_recording(recording, output, arm)
     assumed: tuple[str, ...] = ()
-    if is_assumed and "rate" in detect_format(Path(path)).options:  # CSV, MATLAB file or NumPy archive
+    if not recording.file_coordinates:
         assumed = ("coordinates were not stated, read as joint coordinates (default)",)
     return dataclasses.replace(recording, notes=(*recording.notes, *assumed, *_properties(recording)))
 
 
 def _properties(recording: Recording) -> list[str]:
-    """Returns notes on coordinates, times and repeated rows, which affect the next command."""
+    """Returns notes on times and repeated rows, which affect the next command."""
     notes = []
-    if recording.coordinates == "actuator" and not any("wpi" in note for note in recording.notes):
-        notes.append(
-            "in actuator coordinates, but the CSV does not state this: pass --coordinates actuator to every command "
-            "that reads the CSV, or convert with --arm"
-        )
     if recording.t is None:
         notes.append("without times, read as static poses; for a motion, give its sampling rate with --rate HZ")
         return notes

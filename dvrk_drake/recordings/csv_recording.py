@@ -1,5 +1,7 @@
 """Reads recordings from CSV files with a header, and from CSV files without a header that have a known layout.
 
+A file with the columns of messages sensor_msgs/JointState is read like a topic of a ROS bag.
+
 Layouts without a header, for an arm with n joints:
 
 - 3n columns: positions, velocities and efforts. For n = 7, this is the layout of the motions of WPI
@@ -12,26 +14,49 @@ Layouts without a header, for an arm with n joints:
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import is_package_arm
 from dvrk_drake.models.locked_joints import lock_hint
-from dvrk_drake.recordings.csv_rows import CsvReader, is_number, read_numbers
+from dvrk_drake.recordings.csv_rows import (
+    CsvReader,
+    is_comment,
+    is_number,
+    parse_finite,
+    parse_or_nan,
+    read_numbers,
+)
 from dvrk_drake.recordings.file_options import FileOptions
-from dvrk_drake.recordings.recording import Recording, column_names
+from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
+from dvrk_drake.recordings.recording import UNITS, Recording
+from dvrk_drake.recordings.topic_choice import check_namespace
 
 #: Nominal sampling rate of the motions of WPI [Hz].
 WPI_RATE = 200.0
 _WPI_JOINTS = 7
+#: Columns with the same text in each row. `write_recording` and `collect` write them.
+_STATEMENTS = ("coordinates", "arm")
+#: Columns of messages sensor_msgs/JointState: data collection of the dVRK (header.stamp.sec, position with a list),
+#: bagpy (header.stamp.secs, position_0), and `rostopic echo -p` (field.header.stamp in nanoseconds, field.position0).
+_MESSAGE_FIELD = re.compile(
+    r"(?:field\.)?(?:(?P<block>name|position|velocity|effort)(?:[_.\[]?\d+\]?)?|header\.stamp(?P<stamp>|\.n?secs?|\.nanosec))"
+)
+_STAMP_PARTS = dict.fromkeys((".sec", ".secs"), "sec") | dict.fromkeys((".nsec", ".nsecs", ".nanosec"), "nanosec")
+#: Name of a column with its unit, e.g. "q1 [rad]".
+_UNIT = re.compile(r"(?P<name>\S+)\s*[\[(](?P<unit>[^\])]*)[\])]")
 
 
 def read_csv(path: Path, options: FileOptions) -> Recording:
     """Reads a recording from a CSV.
 
-    For 21 columns without a header, the default coordinates are "wpi" and the default rate is `WPI_RATE`. For all other
-    files, the default coordinates are "joint". Without times and rate, they contain static poses.
+    For an arm of this package and 21 columns without a header, the default coordinates are "wpi" and the default rate
+    is `WPI_RATE`. The default coordinates of all other files are those in the column `coordinates`, or else "joint".
+    Without times and rate, they contain static poses. The names of the columns may contain units.
 
     Args:
         path: Path of the file.
@@ -43,18 +68,34 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
     """
     arm, n = options.arm, options.num_joints
     with CsvReader(path, options.progress) as reader:
-        line, cells = next(iter(reader), (0, []))
+        rows, comments = iter(reader), list[list[str]]()
+        line, cells = next(rows, (0, []))
+        while cells and is_comment(cells):
+            comments.append([cell.strip(" #") for cell in cells])
+            line, cells = next(rows, (0, []))
         if not cells:
             raise RecordingError(f"{path} is empty; needs a header with {_expected_columns(n)}")
         cells, where = [cell.strip() for cell in cells], f"{path}, line {line}"
-        if is_headerless := 2 * sum(map(is_number, cells)) >= len(cells):
+        is_headerless, first = 2 * sum(map(is_number, cells)) >= len(cells), []
+        last = comments[-1] if comments else []
+        if is_headerless and len(last) == len(cells) and not any(map(is_number, last)):
+            # np.savetxt writes the header as a comment.
+            is_headerless, first, cells = False, [(line, cells)], last
+        if fields := _message_fields(where, cells):
+            topic = next((comment[0][7:] for comment in comments if comment[0].startswith("Topic: ")), "")
+            return _read_messages(reader, cells, fields, topic, options)
+        if is_headerless:
             blocks = _layout(path, where, len(cells), arm, n)
+            order = options.joint_order(path)
+            blocks = {prefix: [columns[i] for i in order] for prefix, columns in blocks.items()}
             header = [f"{prefix}{i + 1} (column {n * k + i + 1})" for k, prefix in enumerate(blocks) for i in range(n)]
             first = [(line, cells)]
         else:
-            header, blocks = cells, _columns_of_blocks(where, cells, arm, n)
-            first = list(itertools.islice(reader, 1))
+            header, units = _split_units(cells)
+            blocks = _columns_of_blocks(where, header, options)
+            first = first or list(itertools.islice(reader, 1))
             _check_arm(path, header, first, arm)
+            _check_units(where, header, units, blocks, arm)
         found = read_numbers(
             reader,
             header,
@@ -64,15 +105,15 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
             header_name="the first row" if is_headerless else "the header",
         )
         sha256 = reader.sha256()
-    is_wpi = is_headerless and len(header) == 3 * _WPI_JOINTS
+    is_wpi = is_headerless and len(header) == 3 * _WPI_JOINTS and (arm is None or is_package_arm(arm))
     recorded = found.blocks["t"][:, 0] if "t" in blocks else None
     t, time_notes = options.sampled_times(path, recorded, found.rows, WPI_RATE if is_wpi else None)
     if is_headerless:
         time_notes = (f"no header: columns read as {', '.join(f'{name}1..{name}{n}' for name in blocks)}", *time_notes)
-    used = {column for columns in blocks.values() for column in columns}
+    used = {header[column] for columns in blocks.values() for column in columns} | {*_STATEMENTS}
     # `collect` writes files without a column t.
     is_pose_file = {"pose1", "utime"} <= set(header)
-    ignored = [name for column, name in enumerate(header) if name and column not in used]
+    ignored = [name for name in header if name and name not in used]
     if t is None and ignored and not is_pose_file:
         time_notes = (f"no column t, read as static poses; ignored columns: {', '.join(ignored)}",)
     recording = Recording(
@@ -84,16 +125,114 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         lines=found.lines,
         sha256=sha256,
         notes=(*time_notes, *found.notes),
+        file_coordinates=_statement(header, first, "coordinates"),  # type: ignore[arg-type]
+        arm_name=_statement(header, first, "arm"),
     )
-    return options.with_coordinates(recording, "wpi" if is_wpi else "joint")
+    return options.with_coordinates(recording, "wpi" if is_wpi else "")
+
+
+def _message_fields(where: str, header: list[str]) -> dict[str, list[int]]:
+    """Returns the columns of the fields of messages sensor_msgs/JointState, or an empty dictionary.
+
+    A field is one column with a list, or one column per joint, e.g. `position_0` or `field.position0`.
+    """
+    fields: dict[str, list[int]] = {}
+    for column, name in enumerate(header):
+        if match := _MESSAGE_FIELD.fullmatch(name):
+            fields.setdefault(match["block"] or _STAMP_PARTS.get(match["stamp"], "stamp"), []).append(column)
+    if "position" not in fields:
+        return {}
+    if "name" not in fields or not {"stamp", "sec"} & fields.keys():
+        raise RecordingError(
+            f"{where}: these are columns of JointState messages (position, velocity, effort), but the joint names "
+            "`name` or the times `header.stamp` are missing. Export all fields of the messages, or read the bag."
+        )
+    return fields
+
+
+def _read_messages(
+    reader: CsvReader, header: list[str], fields: dict[str, list[int]], topic: str, options: FileOptions
+) -> Recording:
+    """Reads messages, one per row. `topic` is the topic in the file, or ""."""
+    path = reader.path
+    arm = options.required_arm(path)
+    if topic:
+        check_namespace(path, arm, topic, advice="")
+
+    def numbers(line: int, cells: list[str], field: str) -> list[float]:
+        columns = fields.get(field, [])
+        return [
+            parse_or_nan(text, f"{path}, line {line}: {header[column]}")
+            for column in columns
+            for text in _elements(cells[column])
+        ]
+
+    def messages() -> Iterator[JointState]:
+        for line, cells in reader:
+            if len(cells) != len(header):
+                raise RecordingError(
+                    f"{path}, line {line}: the row has {len(cells)} cells, the header has {len(header)}"
+                )
+            names = [text for column in fields["name"] for text in _elements(cells[column])]
+            stamp = 0
+            # An integer number of nanoseconds since 1970 has more digits than a floating-point number.
+            for field, factor in (("stamp", 1), ("sec", 1_000_000_000), ("nanosec", 1)):
+                for column in fields.get(field, []):
+                    text = cells[column].strip()
+                    where = f"{path}, line {line}: {header[column]}"
+                    stamp += factor * int(text if text.isdecimal() else parse_finite(text, where))
+            yield JointState(line, stamp, names, *(numbers(line, cells, name) for name in MESSAGE_BLOCKS))
+
+    topic = topic or "JointState messages"
+    states = collect_joint_states(
+        path, topic, messages(), skip_invalid=options.skip_invalid, item=lambda line: f"line {line}"
+    )
+    return joint_recording(path, states, None, options, reader.sha256(), "line")
+
+
+def _elements(cell: str) -> list[str]:
+    """Returns the elements of a list such as "['yaw', 'pitch']" or "array('d', [1, 2])", or of a single value."""
+    text = cell.rpartition("[")[2].partition("]")[0]
+    return [element for part in text.split(",") if (element := part.strip(" '\"()"))]
 
 
 def _check_arm(path: Path, header: list[str], first: list[tuple[int, list[str]]], arm: Arm | None) -> None:
-    """Raises RecordingError if the column `arm` of the first row names another arm. `collect` writes this column."""
-    for line, cells in first if arm is not None and "arm" in header else ():
-        name = cells[header.index("arm")].strip() if len(cells) == len(header) else ""
-        if name and arm is not None and name.lower() != arm.name.lower():
-            raise RecordingError(f"{path}, line {line}: the row is of {name[:30]}, but the selected arm is {arm.name}")
+    """Raises RecordingError if the column `arm` of the first row names another arm."""
+    name = _statement(header, first, "arm")
+    if name and arm is not None and name.lower() != arm.name.lower():
+        raise RecordingError(
+            f"{path}, line {first[0][0]}: the row is of {name[:30]}, but the selected arm is {arm.name}"
+        )
+
+
+def _statement(header: list[str], first: list[tuple[int, list[str]]], column: str) -> str:
+    """Returns the text in a column of the first row, or "" without such a column."""
+    if not first or column not in header or len(first[0][1]) != len(header):
+        return ""
+    return first[0][1][header.index(column)].strip()
+
+
+def _split_units(cells: list[str]) -> tuple[list[str], list[str]]:
+    """Returns the names and the units of columns such as "q1 [rad]". The unit is "" if it is not stated."""
+    matches = [_UNIT.fullmatch(cell) for cell in cells]
+    names = [match["name"] if match else cell for match, cell in zip(matches, cells, strict=True)]
+    return names, [match["unit"].strip() if match else "" for match in matches]
+
+
+def _check_units(
+    where: str, header: list[str], units: list[str], blocks: dict[str, list[int]], arm: Arm | None
+) -> None:
+    """Raises RecordingError if the header states a wrong unit. Any joint may be prismatic if `arm` is None."""
+    for prefix, columns in blocks.items():
+        for joint, column in enumerate(columns):
+            revolute, prismatic = UNITS[prefix]
+            accepted = {revolute, prismatic} if arm is None else {prismatic if arm.prismatic[joint] else revolute}
+            unit = re.sub(r"[\s*·.]+", " ", units[column]).replace("Nm", "N m")
+            if unit and unit not in accepted:
+                raise RecordingError(
+                    f"{where}: the unit of {header[column]} is {units[column][:30]}; allowed: "
+                    f"{' or '.join(sorted(accepted))}. Convert the numbers, and correct the header."
+                )
 
 
 def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict[str, list[int]]:
@@ -112,13 +251,13 @@ def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict
     raise RecordingError(message)
 
 
-def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joints: int) -> dict[str, list[int]]:
+def _columns_of_blocks(where: str, header: list[str], options: FileOptions) -> dict[str, list[int]]:
     """Returns a mapping from a prefix (q, qd, tau, t) to its columns in the header."""
     if duplicate := next((name for name, count in Counter(header).items() if name and count > 1), ""):
         raise RecordingError(f"{where}: column {duplicate[:30]} occurs twice")
-    blocks = {}
+    blocks, arm, num_joints = {}, options.arm, options.num_joints
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
-        names = column_names(prefix, num_joints)
+        names = [f"{prefix}{label}" for label in options.joint_labels]
         missing = [name for name in names if name not in header]
         if len(missing) == num_joints and not needed:
             continue
@@ -129,7 +268,7 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
                 f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
                 f"needs {_expected_columns(num_joints)}{_joint_list(arm)}{hint and f'. {hint}'}"
             )
-        if f"{prefix}{num_joints + 1}" in header:
+        if f"{prefix}{num_joints + 1}" in header and not options.joints:
             raise RecordingError(
                 f"{where}: unexpected column {prefix}{num_joints + 1}; "
                 f"the arm has {num_joints} joints{_joint_list(arm)}"

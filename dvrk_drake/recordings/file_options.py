@@ -6,18 +6,15 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording, wpi_transmission
+from dvrk_drake.recordings.recording import Coordinates, Recording
 
-#: Coordinates of q, qd and tau in a file. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint
-#: coordinates (motions of WPI; Wang et al. 2019, table of the PSM).
-FileCoordinates = Literal["joint", "actuator", "wpi"]
 #: Number of joints of a file that is read without an arm.
 _DEFAULT_JOINTS = 7
 
@@ -27,8 +24,9 @@ class FileOptions:
     """Options of a reader. For the attributes, see the arguments of `read_recording`."""
 
     arm: Arm | None = None
-    coordinates: FileCoordinates | None = None
+    coordinates: Coordinates | None = None
     topic: str | None = None
+    joints: Mapping[str, str] | None = None
     arrays: Mapping[str, str] | None = None
     rate: float | None = None
     skip_invalid: bool = False
@@ -39,6 +37,47 @@ class FileOptions:
     def num_joints(self) -> int:
         """Number of joints in the file."""
         return self.arm.num_joints if self.arm else _DEFAULT_JOINTS
+
+    @property
+    def joint_labels(self) -> list[str]:
+        """Names of the joints in a file that numbers them: those of `joints`, or else "1", "2", ..."""
+        names = self.arm.joint_names if self.arm else [""] * self.num_joints
+        return [(self.joints or {}).get(name, str(i)) for i, name in enumerate(names, 1)]
+
+    def joint_order(self, path: Path) -> list[int]:
+        """Returns the index (n,) of each joint in a file that numbers its joints.
+
+        Raises:
+            RecordingError: A name in `joints` is not the number of a joint.
+        """
+        numbers = [str(i) for i in range(1, self.num_joints + 1)]
+        if wrong := [label for label in self.joint_labels if label not in numbers]:
+            raise RecordingError(
+                f"{path}: --joints: the file has no joint {wrong[0]}; it has no names, so the joints have the numbers "
+                f"1..{len(numbers)}"
+            )
+        return [numbers.index(label) for label in self.joint_labels]
+
+    def check_joints(self, path: Path) -> None:
+        """Checks the mapping `joints` from the arm's name of a joint to its name in the file.
+
+        Raises:
+            RecordingError: The arm is missing, it has no joint of a name, or two joints have the same name.
+        """
+        joints = dict(self.joints or {})
+        if not joints:
+            return
+        arm = self.required_arm(path)
+        if unknown := [name for name in joints if name not in arm.joint_names]:
+            raise RecordingError(
+                f"{path}: --joints {unknown[0]}={joints[unknown[0]]}: {arm.name} has no joint {unknown[0]}; allowed: "
+                f"{', '.join(arm.joint_names)}"
+            )
+        labels = self.joint_labels
+        if twice := [label for label in labels if labels.count(label) > 1]:
+            raise RecordingError(
+                f"{path}: --joints: {twice[0]} is used for two joints of {arm.name}; give one name for each joint"
+            )
 
     def required_arm(self, path: Path) -> Arm:
         """Returns the arm.
@@ -52,24 +91,33 @@ class FileOptions:
             )
         return self.arm
 
-    def with_coordinates(self, recording: Recording, default: FileCoordinates = "joint") -> Recording:
+    def with_coordinates(self, recording: Recording, layout: Coordinates | Literal[""] = "") -> Recording:
         """Returns a recording with the coordinates of these options.
 
-        Data in "wpi" coordinates are converted to joint coordinates of the arm. Without an arm, they are not changed,
-        and the result states actuator coordinates, which is wrong for the roll of a PSM.
+        Data in "wpi" coordinates are converted to joint coordinates of the arm, if it is given.
 
         Args:
-            recording: Data of the file. Its attribute `coordinates` is not used.
-            default: Coordinates of the data if these options have none.
+            recording: Data of the file. Its attribute `coordinates` is not used. Its attribute `file_coordinates`
+                contains the coordinates that the file states, or "".
+            layout: Coordinates of other files with the same layout, or "". They are used if neither the file nor these
+                options state coordinates.
+
+        Raises:
+            RecordingError: The file states other coordinates than these options.
         """
-        coordinates = self.coordinates or default
-        if coordinates != "wpi":
-            return dataclasses.replace(recording, coordinates=coordinates)
-        recording = dataclasses.replace(recording, coordinates="actuator")
-        if self.arm is None:
-            note = "in the coordinates wpi; pass --coordinates wpi to every command that reads the converted file"
-            return dataclasses.replace(recording, notes=(*recording.notes, note))
-        return recording.in_joint_coordinates(dataclasses.replace(self.arm, transmission=wpi_transmission(self.arm)))
+        stated = recording.file_coordinates
+        if stated and stated not in get_args(Coordinates):
+            allowed = ", ".join(get_args(Coordinates))
+            raise RecordingError(f'{recording.where(0)}: coordinates is "{stated[:30]}"; allowed: {allowed}')
+        if stated and self.coordinates and stated != self.coordinates:
+            raise RecordingError(
+                f"{recording.where(0)}: the file states {stated} coordinates, not {self.coordinates}. Omit "
+                "--coordinates (coordinates= in Python)."
+            )
+        coordinates = self.coordinates or stated or layout
+        recording = dataclasses.replace(recording, file_coordinates=coordinates)
+        recording = dataclasses.replace(recording, coordinates=coordinates or "joint")
+        return recording.in_joint_coordinates(self.arm) if self.arm and coordinates == "wpi" else recording
 
     def sampled_times(
         self, path: Path, t: NDArray[np.float64] | None, rows: NDArray[np.int_], default_rate: float | None = None

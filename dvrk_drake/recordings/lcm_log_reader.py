@@ -263,7 +263,11 @@ def read_status_log(path: Path, options: FileOptions) -> Recording:
         raise RecordingError(f"{path}: {_no_usable_status(channel, arm, channels, notes)}")
     q, qd, tau = np.array(rows).reshape(len(events), 3, -1).transpose(1, 0, 2)
     numbers, sha256 = np.array(events), log.sha256()
-    return Recording(q, tau, qd, np.array(times), "joint", str(path), numbers, sha256, tuple(notes), "event")
+    return Recording(
+        *(q, tau, qd, np.array(times), "joint", str(path), numbers, sha256, tuple(notes), "event"),
+        file_coordinates="joint",
+        arm_name=arm.name if arm else "",
+    )
 
 
 def _only_status_channel(log: LcmLogReader) -> str:

@@ -51,7 +51,7 @@ class MotionPartFile:
 
     - utime, sequence, guard_state: those of the status of the arm.
     - motion_time: time of the motion [s]. It advances more slowly than t while the motion starts, stops or is paused.
-    - arm, motion: name of the arm, and `PeriodicMotion.digest`.
+    - coordinates, arm, motion: "joint", name of the arm, and `PeriodicMotion.digest`.
     """
 
     def __init__(self, path: Path, arm: Arm, motion: PeriodicMotion) -> None:
@@ -60,7 +60,7 @@ class MotionPartFile:
         Raises:
             RecordingError: The file exists or cannot be written.
         """
-        self._end = f",{arm.name},{motion.digest()}\n"
+        self._end = f",joint,{arm.name},{motion.digest()}\n"
         self._first_utime, self._last_utime = 0, 0
         self._file = GrowingFile(path)
         self._file.append((",".join(_header(arm)) + "\n").encode())
@@ -113,7 +113,7 @@ def recorded_parts(output: str | Path, arm: Arm, motion: PeriodicMotion) -> list
             an earlier part is missing.
         RecordingError: A file cannot be read.
     """
-    if Path(output).suffix != ".csv":
+    if Path(output).suffix.lower() != ".csv":
         raise CollectionError(f"{output}: a recorded motion is a table; the file name must end in .csv")
     parts: list[MotionPart] = []
     while os.path.lexists(path := next_part(output, parts)):
@@ -178,9 +178,8 @@ def useful(parts: list[MotionPart], duration: float) -> list[MotionPart]:
 
 
 def _header(arm: Arm) -> list[str]:
-    n = arm.num_joints
-    names = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, n)]
-    return [*names, "utime", "sequence", "guard_state", "motion_time", "arm", "motion"]
+    names = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, arm.num_joints, arm)]
+    return [*names, "utime", "sequence", "guard_state", "motion_time", "coordinates", "arm", "motion"]
 
 
 @dataclass

@@ -139,7 +139,7 @@ class CollectionFile:
 
     - q1..qn and tau1..taun: measured positions and efforts, as in every Recording.
     - pose1..posen: requested pose.
-    - arm: name of the arm.
+    - coordinates, arm: "joint", and name of the arm.
     - utime: time when the row was written [us since 1970].
     - friction1..frictionn: half of the difference between the efforts of the two approach directions, if each pose is
       approached from both directions.
@@ -159,9 +159,9 @@ class CollectionFile:
             RecordingError: The file cannot be read.
         """
         self._path, self._arm, self._both_sides = Path(path), arm, both_sides
-        if self._path.suffix != ".csv":
+        if self._path.suffix.lower() != ".csv":
             raise CollectionError(f"{path}: a collection is a table; the file name must end in .csv")
-        self._header = [*self._names("q"), *self._names("tau"), *self._names("pose"), "arm", "utime"]
+        self._header = [*self._names("q"), *self._names("tau"), *self._names("pose"), "coordinates", "arm", "utime"]
         if both_sides:
             self._header += self._names("friction")
         self._file: GrowingFile | None = None
@@ -209,7 +209,7 @@ class CollectionFile:
             if not self._has_header:
                 self._file.append((",".join(self._header) + "\n").encode())
         numbers = [*map(repr, [*q.tolist(), *tau.tolist(), *pose.tolist()])]
-        cells = [*numbers, self._arm.name, str(time.time_ns() // 1000)]
+        cells = [*numbers, "joint", self._arm.name, str(time.time_ns() // 1000)]
         if friction is not None:
             cells += map(repr, friction.tolist())
         self._file.append((",".join(cells) + "\n").encode())
@@ -220,7 +220,7 @@ class CollectionFile:
             self._file.close()
 
     def _names(self, prefix: str) -> list[str]:
-        return column_names(prefix, self._arm.num_joints)
+        return column_names(prefix, self._arm.num_joints, self._arm)
 
     def _read(self) -> list[tuple[int, NDArray[np.float64]]]:
         """Returns (line, requested pose) of each complete row."""
@@ -248,7 +248,7 @@ class CollectionFile:
     def _check_header(self, header: list[str]) -> None:
         if header == self._header:
             return
-        if "pose1" in header and ("friction1" in header) != self._both_sides:
+        if self._names("pose")[0] in header and (self._names("friction")[0] in header) != self._both_sides:
             sides = "one side (--no-both-sides)" if self._both_sides else "both sides (--both-sides)"
             raise CollectionError(f"{self._path} was collected from {sides}. Continue with the same option.")
         raise CollectionError(

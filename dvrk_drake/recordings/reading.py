@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,10 @@ from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.array_file import is_array_file, read_array_file
 from dvrk_drake.recordings.cisst_collector import is_collector_file, read_collector
 from dvrk_drake.recordings.csv_recording import read_csv
-from dvrk_drake.recordings.file_options import FileCoordinates, FileOptions
+from dvrk_drake.recordings.csv_rows import GZIP_MAGIC, is_utf16
+from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import Coordinates, Recording
 from dvrk_drake.recordings.ros_bag import is_ros_bag, read_ros_bag
 
 #: Number of bytes at the beginning of a text file that must not contain a null byte.
@@ -44,24 +46,30 @@ class Format:
 #: Formats in the order in which they are tried. A file of no other format is a CSV.
 FORMATS = (
     Format("an LCM log", is_lcm_log, read_status_log, frozenset()),
-    Format("a ROS bag", is_ros_bag, read_ros_bag, frozenset({"topic"})),
-    Format("a file of the cisst collector", is_collector_file, read_collector, frozenset({"topic", "coordinates"})),
+    Format("a ROS bag", is_ros_bag, read_ros_bag, frozenset({"topic", "joints"})),
+    Format(
+        "a file of the cisst collector",
+        is_collector_file,
+        read_collector,
+        frozenset({"topic", "joints", "coordinates"}),
+    ),
     Format(
         "a MATLAB file or NumPy archive",
         is_array_file,
         read_array_file,
-        frozenset({"arrays", "rate", "coordinates"}),
+        frozenset({"arrays", "joints", "rate", "coordinates"}),
     ),
-    Format("a CSV", lambda path: not path.is_dir(), read_csv, frozenset({"rate", "coordinates"})),
+    Format("a CSV", lambda path: not path.is_dir(), read_csv, frozenset({"joints", "rate", "coordinates"})),
 )
 
 
 def read_recording(
     path: str | Path,
     arm: Arm | None = None,
-    coordinates: FileCoordinates | None = None,
+    coordinates: Coordinates | None = None,
     *,
     topic: str | None = None,
+    joints: Mapping[str, str] | None = None,
     arrays: Mapping[str, str] | None = None,
     rate: float | None = None,
     skip_invalid: bool = False,
@@ -79,8 +87,12 @@ def read_recording(
             log must have statuses of only one arm.
         coordinates: Coordinates of q, qd and tau in a file that does not state them: "joint", "actuator", or "wpi" for
             the motions of WPI, which are in actuator coordinates except for the roll of a PSM. Default: the coordinates
-            that the file states, "wpi" for a CSV with 21 columns and no header, or else "joint".
+            that the file states, "wpi" for a CSV of an arm of this package with 21 columns and no header, or else
+            "joint".
         topic: Topic of a bag or its namespace, see `read_ros_bag`. For the cisst collector: name of the signal.
+        joints: Mapping from the arm's name of a joint to its name in the file, e.g. {"yaw": "outer_yaw"}. In a CSV with
+            a header, the latter is the end of the names of its columns: {"yaw": "2"} selects q2, qd2 and tau2. In other
+            files without joint names, it is the number of the joint, from 1.
         arrays: Mapping from "q", "qd", "tau" and "t" to the names of arrays, see `read_array_file`.
         rate: Sampling rate [Hz] of a motion in a file without times. Default: 200 Hz for a CSV with 21 columns and no
             header; all other files without times contain static poses.
@@ -103,28 +115,28 @@ def read_recording(
         >>> len(recording), recording.coordinates, recording.where(0)
         (8, 'joint', 'poses.csv, line 2')
     """
-    if coordinates is not None and coordinates not in get_args(FileCoordinates):
-        allowed = ", ".join(get_args(FileCoordinates))
+    if coordinates is not None and coordinates not in get_args(Coordinates):
+        allowed = ", ".join(get_args(Coordinates))
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {allowed}')
     path = Path(path)
     file_format = detect_format(path)
     if coordinates not in (None, "joint") and "coordinates" not in file_format.options:
         raise RecordingError(f"{path}: {file_format.name} is in joint coordinates, not in {coordinates} coordinates")
-    for option, value in (("topic", topic), ("arrays", arrays), ("rate", rate)):
+    for option, value in (("topic", topic), ("joints", joints), ("arrays", arrays), ("rate", rate)):
         if value is not None and option not in file_format.options:
             raise RecordingError(f"{path}: --{option} does not apply to {file_format.name}")
-    return file_format.read(
-        path,
-        FileOptions(
-            arm=arm,
-            coordinates=coordinates,
-            topic=topic,
-            arrays=arrays,
-            rate=rate,
-            skip_invalid=skip_invalid,
-            progress=step_progress(progress, "reading"),
-        ),
+    options = FileOptions(
+        arm=arm,
+        coordinates=coordinates,
+        topic=topic,
+        joints=joints,
+        arrays=arrays,
+        rate=rate,
+        skip_invalid=skip_invalid,
+        progress=step_progress(progress, "reading"),
     )
+    options.check_joints(path)
+    return file_format.read(path, options)
 
 
 def detect_format(path: Path) -> Format:
@@ -141,7 +153,7 @@ def detect_format(path: Path) -> Format:
                 head = file.read(_HEAD)
             except OSError as error:
                 raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-        if not head.strip() and path.suffix != ".csv":
+        if not head.strip() and path.suffix.lower() != ".csv":
             raise RecordingError(f"{path} is empty")
     found = next((known for known in FORMATS if known.matches(path)), None)
     if found is None:
@@ -149,8 +161,21 @@ def detect_format(path: Path) -> Format:
             f"{path} is a folder without a recording; allowed: ROS 2 bag (with metadata.yaml), MATLAB files (.mat), "
             "NumPy archives (.npz). To read a bag without metadata.yaml, give the path of its .mcap or .db3 file."
         )
-    if found is FORMATS[-1] and b"\0" in head:
+    if head.startswith(GZIP_MAGIC):
+        head = _decompressed(path, head)
+    if found is FORMATS[-1] and b"\0" in head and not is_utf16(head):
         raise RecordingError(
             f"{path}: unknown format; allowed: CSV, ROS bag, MATLAB file, NumPy archive, cisst collector, LCM log"
         )
     return found
+
+
+def _decompressed(path: Path, head: bytes) -> bytes:
+    """Returns the beginning of the content of a gzip file. `head` is the beginning of the file."""
+    try:
+        content = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(head, _HEAD)
+    except zlib.error as error:
+        raise RecordingError(f"{path} is not a complete gzip file: {error}") from error
+    if b"\0" in content and not is_utf16(content):
+        raise RecordingError(f"{path}: only a CSV may be compressed with gzip. Decompress the file first with gunzip.")
+    return content

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -20,7 +21,9 @@ from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.linear_map import LinearMap
 
-Coordinates = Literal["joint", "actuator"]
+#: Coordinates of q, qd and tau. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint
+#: coordinates (motions of WPI; Wang et al. 2019, table of the PSM).
+Coordinates = Literal["joint", "actuator", "wpi"]
 
 #: Tolerance of the position limits [rad], [m]. A pose that exceeds a limit by more is refused. Joint stops are
 #: compliant, so real poses may exceed the limits slightly.
@@ -43,6 +46,13 @@ MAX_MOTION_STEP, MIN_RANGE = 0.05, (0.02, 0.002)
 GAP, MIN_GAP = 5.0, MAX_PERIOD
 #: Maximum difference of each joint position between samples of the same pose [rad], [m].
 SAME_POSE = 0.01, 0.001
+#: Units of the quantities in a CSV, for a revolute and for a prismatic joint.
+UNITS = {
+    "t": ("s", "s"),
+    **dict.fromkeys(("q", "pose"), ("rad", "m")),
+    "qd": ("rad/s", "m/s"),
+    **dict.fromkeys(("tau", "lower", "upper", "friction"), ("N m", "N")),
+}
 #: Values of `--coordinates` with their meaning, for messages.
 COORDINATES_HELP = "joint, actuator, or wpi (recordings of WPI: actuator, but joint for the roll of a PSM)"
 #: Joints in joint coordinates in a file with "wpi" coordinates.
@@ -60,13 +70,17 @@ class Recording:
         tau: Efforts (m, n) applied by the motors, or None.
         qd: Velocities (m, n), or None.
         t: Times (m,) [s], or None for static poses.
-        coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
+        coordinates: Coordinates of q, qd and tau: "joint" or "actuator". "wpi" only if a file in these coordinates was
+            read without an arm.
         source: Source of the data, for messages.
         lines: Line number (m,) of each row in the source, or None. They are event numbers for an LCM log, message
             numbers for a ROS bag, and row or pose numbers for arrays.
         sha256: SHA-256 of the source, or "".
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
         line_label: Name of the numbers in `lines`, for messages: "line", "event", "message", "row" or "pose".
+        file_coordinates: Coordinates that the source or the user states: "joint", "actuator" or "wpi". "" if they are
+            not stated. With an arm, the data of a file in the coordinates "wpi" are converted to joint coordinates.
+        arm_name: Name of the arm that the source states, or "".
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -86,13 +100,15 @@ class Recording:
     sha256: str = ""
     notes: tuple[str, ...] = ()
     line_label: str = "line"
+    file_coordinates: Coordinates | Literal[""] = ""
+    arm_name: str = ""
     # Cache: mapping from a transmission to this recording in the other coordinates.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         where = self.source or "recording"
         if self.coordinates not in get_args(Coordinates):
-            raise RecordingError(f'{where}: coordinates is "{self.coordinates}"; allowed: joint, actuator')
+            raise RecordingError(f'{where}: coordinates is "{self.coordinates}"; allowed: joint, actuator, wpi')
         for name in ("q", "qd", "tau", "t"):
             if (values := getattr(self, name)) is not None:
                 object.__setattr__(self, name, np.asarray(values, float))
@@ -261,17 +277,23 @@ class Recording:
         self._check_joint_count(arm)
         if self.coordinates == coordinates:
             return self
+        is_wpi = self.coordinates == "wpi"
         # The same arm with another gravity vector has the same transmission.
         if arm.transmission not in self._converted:
             to_other = arm.transmission if coordinates == "actuator" else arm.transmission.inverse
+            if is_wpi:
+                to_other = file_transmission(arm, "wpi").inverse
             converted = self._converted[arm.transmission] = replace(
                 self,
                 q=to_other.position(self.q),
                 qd=None if self.qd is None else to_other.velocity(self.qd),
                 tau=None if self.tau is None else to_other.inverse.pull_back_effort(self.tau),
-                coordinates=coordinates,
+                coordinates="joint" if is_wpi else coordinates,
             )
-            converted._converted[arm.transmission] = self
+            if not is_wpi:
+                converted._converted[arm.transmission] = self
+        if is_wpi:
+            return self._converted[arm.transmission]._in_coordinates(coordinates, arm)
         return self._converted[arm.transmission]
 
     def check_fits(self, arm: Arm) -> None:
@@ -282,6 +304,8 @@ class Recording:
                 limits.
         """
         self._check_sizes()
+        if not len(self):
+            raise RecordingError(f"{self.source or 'recording'} has no rows")
         q = self.in_joint_coordinates(arm).q
         excess = np.maximum(arm.position_lower - q, q - arm.position_upper) / arm.per_joint(*LIMIT_TOLERANCE)
         row, joint = np.unravel_index(np.argmax(excess), excess.shape)
@@ -294,7 +318,7 @@ class Recording:
         )
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
-        revolute = np.max(shares[~arm.prismatic])
+        revolute = np.max(shares[~arm.prismatic], initial=0.0)
         # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3. Positions in degrees
         # exceed them by a factor of up to 57.
         if outside > 0.3 and revolute > 4 and np.radians(revolute) <= 1.2:
@@ -311,10 +335,10 @@ class Recording:
 
     def _coordinates_within_limits(self, arm: Arm) -> list[str]:
         """Returns other values of `--coordinates` that move all poses of the file within the limits."""
-        # Bags and logs are always in joint coordinates. A recording with a cached conversion may come from other ones.
-        if self.coordinates != "joint" or self._converted or self.line_label in ("event", "message"):
+        # A recording with a cached conversion may come from other coordinates.
+        if self.coordinates != "joint" or self._converted or self.file_coordinates:
             return []
-        transmissions = {"wpi": wpi_transmission(arm), "actuator": arm.transmission}
+        transmissions = {"wpi": file_transmission(arm, "wpi"), "actuator": arm.transmission}
         if np.array_equal(transmissions["wpi"].matrix, arm.transmission.matrix):
             del transmissions["wpi"]
         return [
@@ -366,8 +390,12 @@ class Setpoints:
     tau: NDArray[np.float64] | None = None
 
 
-def wpi_transmission(arm: Arm) -> LinearMap:
-    """Returns the map from joint coordinates to the coordinates "wpi" (table of the PSM in Wang et al., 2019)."""
+def file_transmission(arm: Arm, coordinates: Coordinates) -> LinearMap:
+    """Returns the map from joint coordinates to the coordinates of a file."""
+    if coordinates == "actuator":
+        return arm.transmission
+    if coordinates == "joint":
+        return LinearMap(np.eye(arm.num_joints), np.zeros(arm.num_joints))
     J = arm.transmission.matrix.copy()
     for joint in set(_WPI_DIRECT_JOINTS) & set(arm.joint_names):
         row = arm.joint_names.index(joint)
@@ -381,9 +409,18 @@ def _is_within(q: NDArray[np.float64], arm: Arm) -> bool:
     return bool(np.all((q >= arm.position_lower - tolerance) & (q <= arm.position_upper + tolerance)))
 
 
-def column_names(prefix: str, num_joints: int) -> list[str]:
-    """Returns the column names of q, qd, tau, or t in a CSV."""
-    return ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
+def column_names(prefix: str, num_joints: int, arm: Arm | None = None) -> list[str]:
+    """Returns the column names of a quantity in a CSV, e.g. "q1". With `arm`, they contain the units, e.g. "q1 [rad]".
+
+    Args:
+        prefix: Name of the quantity, a key of `UNITS` if `arm` is given.
+        num_joints: Number of columns, except for the time t.
+        arm: Arm that defines which joints are prismatic.
+    """
+    names = ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
+    if arm is None:
+        return names
+    return [f"{name} [{UNITS[prefix][bool(arm.prismatic[i])]}]" for i, name in enumerate(names)]
 
 
 def write_recording(
@@ -394,10 +431,11 @@ def write_recording(
     The file is written atomically and with full precision. A bag also contains the transforms of the links and a URDF.
 
     Args:
-        recording: Recording to write. A CSV keeps its coordinates, but does not state them. A bag is in joint
-            coordinates and has other times, see `write_mcap`.
-        path: Path of the file: .mcap for a bag, anything else for a CSV. An existing file is replaced.
-        arm: Arm of the recording. Required for a bag, which contains the joint names.
+        recording: Recording to write. A CSV keeps its coordinates, and states them in the column `coordinates`. A bag
+            is in joint coordinates and has other times, see `write_mcap`.
+        path: Path of the file: .mcap (in any case) for a bag, anything else for a CSV. An existing file is replaced.
+        arm: Arm of the recording. Required for a bag, which contains the joint names. A CSV then contains the name of
+            the arm and the units.
         setpoints: Commands of the recording. They are written only to a bag.
 
     Raises:
@@ -408,9 +446,9 @@ def write_recording(
         >>> import dvrk_drake as dvrk, numpy as np
         >>> dvrk.write_recording(dvrk.Recording(q=np.zeros((8, 7)), t=np.arange(8.0)), "positions.csv")
         >>> open("positions.csv").readline().rstrip()
-        't,q1,q2,q3,q4,q5,q6,q7'
+        't,q1,q2,q3,q4,q5,q6,q7,coordinates'
     """
-    if Path(path).suffix == ".mcap":
+    if Path(path).suffix.lower() == ".mcap":
         from dvrk_drake.recordings.arm_bag import write_mcap
 
         if arm is None:
@@ -419,26 +457,33 @@ def write_recording(
             )
         write_mcap(recording, path, arm, setpoints)
         return
-    columns, header = [], []
-    for prefix, block in (
-        ("t", recording.t),
-        ("q", recording.q),
-        ("qd", recording.qd),
-        ("tau", recording.tau),
-    ):
-        if block is not None:
-            columns.append(block.reshape(len(recording), -1))
-            header += column_names(prefix, recording.q.shape[1])
-    write_csv(path, header, np.hstack(columns))
+    blocks = {"t": recording.t, "q": recording.q, "qd": recording.qd, "tau": recording.tau}
+    write_csv(
+        path,
+        {prefix: block for prefix, block in blocks.items() if block is not None},
+        arm,
+        {"coordinates": recording.coordinates, "arm": arm.name if arm else recording.arm_name},
+    )
 
 
-def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) -> None:
+def write_csv(
+    path: str | Path, blocks: Mapping[str, NDArray[np.float64]], arm: Arm | None, stated: Mapping[str, str]
+) -> None:
     """Writes a table of numbers atomically and with full precision.
+
+    Args:
+        path: Path of the file. An existing file is replaced.
+        blocks: Mapping from the prefix of the columns (key of `UNITS`) to their numbers (m, n), or (m,) for the time t.
+        arm: Arm that defines the units of the columns. None: the names of the columns have no units.
+        stated: Mapping from the names of further columns to the text in each of their rows. Empty texts are omitted.
 
     Raises:
         DvrkDrakeError: The folder does not exist or cannot be written.
     """
+    tables = {prefix: block if block.ndim == 2 else block[:, None] for prefix, block in blocks.items()}
+    stated = {name: text for name, text in stated.items() if text}
+    header = [name for prefix, table in tables.items() for name in column_names(prefix, table.shape[1], arm)]
     with atomic_write(path) as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows([repr(float(x)) for x in row] for row in values)
+        writer.writerow([*header, *stated])
+        writer.writerows([*map(repr, row), *stated.values()] for row in np.hstack(list(tables.values())).tolist())

@@ -61,7 +61,7 @@ def check_stream_output(path: str | Path, accepted: tuple[str, ...] = (".csv", "
             not accepted.
     """
     path = Path(path)
-    if path.suffix not in accepted:
+    if path.suffix.lower() not in accepted:
         raise RecordingError(f"{path}: the file name must end in {' or '.join(accepted)}")
     if os.path.lexists(path):
         raise RecordingError(f"{path} already exists, and a recording is never overwritten. Choose another file.")
@@ -83,18 +83,18 @@ def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> Rec
         RecordingError: See `check_stream_output`; additionally if the file cannot be written.
     """
     check_stream_output(path)
-    suffix = Path(path).suffix
+    suffix = Path(path).suffix.lower()
     if suffix == LCM_LOG:
         return _LogFile(path, status_channel(arm))
-    return _CsvFile(path, stream) if suffix == ".csv" else _McapFile(path, arm)
+    return _CsvFile(path, stream, arm) if suffix == ".csv" else _McapFile(path, arm)
 
 
 class _CsvFile(GrowingFile):
-    def __init__(self, path: str | Path, stream: StatusStream) -> None:
+    def __init__(self, path: str | Path, stream: StatusStream, arm: Arm) -> None:
         super().__init__(path)
-        self._stream = stream
-        header = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, stream.num_joints)]
-        self.append((",".join((*header, *_ORIGIN)) + "\n").encode())
+        self._stream, self._end = stream, f",joint,{arm.name}\n"
+        header = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, stream.num_joints, arm)]
+        self.append((",".join((*header, *_ORIGIN, "coordinates", "arm")) + "\n").encode())
 
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         if status is not None:
@@ -103,7 +103,7 @@ class _CsvFile(GrowingFile):
     def _row(self, status: lcmt_dvrk_status) -> bytes:
         numbers = (self._stream.time(status), *measurements(status))
         origin = (getattr(status, name) for name in _ORIGIN)
-        return (",".join([*map(repr, numbers), *map(str, origin)]) + "\n").encode()
+        return (",".join([*map(repr, numbers), *map(str, origin)]) + self._end).encode()
 
 
 class _LogFile(GrowingFile):

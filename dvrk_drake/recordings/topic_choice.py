@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import known_arms
+from dvrk_drake.models.arm_files import is_package_arm
 
 #: Name of the topic with the measured joint states, in the namespace of an arm.
 MEASURED_JS = "measured_js"
@@ -64,7 +64,12 @@ def choose_topic(source: str | Path, arm: Arm, topic: str | None, topics: Mappin
     )
 
 
-def check_namespace(source: str | Path, arm: Arm, topic: str) -> None:
+def check_namespace(
+    source: str | Path,
+    arm: Arm,
+    topic: str,
+    advice: str = ", or the namespace of {arm} with --topic (topic= in Python)",
+) -> None:
     """Rejects the namespace of another arm of this package, because an MTML and an MTMR have the same joint names.
 
     The last name of a namespace identifies its arm, e.g. "MTML" in "/lab/MTML", or "PSM" in "/PSM2". An arm with
@@ -74,16 +79,15 @@ def check_namespace(source: str | Path, arm: Arm, topic: str) -> None:
         source: Bag or network with the topic, for messages.
         arm: Arm whose joints are read.
         topic: Namespace, or its topic measured_js.
+        advice: Text of the message after the advice to choose the other arm.
 
     Raises:
         RecordingError: The namespace has the name of another arm.
     """
     namespace = f"/{topic.strip('/')}".removesuffix(f"/{MEASURED_JS}")
     own, other = arm.name.rstrip(_DIGITS).upper(), namespace.rpartition("/")[2].rstrip(_DIGITS).upper()
-    # The name in an arm file of this package is the name of the file in capital letters.
-    known = {name.upper() for name in known_arms()}
-    if own != other and {own, other} <= known:
+    if own != other and is_package_arm(own) and is_package_arm(other):
         raise RecordingError(
             f"{source}: {namespace} is the namespace of the arm {other}, not of {arm.name}. Choose --arm "
-            f"{other.lower()}, or the namespace of {arm.name} with --topic (topic= in Python)."
+            f"{other.lower()}{advice.format(arm=arm.name)}."
         )

@@ -63,6 +63,10 @@ def refused(capsys, *arguments):
             ["collect", "--arm", "psm", "--poses", "p", "--output", "o", "--yes", "--topic", "/P", "--max-effort", "0"],
             "--topic, --max-effort and --yes require --ros",
         ),
+        (
+            ["simulate", "x.csv"],
+            "x.csv is not a scenario: its name does not end in .yaml. Give a scenario file, or an arm",
+        ),
         (["model", "--arm", "mtmrr"], 'unknown arm "mtmrr"; did you mean "mtmr"'),
         (["model", "--arm", "mtmx"], 'unknown arm "mtmx"; known arms'),
     ],

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_output import messages, refusal
 from forked import forked_program
+from recordings import csv_block
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -92,15 +93,39 @@ def test_predict_uses_the_coordinates_of_the_recording(folder, tmp_path, coordin
     arm = load_arm("mtmr")
     q = read_recording(folder / "other.csv").q
     recorded = q if coordinates == "joint" else arm.transmission.position(q)
-    write_recording(Recording(q=recorded), tmp_path / "only_q.csv")
+    write_recording(Recording(q=recorded, coordinates=coordinates), tmp_path / "only_q.csv")
     out = tmp_path / "predicted.csv"
     command = ["predict", f"{tmp_path}/only_q.csv", "--model", f"{folder}/model.yaml", "--output", str(out)]
-    assert main([*command, "--coordinates", coordinates]) == 0
-    rows = np.loadtxt(out, delimiter=",", skiprows=1)
-    assert out.read_text().splitlines()[0] == "tau1,tau2,tau3,tau4,tau5,tau6,tau7"
+    assert main(command) == 0
+    rows = csv_block(out, "tau")
+    names = [f"tau{i} [N m]" for i in range(1, 8)]
+    assert out.read_text().splitlines()[0].split(",") == [*names, "coordinates", "arm"]
+    assert out.read_text().splitlines()[1].endswith(f",{coordinates},MTMR")
     expected = IdentifiedModel.load(folder / "model.yaml").holding_torque(q)
     tau = rows if coordinates == "joint" else rows @ arm.transmission.matrix
     np.testing.assert_allclose(tau, expected, atol=1e-12)
+
+
+def test_predict_of_a_psm_in_wpi_coordinates_writes_them(tmp_path):
+    """In these coordinates, the roll is that of the joint. The power is the same in all coordinates."""
+    arm = load_arm("psm")
+    path, model, out = tmp_path / "poses.csv", tmp_path / "model.yaml", tmp_path / "tau.csv"
+    joints = Recording(q=arm.sample_poses(20, np.random.default_rng(0)))
+    actuators, roll = joints.in_actuator_coordinates(arm).q, arm.joint_names.index("roll")
+    wpi = actuators.copy()
+    wpi[:, roll] = joints.q[:, roll]
+    write_recording(Recording(q=wpi), path)
+    text = path.read_text().replace("joint", "wpi")
+    path.write_text(text)
+    IdentifiedModel.from_arm(arm).save(model)
+    assert main(["predict", str(path), "--model", str(model), "--output", str(out)]) == 0
+    tau, expected = csv_block(out, "tau"), IdentifiedModel.load(model).holding_torque(joints.q)
+    assert np.abs(expected).max() > 0.1
+    velocity = np.random.default_rng(1).normal(size=7)
+    velocity_wpi = arm.transmission.velocity(velocity)
+    velocity_wpi[roll] = velocity[roll]
+    np.testing.assert_allclose(tau @ velocity_wpi, expected @ velocity, atol=1e-9)
+    assert out.read_text().splitlines()[1].endswith(",wpi,PSM")
 
 
 def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
@@ -401,8 +426,9 @@ def test_convert(tmp_path, capsys):
     values = generator.uniform(-0.2, 0.2, (30, 21))
     np.savetxt(tmp_path / "wpi.csv", values, delimiter=",", fmt="%.17g")
     assert main(["convert", str(tmp_path / "wpi.csv"), "--output", str(tmp_path / "ours.csv")]) == 0
-    assert "--coordinates wpi" in capsys.readouterr().out
-    ours = read_recording(tmp_path / "ours.csv", coordinates="actuator")
+    assert "30 rows, wpi coordinates" in capsys.readouterr().out
+    ours = read_recording(tmp_path / "ours.csv")
+    assert ours.coordinates == "wpi"
     np.testing.assert_array_equal(ours.q, values[:, :7])
     np.testing.assert_array_equal(ours.tau, values[:, 14:])
 

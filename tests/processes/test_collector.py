@@ -4,6 +4,7 @@ import threading
 
 import numpy as np
 import pytest
+from recordings import csv_block
 from sticky_arm import PERIOD, Disk, GuardedArm, make_collector, make_quick, near_poses, random_poses, run_collector
 
 from dvrk_drake.errors import CollectionError, RecordingError
@@ -36,8 +37,7 @@ def test_only_approach_from_both_sides_cancels_friction(tmp_path):
     _, one_sided = collect_with_friction(tmp_path / "one.csv", False)
     assert np.abs(error).max() < 0.01
     assert np.sqrt(np.mean(one_sided**2)) > 0.5
-    table = np.genfromtxt(tmp_path / "both.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
-    friction = np.array([table[f"friction{j + 1}"] for j in range(7)])
+    (friction,) = csv_block(tmp_path / "both.csv", "friction")
     np.testing.assert_allclose(friction, FRICTION, rtol=0.01, atol=0)
 
 

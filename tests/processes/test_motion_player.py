@@ -94,8 +94,7 @@ def test_pause_stops_on_the_path_and_continues(tmp_path, motion):
     run_collector(player, controller, sticky, 20.0)
     player.close()
     assert player.problem is None and player.motion_time == motion.duration
-    table = np.genfromtxt(tmp_path / "m.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
-    assert np.diff(table["t"]).max() < 1.5 * PERIOD
+    assert np.diff(read_recording(tmp_path / "m.csv", ARM).t).max() < 1.5 * PERIOD
 
 
 def test_long_pause_ends_the_motion(monkeypatch, motion):
@@ -208,7 +207,7 @@ def test_repeated_and_invalid_statuses_are_not_recorded(tmp_path, motion):
 
 def test_interrupted_header_is_an_empty_part(tmp_path, motion):
     path = tmp_path / "m.csv"
-    for content in (b"", b"t,q1"):
+    for content in (b"", b"t [s],q1 [rad]"):
         path.write_bytes(content)
         (part,) = recorded_parts(path, ARM, motion)
         assert part.end == 0.0

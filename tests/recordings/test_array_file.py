@@ -5,12 +5,14 @@ from __future__ import annotations
 import struct
 import warnings
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
-from array_files import KINDS, write_arrays
+from array_files import KINDS, with_objects, write_arrays
 from public_files import assert_refused, team_array, write_mat
 
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 
 
@@ -253,3 +255,59 @@ def test_a_home_pose_is_valid_if_it_has_an_effort(tmp_path):
     array = np.zeros((8, 2, 1))
     array[1, 1, 0] = 0.4
     assert len(read_recording(write_mat(tmp_path, a=array))) == 1
+
+
+def test_arrays_beside_objects_are_read(tmp_path):
+    q, _, tau = blocks()
+    path = with_objects(write_arrays(tmp_path, "v5", {"q": q, "tau": tau}), "string", "datetime")
+    read = read_recording(path)
+    np.testing.assert_array_equal(read.tau, tau)
+    assert read.notes[0].startswith("q from array q, tau from array tau; objects of the MATLAB class datetime")
+
+
+def test_the_case_with_string_and_datetime_is_read(shared_data):
+    read = read_recording(shared_data / "cases" / "string_and_datetime.mat", load_arm("mtmr"))
+    assert read.q.shape == read.tau.shape == (60, 7)
+
+
+def test_a_time_series_is_named_as_a_limitation(tmp_path):
+    limitation = r"objects of the MATLAB class timeseries are not read; save their numbers as arrays, e\.g\. q = data"
+    path = with_objects(write_arrays(tmp_path, "v5", {"gain": np.ones(3)}), "timeseries")
+    assert_refused(limitation, read_recording, path)
+    path = write_arrays(tmp_path, "v7.3", {"q": np.arange(14, dtype=np.uint32).reshape(2, 7)})
+    with h5py.File(path, "r+") as file:
+        file["q"].attrs["MATLAB_class"] = np.bytes_("timeseries")
+    assert_refused(limitation, read_recording, path)
+
+
+@pytest.mark.parametrize("as_cells", [True, False])
+@pytest.mark.parametrize("ros", [1, 2])
+def test_messages_of_the_ros_toolbox_are_read(tmp_path, as_cells, ros):
+    """`readMessages` of MATLAB's ROS Toolbox returns a cell array of structures. Its members are capital in ROS 1."""
+    arm, (q, qd, tau) = load_arm("mtml"), blocks(6)
+    cells = np.empty((7, 1), object)
+    cells[:, 0] = arm.joint_names[::-1]
+    messages = []
+    for k in range(6):
+        stamp = {"sec": 100, "nanosec" if ros == 2 else "nsec": 20_000_000 * k}
+        block = [column[k][::-1][:, None] for column in (q, qd, tau)]
+        names = ("header", "name", "position", "velocity", "effort")
+        message = dict(zip(names, ({"stamp": stamp}, cells, *block), strict=True))
+        messages.append(_capital(message) if ros == 1 else message)
+    if as_cells:
+        value = np.empty((6, 1), object)
+        value[:, 0] = messages
+    else:
+        value = np.array([tuple(message.values()) for message in messages], [(name, object) for name in messages[0]])
+    path = write_arrays(tmp_path, "v5", {"log": value, "gain": np.ones(3)})
+    read = read_recording(path, arm)
+    for name, expected in (("q", q), ("qd", qd), ("tau", tau)):
+        np.testing.assert_array_equal(getattr(read, name), expected)
+    np.testing.assert_allclose(read.t, 0.02 * np.arange(6), atol=1e-12)
+    assert (read.coordinates, read.where(2)) == ("joint", f"{path}, message 3")
+    assert_refused("needs the arm", read_recording, path)
+
+
+def _capital(members):
+    """Returns the structure with capital names of its members."""
+    return {name.capitalize(): _capital(value) if isinstance(value, dict) else value for name, value in members.items()}

@@ -87,7 +87,7 @@ def test_other_existing_output_is_refused_and_unchanged(tmp_path):
         CollectionFile(path, arm, False)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[-1] + ",1"]) + "\n")
-    with pytest.raises(RecordingError, match=r"o.csv, line 5: the row has 31 cells, the header has 30"):
+    with pytest.raises(RecordingError, match=r"o.csv, line 5: the row has 32 cells, the header has 31"):
         CollectionFile(path, arm, True)
     path.write_text("q1,tau1\n1,2\n")
     with pytest.raises(CollectionError, match="already exists and is not a collection of MTML"):

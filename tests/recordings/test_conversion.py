@@ -35,14 +35,14 @@ def test_converted_poses_are_exact(tmp_path):
 def test_converted_motion_is_exact_and_its_properties_are_noted(tmp_path):
     rows = np.random.default_rng(3).normal(size=(50, 21))
     rows[[10, 11]] = rows[9]
-    recording = convert(write_wpi(tmp_path, rows), tmp_path / "out.csv", rate=100)
-    again = read_recording(tmp_path / "out.csv", coordinates="actuator")
+    recording = convert(write_wpi(tmp_path, rows), tmp_path / "out.csv", rate=100, coordinates="actuator")
+    again = read_recording(tmp_path / "out.csv")
+    assert again.coordinates == "actuator"
     assert_equal(again, recording)
     np.testing.assert_array_equal(np.hstack([again.q, again.qd, again.tau]), rows)
     assert recording.notes[1] == "50 samples; the file has no times, so t = row / 100 Hz"
-    assert "pass --coordinates wpi" in recording.notes[2]
-    assert recording.notes[3] == "t from 0 to 0.49 s, median interval 10 ms"
-    assert recording.notes[4].startswith("2 of 50 rows repeat the previous row")
+    assert recording.notes[2] == "t from 0 to 0.49 s, median interval 10 ms"
+    assert recording.notes[3].startswith("2 of 50 rows repeat the previous row")
 
 
 def test_actuator_coordinates_become_joint_coordinates_of_an_arm(tmp_path):
@@ -50,7 +50,7 @@ def test_actuator_coordinates_become_joint_coordinates_of_an_arm(tmp_path):
     q = arm.sample_poses(5, np.random.default_rng(1), margin=0.1)
     given = Recording(q=q, qd=0.1 * q, tau=0.01 * q, t=0.01 * np.arange(5)).in_actuator_coordinates(arm)
     write_recording(given, tmp_path / "motion.csv")
-    stated = convert(tmp_path / "motion.csv", tmp_path / "out.csv", coordinates="actuator", arm=arm)
+    stated = convert(tmp_path / "motion.csv", tmp_path / "out.csv", arm=arm)
     assert not any("not stated" in note for note in stated.notes)
     np.testing.assert_allclose(read_recording(tmp_path / "out.csv", arm).q, q, rtol=0, atol=1e-12)
 
@@ -77,7 +77,7 @@ def test_failed_conversion_keeps_the_old_output(tmp_path):
     assert_refused("the first row has 20 cells", convert, write_text(tmp_path, NUMBERS[:-2]), output)
     assert output.read_text() == "old"
     with pytest.raises(DvrkDrakeError, match="cannot be written: No such file or directory"):
-        convert(write_wpi(tmp_path, wpi_rows()), tmp_path / "no" / "out.csv")
+        convert(write_wpi(tmp_path, wpi_rows()), tmp_path / "no" / "out.csv", coordinates="actuator")
 
 
 def test_poses_that_the_arm_cannot_reach_are_refused(tmp_path):
@@ -91,7 +91,7 @@ def test_poses_that_the_arm_cannot_reach_are_refused(tmp_path):
     assert not (tmp_path / "out.csv").exists()
 
 
-@pytest.mark.parametrize("name", ["out.bag", "out.mat", "out", "out.MCAP"])
+@pytest.mark.parametrize("name", ["out.bag", "out.mat", "out", "out.mcap.gz"])
 def test_other_outputs_are_refused(tmp_path, name):
     path = write_wpi(tmp_path, wpi_rows())
     assert_refused(r"must end in \.csv or \.mcap", convert, path, tmp_path / name)

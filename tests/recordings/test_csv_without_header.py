@@ -1,6 +1,8 @@
-"""CSV files without a header: layouts by their number of columns, times, and one line for each fault."""
+"""CSV files of other programs: layouts without a header, columns of messages, times, and one line for each fault."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,24 +10,54 @@ from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wp
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.recording import write_recording
+
+ARM = load_arm("mtml")
 
 
 def test_21_columns_are_motions_of_wpi_at_200_hz(tmp_path):
     rows = wpi_rows()
     path = write_wpi(tmp_path, rows)
-    recording = read_recording(path)
-    np.testing.assert_array_equal(recording.q, rows[:, :7])
-    np.testing.assert_array_equal(recording.qd, rows[:, 7:14])
-    np.testing.assert_array_equal(recording.tau, rows[:, 14:])
+    recording = read_recording(path, ARM).in_actuator_coordinates(ARM)
+    np.testing.assert_allclose(recording.q, rows[:, :7], atol=1e-12)
+    np.testing.assert_allclose(recording.qd, rows[:, 7:14], atol=1e-12)
+    np.testing.assert_allclose(recording.tau, rows[:, 14:], atol=1e-12)
     np.testing.assert_array_equal(recording.t, [0, 0.005, 0.010, 0.015])
-    assert recording.coordinates == "actuator"
+    assert recording.file_coordinates == "wpi"
     assert recording.where(3) == f"{path}, line 4"
     assert recording.notes == (
         "no header: columns read as q1..q7, qd1..qd7, tau1..tau7",
         "4 samples; the file has no times, so t = row / 200 Hz",
-        "in the coordinates wpi; pass --coordinates wpi to every command that reads the converted file",
     )
-    np.testing.assert_array_equal(read_recording(path, rate=10).t, [0, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(read_recording(path, ARM, rate=10).t, [0, 0.1, 0.2, 0.3])
+
+
+def test_wpi_coordinates_without_an_arm_are_stated(tmp_path):
+    """The roll of a PSM is in joint coordinates, so these are not actuator coordinates."""
+    psm, rows = load_arm("psm"), 1e-2 * wpi_rows()
+    path = write_wpi(tmp_path, rows)
+    read = read_recording(path)
+    assert (read.coordinates, read.file_coordinates) == ("wpi", "wpi")
+    write_recording(read, tmp_path / "again.csv")
+    again = read_recording(tmp_path / "again.csv")
+    assert again.coordinates == "wpi"
+    np.testing.assert_array_equal(np.hstack([again.q, again.qd, again.tau]), rows)
+    for arm in (psm, ARM):
+        converted = read_recording(path, arm)
+        for name in ("q", "qd", "tau"):
+            for other in (again.in_joint_coordinates(arm), read_recording(tmp_path / "again.csv", arm)):
+                np.testing.assert_allclose(getattr(other, name), getattr(converted, name), atol=1e-12)
+            actuator = getattr(again.in_actuator_coordinates(arm), name)
+            np.testing.assert_allclose(actuator, getattr(converted.in_actuator_coordinates(arm), name), atol=1e-12)
+
+
+def test_other_arms_with_seven_joints_have_no_wpi_file(tmp_path):
+    arm = replace(load_arm("psm"), name="PANDA")
+    path = write_wpi(tmp_path, 1e-2 * wpi_rows())
+    recording = read_recording(path, arm)
+    np.testing.assert_array_equal(recording.q, 1e-2 * wpi_rows()[:, :7])
+    assert (recording.t, recording.coordinates, recording.file_coordinates) == (None, "joint", "")
+    assert read_recording(path, arm, "wpi", rate=200).file_coordinates == "wpi"
 
 
 def test_wpi_motions_have_the_roll_of_the_joint(tmp_path):
@@ -42,7 +74,7 @@ def test_wpi_motions_have_the_roll_of_the_joint(tmp_path):
 
 def test_14_columns_are_static_poses(tmp_path):
     rows = wpi_rows()[:, :14]
-    recording = read_recording(write_wpi(tmp_path, rows), load_arm("mtml"))
+    recording = read_recording(write_wpi(tmp_path, rows), ARM)
     np.testing.assert_array_equal(recording.q, rows[:, :7])
     np.testing.assert_array_equal(recording.tau, rows[:, 7:])
     assert (recording.qd, recording.t, recording.coordinates) == (None, None, "joint")
@@ -61,7 +93,9 @@ def test_files_of_the_dvrk_collection_script_have_three_joints(tmp_path):
 
 def test_crlf_byte_order_mark_blank_lines_and_spaces(tmp_path):
     line = ", ".join(str(i) for i in range(21))
-    recording = read_recording(write_text(tmp_path, f"\ufeff\r\n{line}\r\n\r\n{line}\r\n \r\n"))
+    recording = read_recording(
+        coordinates="actuator", path=write_text(tmp_path, f"\ufeff\r\n{line}\r\n\r\n{line}\r\n \r\n")
+    )
     np.testing.assert_array_equal(recording.lines, [2, 4])
     np.testing.assert_array_equal(recording.t, [0, 0.005])
 
@@ -95,7 +129,7 @@ def test_faults_name_file_line_and_column(tmp_path, case):
 @pytest.mark.parametrize("rate", [0, -200, np.nan, np.inf])
 def test_other_rates_are_refused(tmp_path, rate):
     path = write_wpi(tmp_path, wpi_rows())
-    assert_refused("rate is .* Hz; allowed: a positive number", read_recording, path, rate=rate)
+    assert_refused("rate is .* Hz; allowed: a positive number", read_recording, path, ARM, rate=rate)
 
 
 def test_skips_invalid_rows_and_keeps_times(tmp_path):
@@ -104,7 +138,7 @@ def test_skips_invalid_rows_and_keeps_times(tmp_path):
     rows[3, 20] = np.inf
     path = write_wpi(tmp_path, rows)
     path.write_text(path.read_text().replace("nan", ""))
-    recording = read_recording(path, skip_invalid=True)
+    recording = read_recording(path, ARM, skip_invalid=True)
     np.testing.assert_array_equal(recording.t, [0, 0.01, 0.02])
     np.testing.assert_array_equal(recording.lines, [1, 3, 5])
     assert "2 of 5 rows skipped (empty, NaN or infinite): lines 2, 4" in recording.notes
@@ -118,7 +152,72 @@ def test_a_real_motion_without_header_and_time_is_restored(shared_data, tmp_path
     original = shared_data / "trajectories" / "mtm_one.csv"
     lines = original.read_text().splitlines()[1:]
     path = write_text(tmp_path, "\n".join(line.split(",", 1)[1] for line in lines))
-    restored, expected = read_recording(path), read_recording(original, coordinates="actuator")
+    restored, expected = (read_recording(file, coordinates="actuator") for file in (path, original))
     for name in ("q", "qd", "tau"):
         np.testing.assert_array_equal(getattr(restored, name), getattr(expected, name))
     np.testing.assert_allclose(restored.t, expected.t, rtol=0, atol=1e-12)
+
+
+def message_rows(layout, names, stamps, blocks):
+    """Returns the text of a CSV with JointState messages in the layout of a program."""
+    n = len(names)
+    numbered = {"bagpy": "{}_{}", "echo": "field.{}{}"}.get(layout)
+    fields = ("position", "velocity", "effort")
+    if layout == "collection":
+        header = "# Topic: /MTMR/measured_js\n# Type: sensor_msgs/msg/JointState\n"
+        header += "timestamp,header.stamp.sec,header.stamp.nanosec,header.frame_id,name," + ",".join(fields)
+    elif layout == "bagpy":
+        header = "Time,header.seq,header.stamp.secs,header.stamp.nsecs,header.frame_id,name"
+    else:
+        header = "%time,field.header.seq,field.header.stamp,field.header.frame_id"
+        header += "".join(f",field.name{i}" for i in range(n))
+    if numbered:
+        header += "".join("," + numbered.format(field, i) for field in fields for i in range(n))
+    lines = [header]
+    for k, stamp in enumerate(stamps):
+        values = [block[k].tolist() for block in blocks]
+        sec, nanosec, quoted = stamp // 10**9, stamp % 10**9, f'"{list(names)}"'
+        flat = ",".join(repr(x) for row in values for x in row)
+        lines.append(
+            {
+                "collection": f"{stamp},{sec},{nanosec},,{quoted}," + ",".join(f'"{row}"' for row in values),
+                "bagpy": f"{stamp / 1e9},{k},{sec},{nanosec},,{quoted},{flat}",
+                "echo": f"{stamp},{k},{stamp},,{','.join(names)},{flat}",
+            }[layout]
+        )
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("layout", ["collection", "bagpy", "echo"])
+def test_columns_of_messages_are_read_like_a_bag(tmp_path, layout):
+    arm, blocks = load_arm("mtmr"), np.random.default_rng(0).uniform(-0.2, 0.2, (3, 5, 7))
+    stamps = 1_700_000_000_000_000_001 + 10_000_000 * np.arange(5)
+    text = message_rows(layout, arm.joint_names[::-1], stamps.tolist(), blocks)
+    read = read_recording(write_text(tmp_path, text), arm)
+    for name, block in zip(("q", "qd", "tau"), blocks, strict=True):
+        np.testing.assert_array_equal(getattr(read, name), block[:, ::-1])
+    np.testing.assert_allclose(read.t, 0.01 * np.arange(5), atol=1e-12)
+    first = text.count("#") + 2
+    np.testing.assert_array_equal(read.lines, range(first, first + 5))
+    assert (read.file_coordinates, read.notes) == ("joint", ())
+    if layout == "collection":
+        assert_refused(
+            "/MTMR is the namespace of the arm MTMR, not of MTML. Choose --arm mtmr.$", read_recording, read.source, ARM
+        )
+    broken = write_text(tmp_path, text.replace(repr(float(blocks[2, 3, 4])), "off"))
+    assert_refused(f"line {first + 3}: .*effort.* is not a number: 'off'", read_recording, broken, arm)
+    wrong = text.replace("header.stamp", "stamp").replace("field.stamp", "stamp")
+    assert_refused(
+        "these are columns of JointState messages .* the times `header.stamp` are missing",
+        *(read_recording, write_text(tmp_path, wrong), arm),
+    )
+
+
+def test_a_header_in_a_comment_is_read(tmp_path):
+    """np.savetxt writes the header as a comment."""
+    names = ["t", *(f"q{i}" for i in range(1, 8))]
+    table = np.random.default_rng(0).normal(size=(3, 8))
+    np.savetxt(tmp_path / "motion.csv", table, delimiter=",", header=",".join(names))
+    read = read_recording(tmp_path / "motion.csv")
+    np.testing.assert_array_equal(np.column_stack([read.t, read.q]), table)
+    np.testing.assert_array_equal(read.lines, [2, 3, 4])

@@ -56,6 +56,13 @@ def test_coordinates_are_those_of_the_user_or_the_default(tmp_path):
     path = tmp_path / "poses.csv"
     write_recording(Recording(q=wpi_rows()[:, :7]), path)
     assert read_recording(path).coordinates == "joint"
+    assert_refused(
+        "poses.csv, line 2: the file states joint coordinates, not actuator. Omit --coordinates",
+        *(read_recording, path, None, "actuator"),
+    )
+    path = write_text(tmp_path, path.read_text().replace("joint", "motor"))
+    assert_refused('line 2: coordinates is "motor"; allowed: joint, actuator, wpi', read_recording, path)
+    path = write_text(tmp_path, "q1,q2,q3,q4,q5,q6,q7\n1,2,3,4,5,6,7\n")
     assert read_recording(path, coordinates="actuator").coordinates == "actuator"
     assert read_recording(write_mat(tmp_path, a=team_array()), coordinates="actuator").coordinates == "actuator"
 
@@ -92,3 +99,72 @@ def test_row_of_another_arm_is_rejected(tmp_path):
     with pytest.raises(RecordingError, match=r"poses\.csv, line 2: the row is of MTML, but the selected arm is MTMR"):
         read_recording(path, arm)
     assert len(read_recording(path, load_arm("mtml"))) == len(read_recording(path)) == 2
+
+
+def test_joints_of_files_without_names_can_be_stated(tmp_path):
+    arm = load_arm("mtml")
+    numbers = dict(zip(arm.joint_names, "2134567", strict=True))
+    order = [1, 0, 2, 3, 4, 5, 6]
+    q = np.random.default_rng(0).normal(size=(5, 7))
+    path = tmp_path / "poses.csv"
+    write_recording(Recording(q=q, tau=-q), path)
+    bare = write_text(tmp_path, "".join(",".join(map(repr, row)) + "\n" for row in np.hstack([q, -q]).tolist()))
+    for file in (path, bare, write_mat(tmp_path, q=q, tau=-q)):
+        read = read_recording(file, arm, joints=numbers)
+        np.testing.assert_array_equal(read.q, q[:, order])
+        np.testing.assert_array_equal(read.tau, -q[:, order])
+        for number, match in (
+            ("2", "--joints: 2 is used for two joints of MTML"),
+            ("8", "column q8|no joint 8; it"),
+        ):
+            assert_refused(match, read_recording, file, arm, joints={"outer_yaw": number})
+    named = write_text(tmp_path, "".join(f"q_{name}," for name in arm.joint_names) + "t\n1,2,3,4,5,6,7,0\n")
+    names = {name: f"_{name}" for name in arm.joint_names}
+    np.testing.assert_array_equal(read_recording(named, arm, joints=names).q, [range(1, 8)])
+
+
+@pytest.mark.parametrize("coordinates", ["joint", "actuator"])
+def test_written_recordings_state_coordinates_arm_and_units(tmp_path, coordinates):
+    arm, path = load_arm("psm"), tmp_path / "motion.csv"
+    q = np.random.default_rng(0).uniform(0.1, 0.2, (3, 7))
+    write_recording(Recording(q=q, qd=q, tau=q, t=np.arange(3.0), coordinates=coordinates), path, arm)
+    header = path.read_text().splitlines()[0].split(",")
+    assert [header[i] for i in (0, 3, 10, 17, -2, -1)] == [
+        "t [s]",
+        "q3 [m]",
+        "qd3 [m/s]",
+        "tau3 [N]",
+        "coordinates",
+        "arm",
+    ]
+    assert [header[i] for i in (1, 8, 15)] == ["q1 [rad]", "qd1 [rad/s]", "tau1 [N m]"]
+    for selected in (None, arm):
+        again = read_recording(path, selected)
+        assert (again.coordinates, again.arm_name) == (coordinates, "PSM")
+        np.testing.assert_array_equal(again.tau, q)
+    assert_refused("line 2: the row is of PSM, but the selected arm is MTML", read_recording, path, load_arm("mtml"))
+    write_recording(again, tmp_path / "again.csv")
+    assert read_recording(tmp_path / "again.csv").arm_name == "PSM"
+
+
+@pytest.mark.parametrize(
+    "name, unit, match",
+    [
+        ("q1", "deg", "the unit of q1 is deg; allowed: rad. Convert the numbers"),
+        ("q3", "mm", "the unit of q3 is mm; allowed: m"),
+        ("q3", "rad", "the unit of q3 is rad; allowed: m"),
+        ("tau1", "N", "the unit of tau1 is N; allowed: N m"),
+        ("t", "ms", "the unit of t is ms; allowed: s"),
+        ("tau1", "Nm", ""),
+        ("tau1", "N*m", ""),
+        ("qd1", "rad/s", ""),
+    ],
+)
+def test_units_in_the_header_are_checked(tmp_path, name, unit, match):
+    names = ["t", *(f"{block}{i}" for block in ("q", "qd", "tau") for i in range(1, 8))]
+    header = [f"{column} ({unit})" if column == name else column for column in names]
+    path = write_text(tmp_path, ",".join(header) + "\n" + ",".join(["0.1"] * 22) + "\n")
+    if match:
+        assert_refused(f"motion.csv, line 1: {match}", read_recording, path, load_arm("psm"))
+    else:
+        assert len(read_recording(path, load_arm("psm"))) == 1

@@ -12,9 +12,10 @@ from forked import public_folder, run_unprivileged
 from recordings import random_recording, write_text
 
 from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import write_csv, write_recording
+from dvrk_drake.recordings.recording import write_recording
 
 
 @pytest.mark.parametrize("absent", [(), ("t",), ("qd",), ("tau",), ("t", "qd", "tau")])
@@ -33,15 +34,11 @@ def test_csv_round_trip_is_exact(tmp_path, absent):
 
 def test_failed_write_keeps_the_old_file(tmp_path):
     path = tmp_path / "out.csv"
-    write_csv(path, ["a"], np.ones((1, 1)))
+    write_text(tmp_path, "old").rename(path)
     before = path.read_bytes()
-
-    def rows():
-        yield [1.0]
+    with pytest.raises(KeyboardInterrupt), atomic_write(path) as stream:
+        stream.write("new")
         raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_csv(path, ["a"], rows())
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
@@ -112,3 +109,39 @@ def test_new_file_has_the_permissions_of_the_umask(tmp_path):
         os.umask(old)
     assert (tmp_path / "out.bin").read_bytes() == b"\x00\xff"
     assert stat.S_IMODE((tmp_path / "out.bin").stat().st_mode) == 0o640
+
+
+def test_umask_of_the_process_is_not_changed(tmp_path, monkeypatch):
+    """Files that other threads create in the meantime would be writable by everyone."""
+    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail("the umask is changed"))
+    with atomic_write(tmp_path / "out.csv") as stream:
+        stream.write("new")
+    assert (tmp_path / "out.csv").read_text() == "new"
+
+
+def test_content_is_on_the_disk_before_the_file_is_replaced(tmp_path, monkeypatch):
+    calls, path = [], tmp_path / "out.csv"
+    fsync, replace_file = os.fsync, os.replace
+
+    def synced(handle):
+        is_folder = stat.S_ISDIR(os.fstat(handle).st_mode)
+        calls.append("folder" if is_folder else os.fstat(handle).st_size)
+        fsync(handle)
+
+    def replaced(source, target):
+        calls.append("replaced")
+        replace_file(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    with atomic_write(path) as stream:
+        stream.write("12345")
+    assert calls == [5, "replaced", "folder"]
+
+
+def test_suffix_of_a_bag_may_be_in_any_case(tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "motion.MCAP"
+    recording = random_recording()
+    write_recording(recording, path, arm)
+    assert path.read_bytes().startswith(b"\x89MCAP0\r\n")
+    np.testing.assert_allclose(read_recording(path, arm).q, recording.q, atol=1e-12)

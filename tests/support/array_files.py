@@ -1,5 +1,7 @@
 """Writes MATLAB files and NumPy archives for tests."""
 
+import io
+import struct
 from pathlib import Path
 
 import h5py
@@ -24,6 +26,21 @@ def write_arrays(folder: Path, kind: str, arrays: dict) -> Path:
         content = bytearray(path.read_bytes())
         content[:128] = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
         path.write_bytes(bytes(content))
+    return path
+
+
+def with_objects(path: Path, *classes: str) -> Path:
+    """Appends an object of each MATLAB class to a file of version 5, as MATLAB's `save` does."""
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, {"content": np.arange(6, dtype=np.uint32)[:, None]})
+    content = buffer.getvalue()[128:]
+    for name in classes:
+        # Class number of opaque objects; name of the variable, type system and class; content.
+        element = struct.pack("<IIII", 6, 8, 17, 0)
+        for text in (b"recorded", b"MCOS", name.encode()):
+            element += struct.pack("<II", 1, len(text)) + text.ljust(-(-len(text) // 8) * 8, b"\0")
+        element += content
+        path.write_bytes(path.read_bytes() + struct.pack("<II", 14, len(element)) + element)
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,15 @@ def write_text(folder: Path, text: str | bytes) -> Path:
     path = folder / "recording.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
+
+
+def csv_block(path: Path | str, *prefixes: str) -> np.ndarray:
+    """Returns the columns (m, k) of quantities in a CSV, e.g. "tau1 [N m]", "tau2 [N m]", ... for the prefix "tau"."""
+    with open(path, newline="") as stream:
+        header, *rows = csv.reader(stream)
+    names = [name.partition(" [")[0].rstrip("0123456789") for name in header]
+    columns = [column for prefix in prefixes for column, name in enumerate(names) if name == prefix]
+    return np.array([[row[column] for column in columns] for row in rows], float)
 
 
 def random_recording(num_rows: int = 20, **changes: object) -> Recording:

@@ -16,6 +16,7 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from own_network import end, start
+from recordings import csv_block
 from status_logs import ARM, log_bytes, statuses
 from waiting import TIMEOUT, wait_until, within_time_limit
 
@@ -28,7 +29,6 @@ pytestmark = [
     pytest.mark.network,
     pytest.mark.skipif(not (TOOLS / "lcm-logger").exists(), reason=f"no {TOOLS}/lcm-logger: the lcm wheel ships it"),
 ]
-COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(7)]
 
 
 def start_records(paths, *options, arms=("mtml", "mtml")):
@@ -55,8 +55,8 @@ def start_logger(path):
 def by_utime(path):
     """Returns {utime: measurements} of a recorded file, CSV or log."""
     if path.suffix == ".csv":
-        table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True))
-        return {int(row["utime"]): [row[name] for name in COLUMNS] for row in table}
+        rows = zip(csv_block(path, "utime"), csv_block(path, "q", "qd", "tau").tolist(), strict=True)
+        return {int(utime[0]): numbers for utime, numbers in rows}
     messages = [Status.decode(event.data) for event in LcmLogReader(path) if event.channel == "DVRK_STATUS_MTML"]
     return {message.utime: list(measurements(message)) for message in messages}
 

@@ -198,6 +198,8 @@ def _lags(lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
             size = f"{1e3 * MAX_LAG:.0f} ms or more"
         what = f"tau{j + 1} {'lags' if lag > 0 else 'leads'} the motion by {size}"
         advice = "Presliding friction causes a similar lag. Fit presliding friction before you correct a delay."
+        if lag < 0:
+            advice = "The positions may be late, e.g. low-pass filtered. Record unfiltered positions and efforts."
         findings.append(Finding("note", "effort lag", names[j], what, advice, (int(j),), float(lags.lag[j])))
     return findings
 

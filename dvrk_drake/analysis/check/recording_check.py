@@ -390,6 +390,8 @@ def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     sign. Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels
     therefore replaces the refusals for wrong signs.
     """
+    if recording.coordinates == "wpi" and recording.q.shape[1] == arm.num_joints:
+        recording = recording.in_joint_coordinates(arm)
     report = check_recording(recording, arm)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]
     if others or (report.kind == "motion" and not recording.motion(arm)):

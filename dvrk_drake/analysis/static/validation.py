@@ -18,7 +18,7 @@ from dvrk_drake.analysis.static.linear_fit import rms
 from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import Coordinates, Recording, file_transmission
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,15 @@ class StaticValidation(Validation):
         }
 
 
-def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
-    """Returns the predicted holding torques (m, n) in the coordinates of a recording, at its poses [N m, N].
+def predict_static(
+    model: IdentifiedModel, recording: Recording, coordinates: Coordinates | None = None
+) -> NDArray[np.float64]:
+    """Returns the predicted holding torques (m, n) at the poses of a recording [N m, N].
+
+    Args:
+        model: Identified model.
+        recording: Poses.
+        coordinates: Coordinates of the torques. Default: those of the recording.
 
     Raises:
         RecordingError: The recording does not fit the model's arm.
@@ -106,9 +113,9 @@ def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
     arm = model.arm
     recording.check_fits(arm)
     tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
-    if recording.coordinates == "actuator":
+    if (coordinates or recording.coordinates) != "joint":
         # tau_joint = J' tau_actuator, so the inverse map transforms efforts from joints to actuators.
-        tau = arm.transmission.inverse.pull_back_effort(tau)
+        tau = file_transmission(arm, coordinates or recording.coordinates).inverse.pull_back_effort(tau)
     return tau
 
 
@@ -127,6 +134,8 @@ def validate_static(
         RecordingError: The recording does not fit the model's arm, or has no efforts.
     """
     arm = model.arm
+    if recording.coordinates == "wpi":
+        recording = recording.in_joint_coordinates(arm)
     measured = recording.measured_effort()
     predicted = predict_static(model, recording)
     residuals = measured - predicted

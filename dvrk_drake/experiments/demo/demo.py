@@ -211,13 +211,13 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
         )
 
     poses = collect(POSES, "collecting poses")
-    write_recording(poses, output / "poses.csv")
+    write_recording(poses, output / "poses.csv", arm)
     identification = identify_static(poses, arm, progress=lambda share: progress("identifying", share))
     model = identification.model
     model.provenance.recording = "poses.csv"
     model.save(output / "model.yaml")
     fresh_poses = collect(FRESH_POSES, "collecting fresh poses")
-    write_recording(fresh_poses, output / "fresh_poses.csv")
+    write_recording(fresh_poses, output / "fresh_poses.csv", arm)
 
     def part(start: float, end: float) -> Callable[[float], object]:
         return lambda share: progress("simulating the release", start + (end - start) * share)

@@ -183,7 +183,7 @@ class ReproductionSession:
             lambda share: self.progress(f"collecting poses of the {arm_name}", share),
         )
         recording, file = self.folder / f"{name}_poses.csv", self.folder / f"{name}_model.yaml"
-        write_recording(poses, recording)
+        write_recording(poses, recording, load_arm(name))
         identification = identify_static(
             poses, load_arm(name), progress=lambda share: self.progress(f"identifying the {arm_name}", share)
         )

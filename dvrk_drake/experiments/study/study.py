@@ -56,7 +56,7 @@ def run_study(
         ScenarioError, ArmError, ModelError: The scenario or one of its variations is invalid.
     """
     study.check()
-    table_type = ParquetStudyTable if Path(output).suffix == ".parquet" else StudyTable
+    table_type = ParquetStudyTable if Path(output).suffix.lower() == ".parquet" else StudyTable
     futures: dict[Future[Row], Case] = {}
     losses: list[tuple[Case, BaseException]] = []
     with table_type(output, study) as table:

@@ -188,7 +188,7 @@ def test_exchange_replaces_a_wrong_sign():
 def test_identify_refuses_exchanged_channels(tmp_path, capfd):
     write_recording(exchanged(motion("mtmr"), 0, 1, "tau"), tmp_path / "motion.csv")
     model = tmp_path / "model.yaml"
-    command = ["identify", str(tmp_path / "motion.csv"), "--arm", "mtmr", "--coordinates", "actuator"]
+    command = ["identify", str(tmp_path / "motion.csv"), "--arm", "mtmr"]
     assert main([*command, "--output", str(model)]) == 2
     assert "tau1 and tau2 are exchanged" in capfd.readouterr().err
     assert not model.exists()

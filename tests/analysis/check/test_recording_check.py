@@ -11,7 +11,9 @@ from figure_rules import checked_figures
 from rich.console import Console
 from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
+from dvrk_drake.analysis.check.motion_check import _lags
 from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.signals.effort_lag import EffortLag
 from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.cli import main
@@ -228,3 +230,12 @@ def test_units_in_the_headings_of_tables_are_printed():
     console = Console(record=True, width=120)
     console.print(make_table("title [kg]", "", "mass [kg]"))
     assert "mass [kg]" in console.export_text()
+
+
+def test_friction_does_not_explain_leading_efforts():
+    """Presliding friction delays the efforts. It cannot make them earlier."""
+    lag = np.array([2e-3, -2e-3])
+    late, early = _lags(EffortLag(lag, 0.1 * abs(lag), 0 * lag + 2, lag != 0, lag, lag), ("yaw", "pitch"))
+    assert late.what == "tau1 lags the motion by 2.0 ms (standard error 0.2 ms)" and "friction" in late.advice
+    assert early.what == "tau2 leads the motion by 2.0 ms (standard error 0.2 ms)"
+    assert early.advice.startswith("The positions may be late") and "friction" not in early.advice

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
+from recordings import csv_block
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic, motion_problem
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
@@ -23,7 +24,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording, file_transmission, write_recording
 from dvrk_drake.reports.identification import print_identification
 from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
 
@@ -233,9 +234,16 @@ def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsy
     for name in ("with.csv", "without.csv"):
         output = str(tmp_path / f"of_{name}")
         assert main(["predict", paths[name], "--model", paths["model.yaml"], "--output", output]) == 0
-        predicted.append(np.loadtxt(output, delimiter=",", skiprows=1))
+        predicted.append(csv_block(output, "tau", "lower", "upper"))
         assert "always 0" not in capsys.readouterr().out
     np.testing.assert_allclose(*predicted, rtol=0, atol=1e-12 * np.abs(predicted).max())
+    arm, powers = result.model.arm, []
+    for coordinates in ("joint", "actuator", "wpi"):
+        prediction = predict(result.model, recording, coordinates=coordinates)
+        v = file_transmission(arm, coordinates).velocity(recording.in_joint_coordinates(arm).qd)
+        powers.append(np.sum(prediction.tau * v, axis=1))
+        assert np.all(prediction.half_width > 0)
+    np.testing.assert_allclose(powers[1:], [powers[0]] * 2, rtol=0, atol=1e-9 * np.abs(powers[0]).max())
     assert main(["validate", paths["without.csv"], "--model", paths["model.yaml"]]) == 2
     assert "has no efforts; needs columns tau1..tau7" in capsys.readouterr().err
 

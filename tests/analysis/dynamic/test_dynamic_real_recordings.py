@@ -11,6 +11,7 @@ from io import StringIO
 
 import numpy as np
 import pytest
+from recordings import csv_block
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
@@ -94,7 +95,7 @@ def test_commands_accept_a_real_motion(case, tmp_path):
     found = json.loads(errors.read_text())
     assert found["coordinates"] == "actuator" and found["mean_relative_error"] < TARGET[name] / 100
     assert main(["predict", str(path), "--model", str(model), "--output", str(tau)]) == 0
-    joints, lower, upper = np.split(np.loadtxt(tau, delimiter=",", skiprows=1), 3, axis=1)
+    joints, lower, upper = (csv_block(tau, name) for name in ("tau", "lower", "upper"))
     np.testing.assert_allclose(upper - joints, joints - lower, rtol=0, atol=1e-9)
     predicted = arm.transmission.inverse.pull_back_effort(joints)
     measured = recording.in_actuator_coordinates(arm).tau

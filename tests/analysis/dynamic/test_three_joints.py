@@ -86,8 +86,9 @@ def test_commands_end_to_end(folder, capsys):
     assert "valid only for roll = 0.5, wrist_pitch = -0.6, wrist_yaw = 0.2, jaw = 0.3" in out
     prediction = folder / "tau.csv"
     assert main(["predict", f"{folder}/two.csv", "--model", f"{folder}/model.yaml", "--output", str(prediction)]) == 0
-    names = [f"{name}{i}" for name in ("tau", "lower", "upper") for i in (1, 2, 3)]
-    assert prediction.read_text().splitlines()[0].split(",") == names
+    units = ("1 [N m]", "2 [N m]", "3 [N]")
+    efforts = [f"{name}{unit}" for name in ("tau", "lower", "upper") for unit in units]
+    assert prediction.read_text().splitlines()[0].split(",") == ["t [s]", *efforts, "coordinates", "arm"]
 
 
 def test_controller_file_contains_the_held_instrument(folder):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from command_output import refusal
+from recordings import csv_block
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.design import contracted
@@ -150,7 +151,7 @@ def test_command_writes_the_motion(tmp_path, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert "motion of 8 s. Expected error of predicted efforts:" in " ".join(out.split())
     motion = PeriodicMotion.load("m.yaml", dvrk.load_arm("mtmr"))
-    rows = np.loadtxt("m.csv", delimiter=",", skiprows=1)
+    rows = csv_block("m.csv", "t", "q", "qd")
     assert rows.shape == (801, 15)
     np.testing.assert_allclose(rows[:, 1:8], motion.evaluate(rows[:, 0]).q, atol=1e-12)
     np.testing.assert_allclose(rows[:, 8:], motion.evaluate(rows[:, 0]).v, atol=1e-12)

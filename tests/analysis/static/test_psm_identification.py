@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from command_output import refusal
+from recordings import csv_block
 
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
@@ -88,7 +89,7 @@ def test_commands_accept_a_psm(arm, recording, tmp_path, capsys):
     assert main(["validate", str(poses), "--model", str(model), "--json", str(errors)]) == 0
     assert all(j["rms_error"] <= j["rms_torque"] + 1e-9 for j in json.loads(errors.read_text())["joints"])
     assert main(["predict", str(poses), "--model", str(model), "--output", str(prediction)]) == 0
-    tau = np.loadtxt(prediction, delimiter=",", skiprows=1)
+    tau = csv_block(prediction, "tau")
     np.testing.assert_allclose(tau, IdentifiedModel.load(model).holding_torque(recording.q), atol=1e-12)
 
 
