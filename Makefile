@@ -10,22 +10,23 @@ PATHS ?=
 MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
 # Reading all other files takes 10 s.
-NETWORK_FILES = $(shell grep -rl --include='test_*.py' '^pytestmark.*mark\.network\|^    pytest.mark.network' tests)
+NETWORK_FILES = $(shell grep -rl --include='test_*.py' '^pytestmark.*mark\.network' tests | grep -v udp/)
 AND_TESTS = $(if $(TESTS), and $(TESTS))
 
-.PHONY: demo test test-all test-busy test-local test-network mutants lint docs package test-package benchmark clean
+.PHONY: demo test test-all test-busy test-local test-network test-realtime mutants lint docs package test-package benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --folder demo_output --overwrite
 
 # Tests of everything that a change can break. test-all adds tests that repeat others with another arm, draw or duration,
 # and tests with a browser, long recordings or the dVRK console.
-# The tests of the network mostly wait, so they run at the same time. Their output follows that of the others.
+# Network tests that are not in real time mostly wait, so they run beside the others. Their output follows.
 test: $(VENV)/.installed-test
 	@set -e; output=$$(mktemp); $(MAKE) --no-print-directory test-network >$$output 2>&1 & network=$$!; \
 	  trap "kill $$network 2>/dev/null || :; rm -f $$output" EXIT INT TERM; \
 	  result=0; $(MAKE) --no-print-directory test-local || result=$$?; \
-	  wait $$network || result=$$?; cat $$output; exit $$result
+	  wait $$network || result=$$?; cat $$output; \
+	  $(MAKE) --no-print-directory test-realtime || result=$$?; exit $$result
 
 test-all:
 	$(MAKE) test TESTS=
@@ -39,9 +40,12 @@ test-busy:
 test-local: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal --max-worker-restart 0 -m 'not network$(AND_TESTS)' $(PATHS)
 
-# Tests over UDP and DDS run one after the other, since each runs several processes at 1 kHz.
 test-network: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -m 'network$(AND_TESTS)' $(or $(PATHS),$(NETWORK_FILES))
+	$(BIN)/python -m pytest -m 'network and not realtime$(AND_TESTS)' $(or $(PATHS),$(NETWORK_FILES))
+
+# One after the other, since each test runs several processes at 1 kHz and needs all cores.
+test-realtime: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -m 'realtime$(AND_TESTS)' $(or $(PATHS),tests/udp)
 
 # Mutation testing: lists changes of the code that no test detects. Not part of CI, since it takes many minutes.
 mutants: $(VENV)/.installed-test

@@ -60,7 +60,11 @@ def test_unknown_name_is_in_the_error():
         dvrk.identifi  # noqa: B018
 
 
-@pytest.mark.parametrize("name", dvrk.__all__)
+#: Names whose examples take seconds, and whose functions other tests call.
+LONG = ("payload", "design_poses", "design_excitation", "PeriodicMotion")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in dvrk.__all__])
 def test_docstring_example_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     value = getattr(dvrk, name)

@@ -197,8 +197,10 @@ class Recording:
         )
 
     def segments(self) -> list[slice]:
-        """Returns the rows of each segment of a motion between gaps of its times, see `GAP`."""
-        intervals = np.diff(np.asarray(self.t))
+        """Returns the rows of each segment of a motion between gaps of its times, see `GAP`. Poses are one segment."""
+        if self.t is None:
+            return [slice(0, len(self))]
+        intervals = np.diff(self.t)
         typical = float(np.median(intervals)) if len(intervals) else 0.0
         edges = [0, *(np.flatnonzero(intervals > max(GAP * typical, MIN_GAP)) + 1).tolist(), len(self)]
         return [slice(first, last) for first, last in pairwise(edges)]

@@ -337,14 +337,13 @@ def test_static_model_is_not_validated_on_a_motion(files, tmp_path, capsys):
     t = 0.01 * np.arange(300)[:, None]
     q = recording.q[0] + 0.1 * np.sin(5 * t)
     moving = str(tmp_path / "motion.csv")
-    write_recording(
-        Recording(q=q, qd=0.5 * np.cos(5 * t) + 0 * q, tau=np.tile(recording.tau[0], (300, 1)), t=t[:, 0]), moving
-    )
+    qd, tau = 0.5 * np.cos(5 * t) + 0 * q, recording.tau[0] + 0.01 * np.sin(7 * t)
+    write_recording(Recording(q=q, qd=qd, tau=tau, t=t[:, 0]), moving)
     before = (tmp_path / "model.yaml").read_bytes()
     assert main(["validate", moving, "--model", model, "--require", "usable", "--save"]) == 2
     message = refusal(capsys.readouterr().err)
     assert "the arm moves" in message and "the model is static" in message and "static poses" in message
     assert (tmp_path / "model.yaml").read_bytes() == before
-    write_recording(Recording(q=q, qd=0.5 * np.cos(5 * t) + 0 * q, tau=np.tile(recording.tau[0], (300, 1))), moving)
+    write_recording(Recording(q=q, qd=qd, tau=tau), moving)
     assert main(["validate", moving, "--model", model]) == 2
     assert "the arm moves" in refusal(capsys.readouterr().err)

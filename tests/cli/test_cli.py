@@ -401,7 +401,7 @@ def test_invalid_input_gives_one_line(folder, capsys, tmp_path):
     for lines, message in (
         ([text[0].replace("tau4", "torque4"), *text[1:]], f"{bad}, line 1: missing column tau4"),
         ([text[0], text[1].replace(text[1].split(",")[9], "nan"), *text[2:]], f"{bad}, line 2: tau3 is nan"),
-        ([text[0], *text[1:3], text[3] + ",1"], f"{bad}, line 4: the row has 15 cells, the header has 14"),
+        ([text[0], *text[1:3], text[3] + ",1"], f"{bad}, line 4: the row has 16 cells, the header has 15"),
         ([], f"{bad} is empty"),
         (text[:4], f"{bad}: 3 distinct poses found"),
     ):

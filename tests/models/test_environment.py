@@ -39,6 +39,7 @@ def test_objects_may_touch_each_other_and_the_base(arm):
         assert "collision of base_link and" not in detector.collision(pose)
 
 
+@pytest.mark.slow
 def test_motion_keeps_its_distance_from_another_arm(arm, tmp_path):
     environment = dvrk.Environment(directives=OTHER_ARM.format(x=-0.27))
     limits = dvrk.MotionLimits(traverse_time=2.0, environment=environment)
@@ -63,6 +64,7 @@ def object_in(folder, shape=BOX, p_WL=(2.0, 0.0, 0.0)):
     return f"directives:\n- add_model: {{name: o, file: 'file://{folder}/object.sdf'}}\n{weld}"
 
 
+@pytest.mark.slow
 def test_poses_keep_their_distance_from_another_arm(arm, tmp_path):
     environment = dvrk.Environment(directives=OTHER_ARM.format(x=-0.27))
     design = dvrk.design_poses(arm, 8, limits=dvrk.MotionLimits(margin=0.1, environment=environment))

@@ -143,7 +143,7 @@ def test_bag_needs_an_arm(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("tool", ["mcap", "pymcap-cli"])
+@pytest.mark.parametrize("tool", ["mcap", pytest.param("pymcap-cli", marks=pytest.mark.slow)])
 def test_command_lines_accept_and_recover_bags(tmp_path, tool):
     """`mcap` is the tool of the format's authors, `pymcap-cli` an independent one with the same commands, from PyPI."""
     program = shutil.which(tool, path=os.pathsep.join([os.path.dirname(sys.executable), os.environ.get("PATH", "")]))

@@ -129,7 +129,7 @@ def validation():
         model=IdentifiedModel.from_arm(arm),
         recording=Recording(q=q, qd=v, tau=measured, t=t, source="simulated"),
         actuators=[
-            ActuatorError(name, 1.0, 0.1, 0.1, ErrorShares(0.0, 0.9, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0), 0.02, "good")
+            ActuatorError(name, 1.0, 0.1, 0.1, ErrorShares(0.0, 0.9, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0), 0.02, "good", 0.8)
             for name in arm.joint_names
         ],
         cut_off=15.0,

@@ -120,6 +120,9 @@ class _Process:
         self.pending = list(items)
         if "arm_processes" in sys.modules:
             forkserver.ensure_running()  # one fork server for the processes of all modules
+        # The parent of a deadman process is a bridge, which a test may kill. Then this process becomes its parent.
+        _LIBC.prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        self._others = set(_children())
         self._receiver, sender = multiprocessing.Pipe(duplex=False)
         self._pid = os.fork()
         if self._pid == 0:
@@ -134,13 +137,20 @@ class _Process:
             data, delay = self._receiver.recv()
             reports = [item.config.hook.pytest_report_from_serializable(config=item.config, data=each) for each in data]
         except EOFError:
-            status = os.waitpid(self._pid, 0)[1]
             self.pending = []
-            problem = f"the process of the test ended: {os.waitstatus_to_exitcode(status)}"
+            problem = f"the process of the test ended: {self._end()}"
             return [pytest.TestReport(item.nodeid, item.location, {}, "failed", problem, "call")], 0.0
         if not self.pending:
-            os.waitpid(self._pid, 0)
+            self._end()
         return reports, delay
+
+    def _end(self):
+        """Waits for the end of the process, ends processes that remain, and returns the exit code."""
+        status = os.waitpid(self._pid, 0)[1]
+        for pid in set(_children()) - self._others:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+        return os.waitstatus_to_exitcode(status)
 
     @staticmethod
     def _run(items, sender):
@@ -152,16 +162,12 @@ class _Process:
                 item.add_marker(mark)
         # The fork server is a child of the parent, so this process cannot wait for it.
         forkserver._forkserver.ensure_running = lambda: None
-        _LIBC.prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         for item, following in zip(items, [*items[1:], items[0].session], strict=True):
             with _LongestDelay() as delay:
                 reports = runtestprotocol(item, log=False, nextitem=following)
             hook = item.config.hook
             data = [hook.pytest_report_to_serializable(config=item.config, report=report) for report in reports]
             sender.send((data, delay.seconds))
-        # A deadman process of a bridge that a test has killed has lost its parent.
-        for pid in _children():
-            os.kill(pid, signal.SIGKILL)
 
 
 class _LongestDelay:

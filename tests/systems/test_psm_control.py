@@ -91,7 +91,14 @@ def check_steps(bench, poses, largest_overshoot):
             assert np.all(np.abs(error[-1]) < 0.2 * SETTLED)
 
 
-@pytest.mark.parametrize(("gravity_factor", "poses"), [(1.0, slice(None)), (0.8, slice(1, 2)), (1.2, slice(2, 3))])
+@pytest.mark.parametrize(
+    ("gravity_factor", "poses"),
+    [
+        pytest.param(1.0, slice(None), marks=pytest.mark.slow),
+        pytest.param(0.8, slice(1, 2), marks=pytest.mark.slow),
+        (1.2, slice(2, 3)),
+    ],
+)
 def test_step_of_each_joint_settles_within_a_second(gravity_factor, poses):
     # Measured: 9 % at most, on the roll; 0.82 s at most, on the yaw.
     check_steps(Bench(gravity_factor), step_poses()[poses], 0.12)

@@ -86,7 +86,13 @@ def test_commanded_velocity_is_limited():
     np.testing.assert_allclose(fastest[[0, 2, 3, 6]], SPEED[[0, 2, 3, 6]], atol=1e-9)
 
 
-@pytest.mark.parametrize("turn", [np.array([0, 0, 0, 0, 0, 0, 6.0]), np.array([0.8, 0.5, -0.7, 0, 1.5, 0.6, 0])])
+@pytest.mark.parametrize(
+    "turn",
+    [
+        pytest.param(np.array([0, 0, 0, 0, 0, 0, 6.0]), marks=pytest.mark.slow),
+        np.array([0.8, 0.5, -0.7, 0, 1.5, 0.6, 0]),
+    ],
+)
 def test_tip_returns_from_limits_with_the_master(turn):
     q_start = np.array([1.2, -0.7, 0.22, 3.0, 1.0, 1.0, 0.5])
     loop = Loop(q_start, scale=1.0)

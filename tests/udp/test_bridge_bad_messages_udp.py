@@ -16,7 +16,7 @@ from waiting import TIMEOUT, wait_until
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 
-pytestmark = pytest.mark.network
+pytestmark = [pytest.mark.network, pytest.mark.realtime]
 
 ARM = load_arm("mtml")
 NAMES, POSE = list(ARM.joint_names), [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5]

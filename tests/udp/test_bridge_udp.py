@@ -21,7 +21,7 @@ from waiting import wait_until
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 
-pytestmark = [pytest.mark.network, pytest.mark.slow]
+pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
 
 EFFORT, POSITION = "JOINT_SPACE/EFFORT_MODE", "JOINT_SPACE/POSITION_MODE"
 #: Time for which DDS by default lists a killed process [s].

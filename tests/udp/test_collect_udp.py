@@ -17,7 +17,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import load_poses
 from dvrk_drake.recordings.reading import read_recording
 
-pytestmark = [pytest.mark.network, pytest.mark.slow]
+pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
 
 #: Smallest number of poses for an identification.
 POSES = 8

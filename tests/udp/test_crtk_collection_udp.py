@@ -26,7 +26,7 @@ from dvrk_drake.recordings.reading import read_recording
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 from dvrk_drake.systems.ros.messages import Empty, JointState, OperatingState  # noqa: E402
 
-pytestmark = [pytest.mark.network, pytest.mark.slow]
+pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
 
 MTML = load_arm("mtml")
 #: Domains of ended tests. Cyclone DDS may crash if a subscription is deleted while its listener is called.

@@ -6,7 +6,7 @@ from ros_publisher import DOMAIN_FILE
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
-pytestmark = [pytest.mark.network, pytest.mark.slow]
+pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
 
 #: Checks in which the arms differ on purpose (docs/ros.md): beginnings of the texts of the console and the simulation.
 DIFFERENCES = {

@@ -16,7 +16,7 @@ from dvrk_drake.systems.station_config import load_station_config, make_arm_stat
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 
-pytestmark = pytest.mark.network
+pytestmark = [pytest.mark.network, pytest.mark.realtime]
 
 
 def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):

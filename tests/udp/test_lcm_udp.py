@@ -35,7 +35,7 @@ from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command import draw_id
 
-pytestmark = pytest.mark.network
+pytestmark = [pytest.mark.network, pytest.mark.realtime]
 
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 #: Options of tests that publish invalid messages, which observers do not read.

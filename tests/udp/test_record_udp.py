@@ -27,6 +27,7 @@ from dvrk_drake.recordings.reading import read_recording
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children
 pytestmark = [
     pytest.mark.network,
+    pytest.mark.realtime,
     pytest.mark.skipif(not (TOOLS / "lcm-logger").exists(), reason=f"no {TOOLS}/lcm-logger: the lcm wheel ships it"),
 ]
 

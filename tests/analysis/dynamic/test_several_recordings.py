@@ -129,6 +129,7 @@ def test_provenance_names_all_recordings(pair):
     assert not dvrk.validate(model, recordings[2]).of_same_recording
 
 
+@pytest.mark.slow
 def test_command_prints_the_error_of_each_recording(days, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, recording in zip("abc", days[2], strict=True):
@@ -188,7 +189,7 @@ def test_friction_at_rest_is_no_offset(days, alone):
     assert np.all(np.abs(error) < 0.2 * effort)
 
 
-@pytest.mark.parametrize("count", [20, 30])
+@pytest.mark.parametrize("count", [30, pytest.param(20, marks=pytest.mark.slow)])
 def test_hysteresis_between_poses_is_no_spring(days, alone, count):
     """Friction along the path between the poses is correlated with the position, like a spring."""
     truth, effort, _ = days

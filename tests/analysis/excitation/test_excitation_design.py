@@ -86,11 +86,12 @@ def test_presliding_with_constant_acceleration():
     assert np.sqrt(np.mean((found - element)[sliding] ** 2)) < 0.03
 
 
+@pytest.mark.slow
 def test_design_meets_limits_and_beats_random_motions(information):
     arm = information.arm
     limits = MotionLimits(margin=0.1, traverse_time=1.5)
-    design = dvrk.design_excitation(arm, duration=8.0, period=PERIOD, harmonics=5, limits=limits, starts=1)
-    assert design.motion.duration == 10.0
+    design = dvrk.design_excitation(arm, duration=12.0, period=PERIOD, harmonics=8, limits=limits, starts=1)
+    assert design.motion.duration == 15.0
     assert motion_violations(design.motion, arm, limits) == []
     own = MotionInformation(arm, limits)
     generator = np.random.default_rng(4)

@@ -7,6 +7,7 @@ import pytest
 from command_output import refusal
 
 import dvrk_drake as dvrk
+from dvrk_drake.analysis.excitation import static_poses
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, tip_positions
 from dvrk_drake.analysis.excitation.static_poses import (
@@ -23,6 +24,14 @@ from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, approaches
 from dvrk_drake.recordings.pose_file import load_poses
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pool():
+    """Selects from 150 instead of 1500 random poses."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(static_poses, "POOL", 150)
+        yield
 
 
 @pytest.fixture(scope="module", params=["mtml", pytest.param("psm", marks=pytest.mark.slow)])
@@ -92,6 +101,7 @@ def test_poses_and_approaches_meet_the_limits(information, design):
     assert first_collision(arm, design.poses) is None
 
 
+@pytest.mark.slow
 def test_path_above_a_table_has_no_collision():
     arm = dvrk.load_arm("psm")
     limits = MotionLimits(margin=MARGIN, positions={"insertion": (0.05, 0.2)}, environment=Environment(-0.15))
@@ -163,7 +173,7 @@ def test_order_avoids_blocked_paths():
         (
             10,
             MotionLimits(environment=Environment(0.0)),
-            "only 0 of 4500 random poses meet all limits, but 10 poses are required",
+            "only 0 of 450 random poses meet all limits, but 10 poses are required",
         ),
         (10, MotionLimits(positions={"roll": (0.0, 0.1)}), "position limit at the start of an approach"),
         (10, MotionLimits(positions={"rol": (0.0, 0.1)}), 'unknown joint "rol"'),

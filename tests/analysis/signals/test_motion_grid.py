@@ -114,6 +114,7 @@ def test_folds_of_an_aperiodic_motion_are_contiguous(grid):
     assert np.all(np.diff(fold) >= 0)
     np.testing.assert_allclose(np.bincount(fold), len(fold) / 5, atol=1)
     slow = SimpleNamespace(arm=ARM, q=np.linspace(0, 1, 4000)[:, None] * np.ones(N))
+    slow.longest_segment = slow
     assert period_of(slow) is None
 
 

@@ -66,6 +66,7 @@ def true_torque(arm, ground_truth_arm, poses):
     return tau
 
 
+@pytest.mark.slow
 def test_true_torque_is_identified_with_the_closed_linkage(arm, ground_truth_arm, recording):
     np.testing.assert_allclose(recording.tau, true_torque(arm, ground_truth_arm, recording.q), atol=1e-3)
     model = identify_static(recording, arm).model
@@ -79,6 +80,7 @@ def test_true_torque_is_identified_with_the_closed_linkage(arm, ground_truth_arm
     assert "joint.yaw cable sine 1" not in found
 
 
+@pytest.mark.slow
 def test_commands_accept_a_psm(arm, recording, tmp_path, capsys):
     poses, model, prediction, errors = (tmp_path / n for n in ("poses.csv", "model.yaml", "tau.csv", "errors.json"))
     write_recording(recording, poses)
@@ -112,6 +114,7 @@ def test_long_parameter_names_keep_all_digits(capsys):
         (lambda r: Recording(q=r.q, tau=r.tau + 1000 * np.eye(7)[2]), "insertion (tau3) exceed its limit of 9.88"),
     ],
 )
+@pytest.mark.slow
 def test_bad_recordings_are_rejected_in_one_line(recording, tmp_path, capsys, spoil, message):
     path, model = tmp_path / "bad.csv", tmp_path / "model.yaml"
     write_recording(spoil(recording), path)

@@ -129,6 +129,7 @@ def test_demo_prints_verdict_and_next_commands(result, held):
     assert f"dvrk-drake identify {folder}/poses.csv --arm mtml" in text and "--report report.html" in text
 
 
+@pytest.mark.slow
 def test_mean_of_both_approaches_cancels_friction():
     arm = load_arm("mtml")
     poses = arm.sample_poses(2, np.random.default_rng(4), margin=0.2)
