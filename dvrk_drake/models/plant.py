@@ -158,7 +158,7 @@ def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]
 
     The inertial parameters are those of the SDF files.
     """
-    plant = make_arm_plant(arm)
+    plant = shared_plant(arm)
     context = plant.CreateDefaultContext()
     tau = np.empty(poses.shape)
     for row, q in enumerate(poses):

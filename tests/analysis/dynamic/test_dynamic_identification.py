@@ -275,7 +275,8 @@ def test_plants_and_conversions_are_computed_once(case, monkeypatch):
     monkeypatch.setattr(Arm.effect_coordinates, "func", counted("coordinates", Arm.effect_coordinates.func))
     identify_dynamic([dataclasses.replace(recording)], new)
     assert made["inverses"] == 1
-    assert 1 <= made["plants"] <= 2 and 1 <= made["coordinates"] <= 2
+    assert 1 <= made["plants"] <= 2
+    assert 1 <= made["coordinates"] <= 2
     assert recording.in_actuator_coordinates(arm) is recording.in_actuator_coordinates(arm)
     assert recording.in_actuator_coordinates(arm).in_joint_coordinates(arm) is recording
 
