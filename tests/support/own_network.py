@@ -27,6 +27,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from multiprocessing import forkserver
 from pathlib import Path
 
@@ -102,7 +103,10 @@ def pytest_runtest_protocol(item):
         if not item.get_closest_marker("watchdog") and delay < STALL_TIME:
             break
         retries.append(item.name)
-        reports, delay = _Process([item]).results(item)
+        following = process.pending
+        process.stop()
+        process = stash[_PROCESS] = _Process([item, *following])
+        reports, delay = process.results(item)
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
@@ -123,26 +127,38 @@ class _Process:
         # The parent of a deadman process is a bridge, which a test may kill. Then this process becomes its parent.
         _LIBC.prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._others = set(_children())
-        self._receiver, sender = multiprocessing.Pipe(duplex=False)
+        self._connection, other_end = multiprocessing.Pipe()
         self._pid = os.fork()
         if self._pid == 0:
-            self._run(items, sender)
+            self._connection.close()
+            self._run(items, other_end)
             os._exit(0)
-        sender.close()
+        other_end.close()
 
     def results(self, item):
-        """Returns the reports of the next test, and the longest delay of a sleeping thread meanwhile [s]."""
+        """Runs the next test. Returns its reports, and the longest delay of a sleeping thread meanwhile [s].
+
+        No test begins before, so none runs beside the repetition of another one.
+        """
         assert item is self.pending.pop(0)
         try:
-            data, delay = self._receiver.recv()
+            self._connection.send(True)
+            data, delay = self._connection.recv()
             reports = [item.config.hook.pytest_report_from_serializable(config=item.config, data=each) for each in data]
-        except EOFError:
+        except (EOFError, OSError):
             self.pending = []
             problem = f"the process of the test ended: {self._end()}"
             return [pytest.TestReport(item.nodeid, item.location, {}, "failed", problem, "call")], 0.0
         if not self.pending:
             self._end()
         return reports, delay
+
+    def stop(self):
+        """Ends the process without its pending tests."""
+        if self.pending:
+            self.pending = []
+            self._connection.send(False)
+            self._end()
 
     def _end(self):
         """Waits for the end of the process, ends processes that remain, and returns the exit code."""
@@ -153,7 +169,7 @@ class _Process:
         return os.waitstatus_to_exitcode(status)
 
     @staticmethod
-    def _run(items, sender):
+    def _run(items, connection):
         try:
             enter_network()
         except OSError as error:
@@ -163,11 +179,15 @@ class _Process:
         # The fork server is a child of the parent, so this process cannot wait for it.
         forkserver._forkserver.ensure_running = lambda: None
         for item, following in zip(items, [*items[1:], items[0].session], strict=True):
+            if not connection.recv():
+                with suppress(Exception):  # a fixture of the failed test may be damaged
+                    item.session._setupstate.teardown_exact(item.session)
+                return
             with _LongestDelay() as delay:
                 reports = runtestprotocol(item, log=False, nextitem=following)
             hook = item.config.hook
             data = [hook.pytest_report_to_serializable(config=item.config, report=report) for report in reports]
-            sender.send((data, delay.seconds))
+            connection.send((data, delay.seconds))
 
 
 class _LongestDelay:

@@ -173,7 +173,7 @@ def test_order_avoids_blocked_paths():
         (
             10,
             MotionLimits(environment=Environment(0.0)),
-            "only 0 of 450 random poses meet all limits, but 10 poses are required",
+            "only 0 of 4050 random poses meet all limits, but 10 poses are required",
         ),
         (10, MotionLimits(positions={"roll": (0.0, 0.1)}), "position limit at the start of an approach"),
         (10, MotionLimits(positions={"rol": (0.0, 0.1)}), 'unknown joint "rol"'),
