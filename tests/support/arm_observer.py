@@ -87,10 +87,10 @@ class Observer:
 
 
 def check_clock(statuses):
-    """Checks that an arm sends one status per millisecond of its clock. UDP may lose some if the computer is busy."""
+    """Checks that an arm sends one status every 2 ms of its clock. UDP may lose some if the computer is busy."""
     steps = np.diff([status.sequence for status in statuses])
     assert np.all(steps >= 1)
-    np.testing.assert_array_equal(np.diff([status.utime for status in statuses]), 1000 * steps)
+    np.testing.assert_array_equal(np.diff([status.utime for status in statuses]), 2000 * steps)
 
 
 def is_holding(status):

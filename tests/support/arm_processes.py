@@ -16,7 +16,8 @@ from dvrk_drake import cli
 
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
-#: Driver configuration with long timeouts, suitable for a busy computer.
+#: Driver configurations at 500 Hz: with default timeouts, and with long ones, suitable for a busy computer.
+HALF_RATE_DRIVER = Path(__file__).with_name("half_rate_driver.yaml")
 LONG_TIMEOUT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
 
 # The fork server imports the modules to compile from this path.
@@ -98,6 +99,9 @@ def dvrk_drake(*arguments):
 
 
 def start_arm(name, *options):
+    """Starts an arm at its pose of `POSES`. The default driver is `HALF_RATE_DRIVER`."""
+    if "--driver" not in options:
+        options += "--driver", HALF_RATE_DRIVER
     return dvrk_drake("arm", "--arm", name, "--realtime", *options, "--pose", *POSES[name])
 
 

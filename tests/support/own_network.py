@@ -131,8 +131,10 @@ class _Process:
         self._pid = os.fork()
         if self._pid == 0:
             self._connection.close()
-            self._run(items, other_end)
-            os._exit(0)
+            try:
+                self._run(items, other_end)
+            finally:
+                os._exit(0)
         other_end.close()
 
     def results(self, item):
@@ -179,7 +181,11 @@ class _Process:
         # The fork server is a child of the parent, so this process cannot wait for it.
         forkserver._forkserver.ensure_running = lambda: None
         for item, following in zip(items, [*items[1:], items[0].session], strict=True):
-            if not connection.recv():
+            try:
+                may_start = connection.recv()
+            except EOFError:  # pytest ends at a failure
+                may_start = False
+            if not may_start:
                 with suppress(Exception):  # a fixture of the failed test may be damaged
                     item.session._setupstate.teardown_exact(item.session)
                 return

@@ -43,7 +43,7 @@ THIRD_URL = "udpm://239.255.76.67:7669?ttl=0"
 #: Options of an arm with long timeouts; its expiry [s] and a margin, after which it releases a silent sender.
 PATIENT, FORGOTTEN = ("--driver", LONG_TIMEOUT_DRIVER), 0.6
 #: Speed at which logs are played: the network loses nothing when a busy computer delays the player.
-SLOWLY = 0.2
+SLOWLY = 0.5
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
 
 
@@ -131,7 +131,7 @@ def test_command_and_status_round_trip(arm):
 @pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_arm_holds_after_controller_is_killed(name, tmp_path):
     """Tests the expiry by the arm's clock and, with real-time scheduling, by the wall clock."""
-    (tmp_path / "driver.yaml").write_text("guard: {resume_automatically: true}\n")
+    (tmp_path / "driver.yaml").write_text("status_period: 0.002\nguard: {resume_automatically: true}\n")
     observer = Observer(name, OTHER_URL)
     arm = start_arm(name, "--lcm-url", OTHER_URL, "--driver", tmp_path / "driver.yaml")
     controller = start_controller(name, "--lcm-url", OTHER_URL)
@@ -253,7 +253,7 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     assert all(map(accepts_efforts, acting))
     steps = np.diff([status.sequence for status in acting])[:, None]
     efforts = np.array([status.effort_commanded for status in acting])
-    assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * steps * load_arm(name).effort_limits)
+    assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.02 * steps * load_arm(name).effort_limits)
     held = observer.received[observer.until(is_holding, "hold", begun)]
     assert held.num_expired == expired  # it received HOLD and no command expired
     assert drift(*observer.during(0.1)) < 1e-3
@@ -514,6 +514,7 @@ def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
     assert all(command.status_utime <= 10**15 + 600_000_000 for command in arm.commands)
 
 
+@pytest.mark.watchdog
 def test_first_of_two_controllers_stays_in_control(arm):
     name, _, observer = arm
     first = start_controller(name)
