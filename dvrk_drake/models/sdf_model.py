@@ -71,6 +71,11 @@ class SdfFacts:
     frame_names: frozenset[str]
 
 
+def is_in_degrees(pose: ElementTree.Element) -> bool:
+    """Returns whether the angles of an SDF pose are in degrees."""
+    return pose.get("degrees", "").lower() in ("true", "1")
+
+
 def local_path(url: str) -> Path:
     """Returns the path for a package URL; a path is returned unchanged."""
     return MODELS_FOLDER / url.removeprefix(PACKAGE_URL) if url.startswith(PACKAGE_URL) else Path(url)
@@ -220,9 +225,7 @@ def _numbers_of(where: str, name: str, text: str, element: ElementTree.Element) 
     values = [_number(word) for word in text.split()]
     allowed = [_RANGES[name]] * len(values)
     if name == "pose":
-        allowed[3:] = [_POSE_DEGREES if element.get("degrees", "").lower() in ("true", "1") else _POSE_ANGLES] * len(
-            values[3:]
-        )
+        allowed[3:] = [_POSE_DEGREES if is_in_degrees(element) else _POSE_ANGLES] * len(values[3:])
     are_numbers = all(math.isfinite(v) or v in a for v, a in zip(values, allowed, strict=True))
     if len(values) not in counts or not are_numbers:
         number = "a finite number" if counts == (1,) else f"{counts[0]} finite numbers"

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, read_sdf_facts
+from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, is_in_degrees, read_sdf_facts
 
 #: Speed limit of joints for which the SDF has no speed limit [rad/s, m/s]. URDF requires a speed limit.
 NO_SPEED_LIMIT = "1000"
@@ -198,9 +198,7 @@ def _pose(element: ElementTree.Element) -> RigidTransform:
     if not is_euler:
         x, y, z, w = angles / np.linalg.norm(angles)
         return RigidTransform(Quaternion(w, x, y, z), p)
-    return RigidTransform(
-        RollPitchYaw(np.deg2rad(angles) if pose.get("degrees", "").lower() in ("true", "1") else angles), p
-    )
+    return RigidTransform(RollPitchYaw(np.deg2rad(angles) if is_in_degrees(pose) else angles), p)
 
 
 def _add_origin(element: ElementTree.Element, X: RigidTransform) -> None:

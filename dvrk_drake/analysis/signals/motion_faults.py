@@ -11,7 +11,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_RANGE, MIN_RATE, MIN_ROWS, REST_SPEED, Recording
 
 #: Smallest share of rows in which a signal jumps and returns, for the signals of two sources. If the rows of two
-#: sources follow in random order, the share is 25 %. The share of independent noise in most channels is below 1 %.
+#: sources follow in random order, the share is 25 %. Noise rarely returns in more than half of the channels at once.
 MIN_RETURNS = 0.15
 #: A channel returns if the distance of the rows before and after is at most the first share of both jumps. Jumps are
 #: larger than the second share of the range of the channel, so that quantisation does not count.
