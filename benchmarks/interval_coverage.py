@@ -16,7 +16,7 @@ import numpy as np
 from dvrk_drake.analysis.static.effect_selection import StaticProblem
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 
@@ -40,7 +40,7 @@ def main() -> int:
     )
     options = parser.parse_args()
     arm = load_arm("mtmr")
-    truth = compile_static_model(arm, tuple(TRUE_EFFECTS))
+    truth = static_model(arm, tuple(TRUE_EFFECTS))
     beta = truth.gravity.base_values
     theta = np.array([*beta, *TRUE_EFFECTS.values()])
     base, effects, correct, spurious = [], [], [], 0

@@ -2,27 +2,26 @@
 
 An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`). The coordinate is the position of an
 actuator, the position of a joint, or a combination of joint positions that the arm's files define. The effect adds
-coefficient * shape(x, v, state) to the effort along its coordinate. A shape that depends only on position is defined by
-an expression. A shape that depends on velocity or on a state is computed step by step.
+coefficient * shape(x, v, state) to the effort along its coordinate, see `effect_step`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.dynamics.compiled import compiled
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 
-if TYPE_CHECKING:
-    import sympy
+#: What an effect is: friction that is independent of speed, friction that is proportional to speed, a function of
+#: position, or a constant. The last two also act at rest, where their effort is unique, unlike that of friction.
+Role = Literal["dry", "viscous", "position", "offset"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +31,8 @@ class EffectKind:
     Attributes:
         unit: Unit of the coefficient for a revolute coordinate. For a prismatic coordinate, N replaces N m and m
             replaces rad.
+        code: Code of the kind in `effect_step`.
+        role: What the effect is.
         scale: Meaning of `ActuatorEffect.scale` for this kind, or "" if the kind has no scale.
         dissipative: True if the effect dissipates energy in all motions. The coefficient of such an effect must not be
             negative.
@@ -39,69 +40,62 @@ class EffectKind:
         loaded: True if the shape is multiplied by the load, which is the magnitude of the effort that the drive
             transmits along the coordinate [N m, N], see `DynamicModel.transmitted_effort`.
         position_power: Exponent k of the factor |x|^k by which the shape is multiplied.
-        code: Code of the kind in `effect_step`. It is 0 for kinds that depend on position only.
-        position_shape: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None.
-            Effects of such a kind also act at rest. The argument f provides sin, cos, Min and Max for numbers or
-            symbols.
     """
 
     unit: str
+    code: int
+    role: Role
     scale: str = ""
     dissipative: bool = False
     revolute: bool = False
     loaded: bool = False
     position_power: int = 0
-    code: int = 0
-    position_shape: Callable[[Any, Any, Any], Any] | None = None
 
 
 _WIDTH = "speed at which the smoothed sign is 0.76 [rad/s, m/s]"
+_TRAVEL = "travel before sliding [rad, m]"
+_PERIODS = "number of periods per revolution"
 #: Name -> kind of effect.
 EFFECT_KINDS: dict[str, EffectKind] = {
     # Cable preload or offset of the motor current.
-    "offset": EffectKind("N m", position_shape=lambda f, x, scale: 1),
-    "viscous": EffectKind("N m s/rad", dissipative=True, code=1),
-    "coulomb": EffectKind("N m", _WIDTH, dissipative=True, code=2),
-    "coulomb forward": EffectKind("N m", _WIDTH, code=3),
-    "stribeck": EffectKind("N m", _WIDTH, code=4),
-    "presliding": EffectKind("N m", "travel before sliding [rad, m]", dissipative=True, code=5),
-    "presliding forward": EffectKind("N m", "travel before sliding [rad, m]", code=6),
+    "offset": EffectKind("N m", 0, "offset"),
+    "viscous": EffectKind("N m s/rad", 1, "viscous", dissipative=True),
+    "coulomb": EffectKind("N m", 2, "dry", _WIDTH, dissipative=True),
+    "coulomb forward": EffectKind("N m", 3, "dry", _WIDTH),
+    "stribeck": EffectKind("N m", 4, "dry", _WIDTH),
+    "presliding": EffectKind("N m", 5, "dry", _TRAVEL, dissipative=True),
+    "presliding forward": EffectKind("N m", 6, "dry", _TRAVEL),
     # Friction of gears and cables, which increases with the load.
-    "load coulomb": EffectKind("1", _WIDTH, dissipative=True, loaded=True, code=2),
+    "load coulomb": EffectKind("1", 2, "dry", _WIDTH, dissipative=True, loaded=True),
     # Friction of cable pulleys, whose angle of wrap changes with the position.
-    "position coulomb": EffectKind("N m/rad", _WIDTH, dissipative=True, position_power=1, code=2),
-    "position^2 coulomb": EffectKind("N m/rad^2", _WIDTH, dissipative=True, position_power=2, code=2),
-    # The torque is constant outside the range of the recording, because a linear extrapolation would be unbounded.
-    "spring": EffectKind(
-        "N m/rad",
-        "largest |x| of the linear range [rad, m]",
-        position_shape=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
-    ),
+    "position coulomb": EffectKind("N m/rad", 2, "dry", _WIDTH, dissipative=True, position_power=1),
+    "position^2 coulomb": EffectKind("N m/rad^2", 2, "dry", _WIDTH, dissipative=True, position_power=2),
+    "spring": EffectKind("N m/rad", 7, "position", "largest |x| of the linear range [rad, m]"),
     # A spring or cable that is attached off the axis causes one period per revolution. An eccentric pulley or the
     # strands of a cable cause more periods.
-    "cable sine": EffectKind(
-        "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.sin(s * x)
-    ),
-    "cable cosine": EffectKind(
-        "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.cos(s * x)
-    ),
+    "cable sine": EffectKind("N m", 8, "position", _PERIODS, revolute=True),
+    "cable cosine": EffectKind("N m", 9, "position", _PERIODS, revolute=True),
 }
-_NUMERIC = SimpleNamespace(sin=np.sin, cos=np.cos, Min=np.minimum, Max=np.maximum)
-#: Kinds of effects that depend on position only. Their torque at rest is unique, unlike the torque of friction.
-POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.position_shape is not None)
+#: Kinds of effects that depend on position only.
+POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.role in ("position", "offset"))
 
 
-@numba.njit(cache=True)
-def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
-    """Returns the next state and the shape. The shape is NaN for a kind that depends on position only.
+@compiled
+def effect_step(
+    code: int, z: float, dx: float, x: float, v: float, scale: float
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Returns the next state and the shape, without the load and the power of the position.
 
     Args:
         code: Code of the kind.
         z: State at the previous sample, dimensionless.
         dx: Travel of the coordinate since the previous sample [rad, m].
+        x: Position of the coordinate [rad, m].
         v: Velocity of the coordinate [rad/s, m/s].
         scale: `ActuatorEffect.scale`.
     """
+    if code == 0:
+        return z, 1.0
     if code == 1:
         return z, v
     if code == 2:
@@ -122,7 +116,12 @@ def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple
         # Additional dry friction in the direction +x.
         z = min(max(z + dx / scale, 0.0), 1.0)
         return z, z
-    return z, math.nan
+    if code == 7:
+        # Constant outside the range of the recording, because a linear extrapolation would be unbounded.
+        return z, min(max(x, -scale), scale)
+    if code == 8:
+        return z, math.sin(scale * x)
+    return z, math.cos(scale * x)
 
 
 @dataclass(frozen=True)
@@ -152,18 +151,6 @@ class ActuatorEffect:
         """True if the coefficient must not be negative."""
         return EFFECT_KINDS[self.kind].dissipative
 
-    def position_shape(self, x: sympy.Expr) -> sympy.Expr:
-        """Returns the shape at position x [rad, m] of the coordinate. The kind must be in `POSITION_KINDS`."""
-        import sympy  # Importing sympy takes 0.3 s, and sympy is not needed for motions.
-
-        scale = sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale)
-        return sympy.sympify(self._shape(sympy, x, scale))
-
-    def _shape(self, functions: Any, x: Any, scale: Any) -> Any:
-        shape = EFFECT_KINDS[self.kind].position_shape
-        assert shape is not None, f"{self} depends on more than position"
-        return shape(functions, x, scale)
-
     def step(self, state: float, dx: float, x: float, v: float, load: float = 0.0) -> tuple[float, float]:
         """Returns the next state and the shape, for a simulation.
 
@@ -173,10 +160,8 @@ class ActuatorEffect:
             x, v: Position [rad, m] and velocity of the coordinate.
             load: Magnitude of the effort along the coordinate [N m, N]. Only kinds with `EffectKind.loaded` use it.
         """
-        if self.kind in POSITION_KINDS:
-            return state, float(self._shape(_NUMERIC, x, self.scale))
         kind = EFFECT_KINDS[self.kind]
-        state, shape = effect_step(kind.code, state, dx, v, self.scale)
+        state, shape = effect_step(kind.code, state, dx, x, v, self.scale)
         return state, shape * (load if kind.loaded else 1.0) * abs(x) ** kind.position_power
 
     def column(
@@ -188,19 +173,19 @@ class ActuatorEffect:
             x, v: Positions [rad, m] and velocities (m,) of the coordinate.
             load: Magnitude (m,) of the effort along the coordinate [N m, N], see `step`.
         """
-        if self.kind in POSITION_KINDS:
-            return np.array(np.broadcast_to(self._shape(_NUMERIC, x, self.scale), x.shape), dtype=np.float64)
         kind = EFFECT_KINDS[self.kind]
         shape = _run_effect(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
         return np.asarray(shape * (load if kind.loaded else 1.0) * np.abs(x) ** kind.position_power)
 
 
-@numba.njit(cache=True)
-def _run_effect(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+@compiled
+def _run_effect(
+    code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float
+) -> NDArray[np.float64]:  # pragma: no cover - compiled
     out = np.empty(len(x))
     state, previous = 0.0, x[0]
     for i in range(len(x)):
-        state, out[i] = effect_step(code, state, x[i] - previous, v[i], scale)
+        state, out[i] = effect_step(code, state, x[i] - previous, x[i], v[i], scale)
         previous = x[i]
     return out
 

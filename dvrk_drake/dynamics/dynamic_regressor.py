@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,11 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
-from dvrk_drake.dynamics.gravity_parameters import labelled_bodies, named_lengths
+from dvrk_drake.dynamics.gravity_parameters import link_frames, named_lengths, preference_order
 from dvrk_drake.dynamics.inertial_parameters import (
     PARAMETER_NAMES,
     LinkInertia,
@@ -138,22 +135,7 @@ class DynamicRegressor:
         return tau
 
     def _fill(self, motion: tuple[NDArray, ...], gravity: NDArray, Y: NDArray) -> None:
-        tree = self._tree
-        q, v, vd = motion
-        fill_regressor(
-            q,
-            v,
-            vd,
-            gravity,
-            tree.parents,
-            tree.pose_terms,
-            tree.hinges,
-            tree.G,
-            tree.c,
-            tree.affects,
-            self._rotor_rows,
-            Y,
-        )
+        fill_regressor(*motion, np.array(gravity), self._tree.arrays, self._rotor_rows, Y)
 
     @cached_property
     def _rotor_rows(self) -> NDArray[np.float64]:
@@ -217,13 +199,8 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
         model: Regressor of the arm.
         coupled_rotors: False to exclude the terms that couple two rotors. Real motors have no such terms (see
             `rotor_inertias`). The last columns of the regressor belong to these terms, so p is reduced by their number.
-
-    Raises:
-        ArmError: The arm's SDF has no frames dh_1, dh_2, ...
     """
-    plant = shared_plant(model.arm)
-    bodies = labelled_bodies(plant, "dh")
-    frames = _link_frames(model, plant, bodies)
+    frames = _link_frames(model)
     rotors = [rotor for rotor in model.rotors if coupled_rotors or rotor.actuators[0] == rotor.actuators[1]]
     p = len(model.values) - len(model.rotors) + len(rotors)
     to_links = np.eye(p)
@@ -238,20 +215,15 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
     base = reduce_to_base(
         _regressor_at_random_states(model)[:, :p] @ to_links,
         parameters,
-        _preference_order(parameters, _hinge_axes(plant, model, frames)),
-        _named_coefficients(named_lengths(plant, bodies)),
+        preference_order(parameters, _hinge_axes(model, frames)),
+        _named_coefficients(named_lengths(model.arm, link_frames(model.arm))),
     )
     return DynamicBaseParameters(tuple(parameters), base, to_links)
 
 
-def _link_frames(
-    model: DynamicRegressor, plant: MultibodyPlant, bodies: dict[str, tuple[RigidBody, RigidTransform]]
-) -> list[tuple[str, RigidTransform]]:
-    """Returns the label of each link L of the model, and the pose X_LF of its frame F = dh_<label>.
-
-    For a link without such a frame, F is its SDF frame. The label is then its name without the suffix "_link".
-    """
-    named = {body.name(): (label, X_LF) for label, (body, X_LF) in bodies.items()}
+def _link_frames(model: DynamicRegressor) -> list[tuple[str, RigidTransform]]:
+    """Returns the label of each link L of the model, and the pose X_LF of its frame F; see `link_frames`."""
+    named = {body.name(): (label, X_LF) for label, (body, X_LF) in link_frames(model.arm).items()}
     return [named.get(link.link, (link.link.removesuffix("_link"), RigidTransform())) for link in model.links]
 
 
@@ -263,11 +235,9 @@ def _regressor_at_random_states(model: DynamicRegressor) -> NDArray[np.float64]:
     return model.regressor(q, v, vd).reshape(-1, len(model.values))
 
 
-def _hinge_axes(
-    plant: MultibodyPlant, model: DynamicRegressor, frames: list[tuple[str, RigidTransform]]
-) -> dict[str, int]:
+def _hinge_axes(model: DynamicRegressor, frames: list[tuple[str, RigidTransform]]) -> dict[str, int]:
     """Returns label -> index (0, 1, 2) of the axis of frame F that is parallel to the axis of a revolute joint."""
-    axes = {}
+    plant, axes = shared_plant(model.arm), {}
     for link, (label, X_LF) in zip(model.links, frames, strict=True):
         joints = (plant.get_joint(i) for i in plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().name() == link.link)
@@ -275,32 +245,6 @@ def _hinge_axes(
             axis_L = joint.frame_on_child().GetFixedPoseInBodyFrame().rotation() @ joint.revolute_axis()
             axes[label] = int(np.argmax(np.abs(X_LF.rotation().inverse() @ axis_L)))
     return axes
-
-
-def _preference_order(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
-    """Returns the column indices, with the columns that are preferred for base parameters first.
-
-    Three parameters of a revolute link with axis u can be regrouped with the previous link. They are the mass, the
-    first moment along u and one moment of inertia about an axis perpendicular to u. The order is: link parameters that
-    cannot be regrouped, from tip to base; moments that can be regrouped, from base to tip; rotors; masses, from base to
-    tip. In each group, the links of the linkage follow the numbered links. Reference: Khalil and Dombre, "Modeling,
-    Identification and Control of Robots", 9.4.2.
-    """
-
-    def is_regrouped(p: StandardParameter) -> bool:
-        if not p.axis:
-            return True
-        u = hinge_axes.get(p.label)
-        perpendicular = [axis for axis in range(3) if axis != u]
-        return u is not None and p.axis in ("xyz"[u], 2 * "xyz"[perpendicular[-1]])
-
-    def key(index: int) -> tuple:
-        p = parameters[index]
-        number = int(p.label) if p.label.isdigit() else math.inf
-        rotor = p.axis == "a"
-        return (not p.axis, rotor, is_regrouped(p), number == math.inf, number if is_regrouped(p) else -number, index)
-
-    return sorted(range(len(parameters)), key=key)
 
 
 def _named_coefficients(lengths: dict[str, float]) -> dict[str, float]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,8 @@ from dvrk_drake.dynamics.dynamic_section import (
     SignalSettings,
 )
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
+from dvrk_drake.dynamics.holding_torque import holding_torque_into
+from dvrk_drake.dynamics.static_model import StaticModel, static_model
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
@@ -36,9 +38,6 @@ from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.models.schema_fault import formerly, missing_key, schema_fault, with_current_keys, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
-
-if TYPE_CHECKING:
-    from dvrk_drake.dynamics.static_model import StaticModel
 
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
@@ -375,11 +374,9 @@ class IdentifiedModel(_Identified):
         return np.array([joint.feedforward_scale for joint in self.joints])
 
     @cached_property
-    def static_model(self) -> "StaticModel":
-        """Compiled static model with the parameters `theta`."""
-        from dvrk_drake.dynamics.static_model import compile_static_model  # importing sympy takes 0.3 s
-
-        return compile_static_model(self.arm, tuple(map(ActuatorEffect.of, self.holding_effects)))
+    def static_model(self) -> StaticModel:
+        """Static model with the parameters `theta`."""
+        return static_model(self.arm, tuple(map(ActuatorEffect.of, self.holding_effects)))
 
     @cached_property
     def dynamic_model(self) -> DynamicModel:
@@ -409,7 +406,7 @@ class ControlModel:
     """Gravity effort and mass matrix of an arm, evaluated fast enough for a control loop."""
 
     def __init__(self, model: IdentifiedModel, *, with_gravity: bool = True) -> None:
-        """Compiles the gravity effort of `model` and reads its inertial parameters.
+        """Reads the parameters of `model`.
 
         Args:
             model: Model of the arm with the actual orientation of its base. A model identified from poses has no
@@ -421,8 +418,7 @@ class ControlModel:
             ModelError: The model does not match its arm.
         """
         model.check()
-        self._torque_into = model.static_model.torque_into
-        self._theta = np.ascontiguousarray(model.theta)
+        self._holding = model.static_model.with_parameters(model.theta)
         self._scale = model.feedforward_scale * with_gravity
         if model.dynamics is None:
             self._regressor = DynamicRegressor(model.arm)
@@ -436,7 +432,7 @@ class ControlModel:
         `q` must be C-contiguous.
         """
         effort = np.empty(len(q))
-        self._torque_into(q, self._theta, effort)
+        holding_torque_into(q, self._holding, effort)
         return effort * self._scale
 
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:

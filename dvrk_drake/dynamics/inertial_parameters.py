@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody, SpatialInertia, UnitInertia
+from pydrake.multibody.tree import Joint, RigidBody, SpatialInertia, UnitInertia
 
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
@@ -166,8 +166,28 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
 
 
 def rotor_links(arm: Arm) -> set[str]:
-    """Returns the links without a frame dh_<name>. These links are rotors that are balanced about their axes."""
+    """Returns the links that represent balanced rotors: they carry nothing, and no dh_ frame marks them as a link.
+
+    Only an SDF with DH frames can have such links. Their joint is revolute, and their centre of mass is on its axis, so
+    their rotation does not change the torque of gravity.
+    """
     plant = shared_plant(arm)
     frames = [plant.get_frame(i) for i in plant.GetFrameIndices(plant.GetBodyByName("base_link").model_instance())]
     framed = {frame.body().name() for frame in frames if frame.name().startswith("dh_")}
-    return {body.name() for body in moving_bodies(plant)} - framed
+    if not framed:
+        return set()
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    carriers = {joint.parent_body().name() for joint in joints}
+    bodies = {body.name() for body in moving_bodies(plant)} - framed - carriers
+    return {
+        joint.child_body().name() for joint in joints if joint.child_body().name() in bodies and _is_balanced(joint)
+    }
+
+
+def _is_balanced(joint: Joint) -> bool:
+    """Returns whether the centre of mass of the child is on the axis of a revolute joint, to 1e-9 m (rounding)."""
+    if joint.type_name() != "revolute":
+        return False
+    X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
+    lever = joint.child_body().default_com() - X_CM.translation()
+    return bool(np.linalg.norm(np.cross(lever, X_CM.rotation() @ joint.revolute_axis())) < 1e-9)

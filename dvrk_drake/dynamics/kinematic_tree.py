@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
 
 from dvrk_drake.dynamics.inertial_parameters import moving_bodies
+from dvrk_drake.dynamics.regressor_kernel import TreeArrays
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 
@@ -19,29 +22,27 @@ from dvrk_drake.models.arm import Arm
 class KinematicTree:
     """Moving links C of an arm with their parents P and inboard joints. Each parent precedes its children.
 
-    With the joint coordinate x = G q + c, the same formulas represent revolute, prismatic and fixed joints:
-
-        X_PC(x) = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3,    V_PC_C = H dx/dt.
+    A joint moves its frame Z, which is fixed in C, along or about the z-axis of Z. With the joint coordinate
+    x = G q + c, the pose of a link is X_PC = X_PZ0 X_Z0Z(x) X_CZ^-1. Fixed joints are prismatic joints with x = 0.
 
     Attributes:
         links: Names of the l links.
         parents: Indices (l,) of the parents, -1 for the base.
-        pose_terms: Matrices T0 to T3 (l, 4, 3, 4), each with a rotation part and a translation part [m].
-        hinges: Hinge vectors H (l, 6). They contain the angular velocity of C and the velocity of its origin Co,
-            relative to P, per unit of dx/dt, expressed in C.
+        mounts: Poses X_PZ0 (l, 4, 4) of the joint frames at x = 0 in the parents [m]. For the base, P is its frame.
+        joint_poses: Poses X_CZ (l, 4, 4) of the joint frames in the links.
+        prismatic: Mask (l,) of prismatic and fixed joints.
         G: Matrix (l, n) that maps the independent joint positions q to the joint coordinates. The rows of fixed joints
             are zero.
         c: Offsets (l,) of the joint coordinates [rad, m].
-        affects: Mask (l, n), True where an independent joint moves a link.
     """
 
     links: tuple[str, ...]
     parents: NDArray[np.int64]
-    pose_terms: NDArray[np.float64]
-    hinges: NDArray[np.float64]
+    mounts: NDArray[np.float64]
+    joint_poses: NDArray[np.float64]
+    prismatic: NDArray[np.bool_]
     G: NDArray[np.float64]
     c: NDArray[np.float64]
-    affects: NDArray[np.bool_]
 
     @classmethod
     def from_plant(cls, plant: MultibodyPlant, arm: Arm) -> KinematicTree:
@@ -59,19 +60,48 @@ class KinematicTree:
             if joint.name() in arm.tree_joint_names:
                 index = arm.tree_joint_names.index(joint.name())
                 G[row], c[row] = arm.linkage.matrix[index], arm.linkage.offset[index]
-        parent_rows = [links.index(parent) if parent in links else -1 for parent in parents]
-        affects = G != 0
-        for row, parent in enumerate(parent_rows):
-            affects[row] |= affects[parent] if parent >= 0 else False
+        frames = [_joint_frames(plant, joint) for joint in joints]
         return cls(
             links=links,
-            parents=np.array(parent_rows),
-            pose_terms=np.array([_pose_terms(plant, joint) for joint in joints]),
-            hinges=np.array([_hinge(joint) for joint in joints]),
+            parents=np.array([links.index(parent) if parent in links else -1 for parent in parents]),
+            mounts=np.array([X_PZ0.GetAsMatrix4() for X_PZ0, _ in frames]),
+            joint_poses=np.array([X_CZ.GetAsMatrix4() for _, X_CZ in frames]),
+            prismatic=np.array([joint.type_name() != "revolute" for joint in joints]),
             G=G,
             c=c,
-            affects=affects,
         )
+
+    def in_frames(self, poses: Sequence[RigidTransform]) -> KinematicTree:
+        """Returns the tree with other link frames F. `poses` contains the pose X_LF of F in each link frame L."""
+        X_FL = np.array([pose.inverse().GetAsMatrix4() for pose in poses])
+        carriers = np.array([X_FL[parent] if parent >= 0 else np.eye(4) for parent in self.parents])
+        return replace(self, mounts=carriers @ self.mounts, joint_poses=X_FL @ self.joint_poses)
+
+    def without(self, links: Collection[str]) -> KinematicTree:
+        """Returns the tree without some links, which must not carry other links."""
+        kept = [i for i, link in enumerate(self.links) if link not in links]
+        arrays = {name: getattr(self, name)[kept] for name in ("mounts", "joint_poses", "prismatic", "G", "c")}
+        parents = np.array([kept.index(parent) if parent >= 0 else -1 for parent in self.parents[kept]])
+        return KinematicTree(tuple(self.links[i] for i in kept), parents, **arrays)
+
+    @cached_property
+    def arrays(self) -> TreeArrays:
+        """Arrays for compiled functions."""
+        affects = self.G != 0
+        for row, parent in enumerate(self.parents):
+            affects[row] |= affects[parent] if parent >= 0 else False
+        # X_Z0Z is 1 + sin(x) K + (1 - cos(x)) K^2 for a rotation (Rodrigues), where K is the cross product matrix of z.
+        terms, H = np.zeros((len(self.links), 4, 4, 4)), np.zeros((len(self.links), 6))
+        terms[:, 0] = np.eye(4)
+        revolute = ~self.prismatic
+        terms[revolute, 1, :2, :2], terms[revolute, 2, :2, :2] = [[0, -1], [1, 0]], -np.eye(2)
+        terms[self.prismatic, 3, 2, 3] = 1.0
+        X_ZC = np.linalg.inv(self.joint_poses)
+        axes, points = self.joint_poses[:, :3, 2], self.joint_poses[:, :3, 3]
+        H[revolute, :3], H[revolute, 3:] = axes[revolute], np.cross(points, axes)[revolute]
+        H[self.prismatic, 3:] = axes[self.prismatic]
+        pose_terms = self.mounts[:, None] @ terms @ X_ZC[:, None]
+        return TreeArrays(self.parents, np.ascontiguousarray(pose_terms[:, :, :3]), H, self.G, self.c, affects)
 
 
 def _joints(plant: MultibodyPlant) -> list[Joint]:
@@ -94,43 +124,20 @@ def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ..
     return tuple(ordered)
 
 
-def _axis(joint: Joint) -> NDArray[np.float64]:
-    """Returns the unit axis (3,) of a joint in the joint frames F and M, or zero for a fixed joint."""
+def _joint_frames(plant: MultibodyPlant, joint: Joint) -> tuple[RigidTransform, RigidTransform]:
+    """Returns X_PZ0 and X_CZ of a joint. The world frame replaces P if the parent is anchored."""
     match joint.type_name():
         case "revolute":
-            return joint.revolute_axis()
+            axis = joint.revolute_axis()
         case "prismatic":
-            return joint.translation_axis()
+            axis = joint.translation_axis()
         case "weld":
-            return np.zeros(3)
-    raise ArmError(f"joint {joint.name()} is {joint.type_name()}; allowed: revolute, prismatic, fixed")
-
-
-def _pose_terms(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
-    """Returns T0 to T3 (4, 3, 4) of X_PC = X_PF X_FM(x) X_MC. The world frame replaces P if the parent is anchored."""
-    X_FM = joint.X_FM() if joint.type_name() == "weld" else RigidTransform()
-    X_PF, X_MC = _pose_in_parent(plant, joint), joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-    x, y, z = _axis(joint)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    terms = np.zeros((4, 4, 4))
-    terms[0] = X_FM.GetAsMatrix4()
-    if joint.type_name() == "revolute":  # Rodrigues' formula R = 1 + sin(x) K + (1 - cos(x)) K^2
-        terms[1, :3, :3], terms[2, :3, :3] = K, K @ K
-    if joint.type_name() == "prismatic":
-        terms[3, :3, 3] = x, y, z
-    return np.array([(X_PF.GetAsMatrix4() @ term @ X_MC.GetAsMatrix4())[:3] for term in terms])
-
-
-def _pose_in_parent(plant: MultibodyPlant, joint: Joint) -> RigidTransform:
+            axis = [0.0, 0.0, 1.0]
+        case kind:
+            raise ArmError(f"joint {joint.name()} is {kind}; allowed: revolute, prismatic, fixed")
+    X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
     if plant.IsAnchored(joint.parent_body()):
-        return joint.frame_on_parent().CalcPoseInWorld(plant.CreateDefaultContext())
-    return joint.frame_on_parent().GetFixedPoseInBodyFrame()
-
-
-def _hinge(joint: Joint) -> NDArray[np.float64]:
-    """Returns H (6,), the spatial velocity V_PC_C of frame C per unit of dx/dt."""
-    X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
-    axis_C = X_CM.rotation() @ _axis(joint)
-    if joint.type_name() == "prismatic":
-        return np.concatenate([np.zeros(3), axis_C])
-    return np.concatenate([axis_C, np.cross(X_CM.translation(), axis_C)])
+        X_PF = joint.frame_on_parent().CalcPoseInWorld(plant.CreateDefaultContext())
+    X_FM0 = joint.X_FM() if joint.type_name() == "weld" else RigidTransform()
+    X_MZ = RigidTransform(RotationMatrix.MakeFromOneVector(axis, 2))
+    return X_PF @ X_FM0 @ X_MZ, joint.frame_on_child().GetFixedPoseInBodyFrame() @ X_MZ

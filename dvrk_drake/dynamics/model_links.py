@@ -15,8 +15,9 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import (
     LinkInertia,
     parameters_from_pseudo_inertia,
+    rotor_links,
 )
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
@@ -42,14 +43,15 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
 
     Args:
         arm: Arm of the links.
-        base_values: Values (b,) of the base parameters `derive_gravity(arm).base`.
+        base_values: Values (b,) of the base parameters `gravity_parameters(arm).base`.
 
     Raises:
         ModelError: No physically consistent links have these base parameters, or the solver did not converge.
     """
     regressor = DynamicRegressor(arm)
-    # The parameters phi of a link are a linear function of the ten elements z of Z. Rotors are not changed.
-    maps = {i: _parameter_map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
+    # The parameters phi of a link are a linear function of the ten elements z of Z. Balanced rotors are not changed.
+    rotors = rotor_links(arm)
+    maps = {i: _parameter_map(link) for i, link in enumerate(regressor.links) if link.link not in rotors}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
     if _least_eigenvalue(z) < MIN_EIGENVALUE_RATIO:
@@ -68,17 +70,6 @@ def _parameter_map(link: LinkInertia) -> NDArray[np.float64]:
     return np.column_stack([parameters_from_pseudo_inertia(L @ _symmetric(e) @ L.T) for e in np.eye(10)])
 
 
-def _is_rotor(arm: Arm, link: str) -> bool:
-    """Returns whether a link has no frame dh_<name>.
-
-    Such a link is a rotor. The centre of mass of a rotor is on its axis (see `GravityParameters`) and must remain on
-    this axis.
-    """
-    plant = shared_plant(arm)
-    frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
-    return not any(f.name().startswith("dh_") and f.body().name() == link for f in frames)
-
-
 def _equations(
     regressor: DynamicRegressor, maps: dict[int, NDArray[np.float64]], base_values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -92,7 +83,7 @@ def _equations(
     Y = Y.reshape(-1, Y.shape[2])
     fixed = np.repeat([i not in maps for i in range(len(regressor.links))], 10)
     fixed = np.append(fixed, np.zeros(len(regressor.rotors), dtype=bool))
-    tau = (compile_static_model(arm).regressor(q) @ base_values).ravel() - Y[:, fixed] @ regressor.values[fixed]
+    tau = (static_model(arm).regressor(q) @ base_values).ravel() - Y[:, fixed] @ regressor.values[fixed]
     A = np.hstack([Y[:, 10 * i : 10 * i + 10] @ T for i, T in maps.items()])
     U, s, Vt = np.linalg.svd(A, full_matrices=False)
     rank = int(np.sum(s > 1e-9 * s[0]))

@@ -1,206 +1,223 @@
-"""Compiled recursion over the links of an arm, for the dynamic regressor. All arms use the same compiled code.
+"""Compiled recursion over the links of an arm: regressor of the dynamics, and regressor at rest.
 
-The recursion processes blocks of `BLOCK` samples. Each quantity of the recursion is a row of `BLOCK` samples, so that
-the compiler can vectorise the loops over a block. The compiler vectorises a loop only if it can prove that rows do not
-overlap and indices are not negative. Therefore each loop writes to only one array. Sample s of row k is at index
-k * BLOCK + s.
+All arms use the same compiled code. The arrays of a `KinematicTree` describe the arm. A link C has the parent P and the
+pose X_PC = (R, p). Its motion and its hinge are expressed in C:
+
+    V_C = X V_P + H dx/dt,    A_C = X A_P + H d2x/dt2 + V_C x H dx/dt,    J_C = X J_P + H G.
+
+Here, x = G q + c is the joint coordinate of the link, V = (w, u) and A = (dw, du) are the spatial velocity and
+acceleration of C, and column j of J is the spatial velocity per unit rate of the independent joint j. X transforms
+spatial vectors from P to C. A torque is linear in the mass m, the first moment h and the inertia I of each link, about
+its origin Co. With the acceleration a = du + w x u of Co, the link needs
+
+    force  m a + dw x h + w x (w x h)    and moment  h x a + I dw + w x I w    about Co.
+
+Gravity is represented by an upward acceleration of the base. At rest, most of this is zero; see
+`fill_gravity_regressor`. Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008), 5.3.
+
+The regressors process blocks of `BLOCK` samples. Each number of the recursion is a row with its values for all samples
+of a block, so that the compiler can vectorise the loops over a block. It does so only if each loop writes to one array.
+Row k of an array `rows` begins at index k * BLOCK, because the compiler must know the distance of two rows.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.trigonometry import sin_cos
+from dvrk_drake.dynamics.compiled import (
+    add,
+    compiled,
+    compiled_for,
+    cross,
+    dot,
+    scale,
+    sin_cos,
+    times,
+    transposed_times,
+)
 
 #: Number of samples per block. It is large enough for vector instructions, and small enough that the rows of a block
 #: fit into fast caches.
 BLOCK = 64
+#: First rows of the vectors in the rows of a link: w, u, dw, du and a.
+_W, _U, _DW, _DU, _A = 0, 3, 6, 9, 12
+#: Number of rows of a link, of the Jacobian column (w, u) of a joint, and of a pose (three rows of R, then p).
+_LINK_ROWS, _JACOBIAN_ROWS, _POSE_ROWS = 15, 6, 12
+#: Rows of a joint coordinate: x, sin(x), 1 - cos(x), dx/dt and d2x/dt2. The last two are 0 at rest.
+_X, _SINE, _VERSINE, _RATE, _ACCELERATION, _JOINT_ROWS = 0, 1, 2, 3, 4, 5
 
-# "contract" allows fused multiply-add instructions, which round once instead of twice.
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
+class TreeArrays(NamedTuple):
+    """Arrays of a `KinematicTree` with l links and n independent joints, for compiled functions.
 
-@_compiled
-def fill_regressor(
-    q, v, vd, gravity, parents, pose_terms, hinges, G, c, affects, rotors, out
-):  # pragma: no cover - compiled
-    """Computes the regressor (m, n, 10 l + r) of an arm with n independent joints, l links and r rotor parameters.
-
-    From base to tip, the recursion computes three quantities of each link in the link frame. These are the spatial
-    velocity V, the spatial acceleration A, and the spatial velocity J_j per unit rate of each independent joint j. The
-    wrench f about the link's origin is linear in the ten parameters of the link. The torque of joint j due to the link
-    is J_j' f. Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008), 5.3.
-
-    Args:
-        q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
-        gravity: Gravity vector (3,) in the base frame [m/s^2].
-        parents, pose_terms, hinges, G, c, affects: Attributes of `KinematicTree`.
-        rotors: Rows a and b (r, 2, n) of the rotor parameters. Per unit of a parameter, the torque is
-            a (b . vd) + b (a . vd).
-        out: Array that receives the regressor. Previous values are overwritten.
+    Attributes:
+        parents: Indices (l,) of the parents, -1 for the base.
+        pose_terms: Matrices T0 to T3 (l, 4, 3, 4), each with a rotation part and a translation part [m]. The pose of a
+            link is X_PC = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3.
+        hinges: Hinge vectors H (l, 6). They contain the angular velocity of C and the velocity of its origin Co,
+            relative to P, per unit of dx/dt, expressed in C.
+        G, c: Matrix (l, n) and offsets (l,) of the joint coordinates x = G q + c.
+        affects: Mask (l, n), True where an independent joint moves a link.
     """
-    num_links, n = G.shape
-    motion = np.zeros((3, n * BLOCK))
-    joint = np.empty(5 * BLOCK)
-    X = np.empty(12 * BLOCK)
-    links = np.empty((num_links, 21 * BLOCK))
-    J = np.empty((num_links, n, 6 * BLOCK))
-    torques = np.empty(10 * BLOCK)
-    # Gravity is represented by an upward acceleration of the base. No joint moves the base.
-    base, fixed = np.zeros(21 * BLOCK), np.zeros(6 * BLOCK)
+
+    parents: NDArray[np.int64]
+    pose_terms: NDArray[np.float64]
+    hinges: NDArray[np.float64]
+    G: NDArray[np.float64]
+    c: NDArray[np.float64]
+    affects: NDArray[np.bool_]
+
+
+_number = numba.float64
+#: Type of `TreeArrays` for compiled functions.
+TREE = numba.types.NamedTuple(
+    (
+        numba.int64[::1],
+        _number[:, :, :, ::1],
+        _number[:, ::1],
+        _number[:, ::1],
+        _number[::1],
+        numba.boolean[:, ::1],
+    ),
+    TreeArrays,
+)
+
+
+@compiled
+def _vector(rows, first, s):  # pragma: no cover - compiled
+    """Returns the vector of sample s whose elements are the three rows from `first` on."""
+    return rows[first * BLOCK + s], rows[(first + 1) * BLOCK + s], rows[(first + 2) * BLOCK + s]
+
+
+@compiled
+def _store(rows, first, s, vector):  # pragma: no cover - compiled
+    """Writes a vector to the three rows from `first` on."""
     for k in range(3):
-        base[(9 + k) * BLOCK : (10 + k) * BLOCK] = -gravity[k]
-    for start in range(0, len(q), BLOCK):
-        part = out[start : start + BLOCK]
-        part.reshape(-1)[:] = 0.0  # Sequential access, which also loads the memory into the cache.
-        _to_rows(q[start : start + BLOCK], motion[0])
-        _to_rows(v[start : start + BLOCK], motion[1])
-        _to_rows(vd[start : start + BLOCK], motion[2])
-        for i in range(num_links):
-            parent = parents[i]
-            _move_joint(G[i], c[i], motion, joint)
-            _pose(pose_terms[i], joint, X)
-            _move_link(X, hinges[i], joint, links[parent] if parent >= 0 else base, links[i])
-            for j in range(n):
-                if affects[i, j]:
-                    J_P = J[parent, j] if parent >= 0 and affects[parent, j] else fixed
-                    _torques(X, hinges[i], G[i, j], J_P, links[i], J[i, j], torques)
-                    _from_rows(torques, part[:, j, 10 * i : 10 * i + 10])
-        for k in range(len(rotors)):
-            _rotor_torques(rotors[k, 0], rotors[k, 1], motion[2], part[:, :, 10 * num_links + k])
+        rows[(first + k) * BLOCK + s] = vector[k]
 
 
-@_compiled
-def _to_rows(samples, rows):  # pragma: no cover - compiled
+@compiled
+def _pose(X, s):  # pragma: no cover - compiled
+    """Returns R and p of sample s."""
+    return (_vector(X, 0, s), _vector(X, 3, s), _vector(X, 6, s)), _vector(X, 9, s)
+
+
+@compiled
+def _to_child(R, p, w, u):  # pragma: no cover - compiled
+    """Transforms a spatial velocity (w, u) from P to C."""
+    return transposed_times(R, w), transposed_times(R, add(u, cross(w, p)))
+
+
+@compiled
+def _hinge(H):  # pragma: no cover - compiled
+    """Returns the angular and the linear part of a hinge vector."""
+    return (H[0], H[1], H[2]), (H[3], H[4], H[5])
+
+
+@compiled
+def _fill_rows(samples, rows):  # pragma: no cover - compiled
     for s in range(len(samples)):
         for k in range(samples.shape[1]):
             rows[k * BLOCK + s] = samples[s, k]
 
 
-@_compiled
-def _from_rows(rows, samples):  # pragma: no cover - compiled
+@compiled
+def _fill_samples(rows, samples):  # pragma: no cover - compiled
     for s in range(len(samples)):
-        for k in range(10):
+        for k in range(samples.shape[1]):
             samples[s, k] = rows[k * BLOCK + s]
 
 
-@_compiled
+@compiled
 def _move_joint(G, c, motion, joint):  # pragma: no cover - compiled
-    """Fills `joint` with the rows x, sin(x), 1 - cos(x), dx/dt and d2x/dt2 of the joint coordinate x = G q + c."""
+    """Fills the rows of the joint coordinate x = G q + c from the rows of q, v and vd, or of q only."""
     joint[:] = 0.0
     for s in range(BLOCK):
-        joint[s] = c
+        joint[_X * BLOCK + s] = c
     for j in range(len(G)):
         g = G[j]
         if g != 0.0:
             for s in range(BLOCK):
-                joint[s] += g * motion[0, j * BLOCK + s]
-                joint[3 * BLOCK + s] += g * motion[1, j * BLOCK + s]
-                joint[4 * BLOCK + s] += g * motion[2, j * BLOCK + s]
+                joint[_X * BLOCK + s] += g * motion[0, j * BLOCK + s]
+            if len(motion) == 3:
+                for s in range(BLOCK):
+                    joint[_RATE * BLOCK + s] += g * motion[1, j * BLOCK + s]
+                    joint[_ACCELERATION * BLOCK + s] += g * motion[2, j * BLOCK + s]
     for s in range(BLOCK):
-        sine, cosine = sin_cos(joint[s])
-        joint[BLOCK + s], joint[2 * BLOCK + s] = sine, 1.0 - cosine
+        sine, cosine = sin_cos(joint[_X * BLOCK + s])
+        joint[_SINE * BLOCK + s], joint[_VERSINE * BLOCK + s] = sine, 1.0 - cosine
 
 
-@_compiled
-def _pose(terms, joint, X):  # pragma: no cover - compiled
-    """Fills X with 12 rows: the pose X_PC (3, 4) of the link in its parent, row by row."""
+@compiled
+def _place_link(terms, joint, X):  # pragma: no cover - compiled
+    """Fills the rows of the pose X_PC = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3."""
     for a in range(3):
         for b in range(4):
             t0, t1, t2, t3 = terms[0, a, b], terms[1, a, b], terms[2, a, b], terms[3, a, b]
-            row = (4 * a + b) * BLOCK
+            row = 3 * a + b if b < 3 else 9 + a
             for s in range(BLOCK):
-                X[row + s] = t0 + t1 * joint[BLOCK + s] + t2 * joint[2 * BLOCK + s] + t3 * joint[s]
+                X[row * BLOCK + s] = (
+                    t0 + t1 * joint[_SINE * BLOCK + s] + t2 * joint[_VERSINE * BLOCK + s] + t3 * joint[_X * BLOCK + s]
+                )
 
 
-@_compiled
-def _to_child(X, s, w0, w1, w2, u0, u1, u2):  # pragma: no cover - compiled
-    """Transforms sample s of a spatial velocity (w, u) from P to C: returns R' w and R' (u + w x p)."""
-    p0, p1, p2 = X[3 * BLOCK + s], X[7 * BLOCK + s], X[11 * BLOCK + s]
-    u0, u1, u2 = u0 + w1 * p2 - w2 * p1, u1 + w2 * p0 - w0 * p2, u2 + w0 * p1 - w1 * p0
-    r0, r1, r2 = X[s], X[4 * BLOCK + s], X[8 * BLOCK + s]
-    wx, ux = r0 * w0 + r1 * w1 + r2 * w2, r0 * u0 + r1 * u1 + r2 * u2
-    r0, r1, r2 = X[BLOCK + s], X[5 * BLOCK + s], X[9 * BLOCK + s]
-    wy, uy = r0 * w0 + r1 * w1 + r2 * w2, r0 * u0 + r1 * u1 + r2 * u2
-    r0, r1, r2 = X[2 * BLOCK + s], X[6 * BLOCK + s], X[10 * BLOCK + s]
-    wz, uz = r0 * w0 + r1 * w1 + r2 * w2, r0 * u0 + r1 * u1 + r2 * u2
-    return wx, wy, wz, ux, uy, uz
-
-
-@_compiled
+@compiled
 def _move_link(X, H, joint, P, C):  # pragma: no cover - compiled
-    """Fills the rows of link C from the rows of its parent P.
-
-    0..5    spatial velocity V, angular then linear
-    6..11   spatial acceleration A = A_P + H d2x/dt2 + V x H dx/dt, where x is the cross product of spatial vectors
-    12..14  acceleration of the origin Co minus gravity: linear part of A plus w x v
-    15..20  elements xx, yy, zz, xy, xz, yz of [w]^2, where [w] is the cross product matrix of w
-    """
-    h0, h1, h2, h3, h4, h5 = H
+    """Fills the rows of link C: V_C, A_C and the acceleration a of its origin, from the rows of its parent P."""
+    H_w, H_u = _hinge(H)
     for s in range(BLOCK):
-        xd, xdd = joint[3 * BLOCK + s], joint[4 * BLOCK + s]
-        wx, wy, wz, ux, uy, uz = _to_child(
-            X, s, P[s], P[BLOCK + s], P[2 * BLOCK + s], P[3 * BLOCK + s], P[4 * BLOCK + s], P[5 * BLOCK + s]
-        )
-        wx, wy, wz, ux, uy, uz = wx + h0 * xd, wy + h1 * xd, wz + h2 * xd, ux + h3 * xd, uy + h4 * xd, uz + h5 * xd
-        dx, dy, dz, ax, ay, az = _to_child(
-            X, s, P[6 * BLOCK + s], P[7 * BLOCK + s], P[8 * BLOCK + s], P[9 * BLOCK + s], P[10 * BLOCK + s],
-            P[11 * BLOCK + s],
-        )  # fmt: skip
-        dx += h0 * xdd + (wy * h2 - wz * h1) * xd
-        dy += h1 * xdd + (wz * h0 - wx * h2) * xd
-        dz += h2 * xdd + (wx * h1 - wy * h0) * xd
-        ax += h3 * xdd + (wy * h5 - wz * h4 + uy * h2 - uz * h1) * xd
-        ay += h4 * xdd + (wz * h3 - wx * h5 + uz * h0 - ux * h2) * xd
-        az += h5 * xdd + (wx * h4 - wy * h3 + ux * h1 - uy * h0) * xd
-        C[s], C[BLOCK + s], C[2 * BLOCK + s] = wx, wy, wz
-        C[3 * BLOCK + s], C[4 * BLOCK + s], C[5 * BLOCK + s] = ux, uy, uz
-        C[6 * BLOCK + s], C[7 * BLOCK + s], C[8 * BLOCK + s] = dx, dy, dz
-        C[9 * BLOCK + s], C[10 * BLOCK + s], C[11 * BLOCK + s] = ax, ay, az
-        C[12 * BLOCK + s] = ax + wy * uz - wz * uy
-        C[13 * BLOCK + s] = ay + wz * ux - wx * uz
-        C[14 * BLOCK + s] = az + wx * uy - wy * ux
-        C[15 * BLOCK + s] = -wy * wy - wz * wz
-        C[16 * BLOCK + s] = -wx * wx - wz * wz
-        C[17 * BLOCK + s] = -wx * wx - wy * wy
-        C[18 * BLOCK + s], C[19 * BLOCK + s], C[20 * BLOCK + s] = wx * wy, wx * wz, wy * wz
+        R, p = _pose(X, s)
+        rate, acceleration = joint[_RATE * BLOCK + s], joint[_ACCELERATION * BLOCK + s]
+        w, u = _to_child(R, p, _vector(P, _W, s), _vector(P, _U, s))
+        w, u = add(w, scale(rate, H_w)), add(u, scale(rate, H_u))
+        dw, du = _to_child(R, p, _vector(P, _DW, s), _vector(P, _DU, s))
+        dw = add(dw, add(scale(acceleration, H_w), scale(rate, cross(w, H_w))))
+        du = add(du, add(scale(acceleration, H_u), scale(rate, add(cross(w, H_u), cross(u, H_w)))))
+        _store(C, _W, s, w)
+        _store(C, _U, s, u)
+        _store(C, _DW, s, dw)
+        _store(C, _DU, s, du)
+        _store(C, _A, s, add(du, cross(w, u)))
 
 
-@_compiled
-def _torques(X, H, factor, J_P, C, J_C, torques):  # pragma: no cover - compiled
-    """Fills J_C and `torques`. The ten rows of `torques` are J_C' f per unit of each parameter of link C.
-
-    J_C' f is the joint torque. J_C is J_P, transformed to C, plus factor * H. `factor` is the element of G for the link
-    and the joint. The wrench f has the force m a + [dw] h + [w]^2 h and the moment h x a + I dw + w x I w. Here, m, h
-    and I are the mass, first moment and inertia of the link, w and dw are its angular velocity and acceleration, and a
-    is the acceleration of its origin minus gravity.
-    """
-    h0, h1, h2, h3, h4, h5 = H[0] * factor, H[1] * factor, H[2] * factor, H[3] * factor, H[4] * factor, H[5] * factor
+@compiled
+def _move_jacobian(X, H, factor, J_P, J_C):  # pragma: no cover - compiled
+    """Fills the rows of column j of J_C = X J_P + H G. `factor` is the element of G for the link and the joint j."""
+    H_w, H_u = _hinge(H)
     for s in range(BLOCK):
-        jx, jy, jz, kx, ky, kz = _to_child(
-            X, s, J_P[s], J_P[BLOCK + s], J_P[2 * BLOCK + s], J_P[3 * BLOCK + s], J_P[4 * BLOCK + s], J_P[5 * BLOCK + s]
-        )
-        jx, jy, jz, kx, ky, kz = jx + h0, jy + h1, jz + h2, kx + h3, ky + h4, kz + h5
-        J_C[s], J_C[BLOCK + s], J_C[2 * BLOCK + s] = jx, jy, jz
-        J_C[3 * BLOCK + s], J_C[4 * BLOCK + s], J_C[5 * BLOCK + s] = kx, ky, kz
-        dx, dy, dz = C[6 * BLOCK + s], C[7 * BLOCK + s], C[8 * BLOCK + s]
-        ax, ay, az = C[12 * BLOCK + s], C[13 * BLOCK + s], C[14 * BLOCK + s]
-        xx, yy, zz = C[15 * BLOCK + s], C[16 * BLOCK + s], C[17 * BLOCK + s]
-        xy, xz, yz = C[18 * BLOCK + s], C[19 * BLOCK + s], C[20 * BLOCK + s]
-        torques[s] = kx * ax + ky * ay + kz * az
-        torques[BLOCK + s] = kx * xx + ky * (xy + dz) + kz * (xz - dy) + jz * ay - jy * az
-        torques[2 * BLOCK + s] = kx * (xy - dz) + ky * yy + kz * (yz + dx) + jx * az - jz * ax
-        torques[3 * BLOCK + s] = kx * (xz + dy) + ky * (yz - dx) + kz * zz + jy * ax - jx * ay
-        torques[4 * BLOCK + s] = jx * dx + jy * xz - jz * xy
-        torques[5 * BLOCK + s] = jy * dy + jz * xy - jx * yz
-        torques[6 * BLOCK + s] = jz * dz + jx * yz - jy * xz
-        torques[7 * BLOCK + s] = jx * (dy - xz) + jy * (dx + yz) + jz * (xx - yy)
-        torques[8 * BLOCK + s] = jx * (dz + xy) + jy * (zz - xx) + jz * (dx - yz)
-        torques[9 * BLOCK + s] = jx * (yy - zz) + jy * (dz - xy) + jz * (dy + xz)
+        R, p = _pose(X, s)
+        w, u = _to_child(R, p, _vector(J_P, 0, s), _vector(J_P, 3, s))
+        _store(J_C, 0, s, add(w, scale(factor, H_w)))
+        _store(J_C, 3, s, add(u, scale(factor, H_u)))
 
 
-@_compiled
+@compiled
+def _torques(J_C, C, torques):  # pragma: no cover - compiled
+    """Fills ten rows: the torque J_u . force + J_w . moment per unit of each parameter m, h and I of link C.
+
+    The factor of h is a x J_w + J_u x dw + w (w . J_u) - J_u (w . w). The torque of I is the sum of its elements times
+    those of the matrix J_w dw' + (J_w x w) w'.
+    """
+    for s in range(BLOCK):
+        J_w, J_u = _vector(J_C, 0, s), _vector(J_C, 3, s)
+        w, dw, a = _vector(C, _W, s), _vector(C, _DW, s), _vector(C, _A, s)
+        of_moment = add(cross(a, J_w), cross(J_u, dw))
+        of_moment = add(of_moment, add(scale(dot(w, J_u), w), scale(-dot(w, w), J_u)))
+        b = cross(J_w, w)
+        torques[s] = dot(J_u, a)
+        _store(torques, 1, s, of_moment)
+        for k in range(3):
+            torques[(4 + k) * BLOCK + s] = J_w[k] * dw[k] + b[k] * w[k]
+        torques[7 * BLOCK + s] = J_w[0] * dw[1] + J_w[1] * dw[0] + b[0] * w[1] + b[1] * w[0]
+        torques[8 * BLOCK + s] = J_w[0] * dw[2] + J_w[2] * dw[0] + b[0] * w[2] + b[2] * w[0]
+        torques[9 * BLOCK + s] = J_w[1] * dw[2] + J_w[2] * dw[1] + b[1] * w[2] + b[2] * w[1]
+
+
+@compiled
 def _rotor_torques(a, b, vd, out):  # pragma: no cover - compiled
     """Adds a (b . vd) + b (a . vd) to out (samples, n)."""
     for j in range(len(a)):
@@ -209,3 +226,133 @@ def _rotor_torques(a, b, vd, out):  # pragma: no cover - compiled
             if inertia != 0.0:
                 for s in range(len(out)):
                     out[s, j] += inertia * vd[k * BLOCK + s]
+
+
+@compiled_for(*(_number[:, ::1],) * 3, _number[::1], TREE, _number[:, :, ::1], _number[:, :, ::1])
+def fill_regressor(q, v, vd, gravity, tree, rotors, out):  # pragma: no cover - compiled
+    """Computes the regressor (m, n, 10 l + r) of an arm with n independent joints, l links and r rotor parameters.
+
+    Args:
+        q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
+        gravity: Gravity vector (3,) in the base frame [m/s^2].
+        tree: Arrays of the arm's `KinematicTree`.
+        rotors: Rows a and b (r, 2, n) of the rotor parameters. Per unit of a parameter, the torque is
+            a (b . vd) + b (a . vd).
+        out: Array that receives the regressor. Previous values are overwritten.
+    """
+    num_links, n = tree.G.shape
+    motion = np.zeros((3, n * BLOCK))
+    joint = np.empty(_JOINT_ROWS * BLOCK)
+    X = np.empty(_POSE_ROWS * BLOCK)
+    links = np.empty((num_links, _LINK_ROWS * BLOCK))
+    J = np.empty((num_links, n, _JACOBIAN_ROWS * BLOCK))
+    torques = np.empty(10 * BLOCK)
+    # No joint moves the base. Gravity is an upward acceleration of the base.
+    base, fixed = np.zeros(_LINK_ROWS * BLOCK), np.zeros(_JACOBIAN_ROWS * BLOCK)
+    for s in range(BLOCK):
+        _store(base, _DU, s, (-gravity[0], -gravity[1], -gravity[2]))
+    for start in range(0, len(q), BLOCK):
+        part = out[start : start + BLOCK]
+        part.reshape(-1)[:] = 0.0  # Sequential access, which also loads the memory into the cache.
+        _fill_rows(q[start : start + BLOCK], motion[0])
+        _fill_rows(v[start : start + BLOCK], motion[1])
+        _fill_rows(vd[start : start + BLOCK], motion[2])
+        for i in range(num_links):
+            parent, H = tree.parents[i], tree.hinges[i]
+            _move_joint(tree.G[i], tree.c[i], motion, joint)
+            _place_link(tree.pose_terms[i], joint, X)
+            _move_link(X, H, joint, links[parent] if parent >= 0 else base, links[i])
+            for j in range(n):
+                if tree.affects[i, j]:
+                    J_P = J[parent, j] if parent >= 0 and tree.affects[parent, j] else fixed
+                    _move_jacobian(X, H, tree.G[i, j], J_P, J[i, j])
+                    _torques(J[i, j], links[i], torques)
+                    _fill_samples(torques, part[:, j, 10 * i : 10 * i + 10])
+        for k in range(len(rotors)):
+            _rotor_torques(rotors[k, 0], rotors[k, 1], motion[2], part[:, :, 10 * num_links + k])
+
+
+@compiled
+def _place_in_base(X, P, C):  # pragma: no cover - compiled
+    """Fills the rows of the pose X_BC = X_BP X_PC of link C in the base frame B."""
+    for s in range(BLOCK):
+        R, p = _pose(X, s)
+        R_BP, p_BP = _pose(P, s)
+        for k in range(3):
+            _store(C, 3 * k, s, transposed_times(R, R_BP[k]))
+        _store(C, 9, s, add(times(R_BP, p), p_BP))
+
+
+@compiled
+def _weight_on_hinge(C, H, gravity, hinge):  # pragma: no cover - compiled
+    """Fills the rows of b and c. The torque about the hinge of C is b . r - c per unit mass at the point r in B."""
+    H_w, H_u = _hinge(H)
+    g = (gravity[0], gravity[1], gravity[2])
+    for s in range(BLOCK):
+        R, p = _pose(C, s)
+        b = cross(times(R, H_w), g)
+        _store(hinge, 0, s, b)
+        hinge[3 * BLOCK + s] = dot(p, b) + dot(g, times(R, H_u))
+
+
+@compiled
+def _torques_of_weight(C, weight, torques):  # pragma: no cover - compiled
+    """Fills four rows: the torque per unit of m and h of link C, from the rows of b and c of an independent joint."""
+    for s in range(BLOCK):
+        R, p = _pose(C, s)
+        b = _vector(weight, 0, s)
+        torques[s] = dot(p, b) - weight[3 * BLOCK + s]
+        _store(torques, 1, s, transposed_times(R, b))
+
+
+@compiled_for(_number[:, ::1], _number[::1], TREE, numba.int64[:, ::1], _number[:, :, ::1])
+def fill_gravity_regressor(q, gravity, tree, columns, out):  # pragma: no cover - compiled
+    """Computes columns of the regressor of an arm at rest. It equals `fill_regressor`, without all that is zero.
+
+    The torque of independent joint j due to a link is the sum of the torques about the hinges of the link and of the
+    links that carry it, each multiplied by its element of G.
+
+    Args:
+        q: Positions (m, n) of the independent joints [rad, m].
+        gravity: Gravity vector (3,) in the base frame [m/s^2].
+        tree: Arrays of the arm's `KinematicTree`.
+        columns: Index (l, 4) of the column of `out` for m and h of each link, or -1 to omit the parameter.
+        out: Array (m, n, columns) that receives the regressor. Previous values are overwritten.
+    """
+    num_links, n = tree.G.shape
+    motion = np.zeros((1, n * BLOCK))
+    joint = np.empty(_JOINT_ROWS * BLOCK)
+    X = np.empty(_POSE_ROWS * BLOCK)
+    links = np.empty((num_links, _POSE_ROWS * BLOCK))
+    hinge = np.empty(4 * BLOCK)
+    weights = np.empty((num_links, n, 4 * BLOCK))
+    torques = np.empty(4 * BLOCK)
+    base = np.zeros(_POSE_ROWS * BLOCK)
+    for k in range(3):
+        base[4 * k * BLOCK : (4 * k + 1) * BLOCK] = 1.0
+    # Link whose hinge moved last, from the base to each link, by each independent joint.
+    last = np.full((num_links, n), -1)
+    for start in range(0, len(q), BLOCK):
+        part = out[start : start + BLOCK]
+        part.reshape(-1)[:] = 0.0
+        _fill_rows(q[start : start + BLOCK], motion[0])
+        for i in range(num_links):
+            parent = tree.parents[i]
+            _move_joint(tree.G[i], tree.c[i], motion, joint)
+            _place_link(tree.pose_terms[i], joint, X)
+            _place_in_base(X, links[parent] if parent >= 0 else base, links[i])
+            _weight_on_hinge(links[i], tree.hinges[i], gravity, hinge)
+            for j in range(n):
+                before = last[parent, j] if parent >= 0 else -1
+                factor = tree.G[i, j]
+                last[i, j] = i if factor != 0.0 else before
+                if factor != 0.0:
+                    for s in range(4 * BLOCK):
+                        weights[i, j, s] = factor * hinge[s] + (weights[before, j, s] if before >= 0 else 0.0)
+                if last[i, j] >= 0 and columns[i].max() >= 0:
+                    _torques_of_weight(links[i], weights[last[i, j], j], torques)
+                    for k in range(4):
+                        column = columns[i, k]
+                        if column >= 0:
+                            for s in range(len(part)):
+                                part[s, j, column] = torques[k * BLOCK + s]

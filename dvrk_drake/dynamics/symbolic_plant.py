@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from dvrk_drake.dynamics.gravity_parameters import exact_rotation, labelled_bodies
+from dvrk_drake.dynamics.gravity_parameters import exact_rotation, link_frames
 from dvrk_drake.dynamics.trigonometric_ring import Polynomial, TrigonometricRing, exact_half
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant, tree_selector
@@ -24,7 +24,7 @@ class SymbolicPlant:
         arm: Arm of the plant.
         numeric: Numeric plant of the arm.
         bodies: Label ("1" to "7", "crank", ...) -> moving body B and the pose X_BF of its frame F, see
-            `labelled_bodies`.
+            `link_frames`.
         q: Joint positions as sympy symbols q1, ..., qn [rad, m].
         ring: Ring of polynomials in q and in sines and cosines of sums of q.
     """
@@ -41,7 +41,7 @@ class SymbolicPlant:
         """
         self.arm, self._frames = arm, frames
         self.numeric = shared_plant(arm)
-        self.bodies = labelled_bodies(self.numeric, frames)
+        self.bodies = link_frames(arm, frames)
         self._plant = self.numeric.ToSymbolic()
         self._context = self._plant.CreateDefaultContext()
         drake_q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]

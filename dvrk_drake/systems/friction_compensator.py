@@ -155,7 +155,7 @@ def _advance(
             v += rows[j, i] * state[n + i]
         if not was_valid:
             deflection[j], last[j] = 0.0, x
-        deflection[j], shape = effect_step(codes[j], deflection[j], x - last[j], v, scales[j])
+        deflection[j], shape = effect_step(codes[j], deflection[j], x - last[j], x, v, scales[j])
         last[j] = x
         for i in range(n):
             effort[i] += weights[j] * shape * rows[j, i]

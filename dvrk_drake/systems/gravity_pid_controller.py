@@ -6,15 +6,16 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
-from dvrk_drake.dynamics.codegen import entry_point
+from dvrk_drake.dynamics.compiled import entry_point
+from dvrk_drake.dynamics.holding_torque import HoldingArrays
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.systems.gravity_pid_step import compile_step
+from dvrk_drake.systems.gravity_pid_step import controller_step
 
 #: "hold" regulates a pose, "gravity" compensates gravity and leaves the arm free to move, "damped" adds damping.
 Mode = Literal["hold", "gravity", "damped"]
@@ -90,7 +91,7 @@ class GravityPidController(LeafSystem):
         mode: Mode = "hold",
         effort_limits: ArrayLike | None = None,
     ) -> None:
-        """Compiles the controller for the model's arm. The first compilation takes seconds, later ones are fast.
+        """Creates the controller for the model's arm.
 
         Args:
             model: Model that defines G(q). Its parameters are copied.
@@ -138,10 +139,9 @@ class GravityPidController(LeafSystem):
             ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((5, n)), 0)), calc=self._calc_settings),
             {self.all_parameters_ticket()},
         )
-        self._dispatcher = compile_step(model.static_model.torque_into)  # owns the compiled code
-        step = entry_point(self._dispatcher)
-        update = self._make_update(step, model.theta.copy(), restart=False)
-        restart = self._make_update(step, model.theta.copy(), restart=True)
+        holding = model.static_model.with_parameters(model.theta)
+        update = self._make_update(holding, restart=False)
+        restart = self._make_update(holding, restart=True)
         self.DeclareInitializationDiscreteUpdateEvent(update=restart)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec=self._period, offset_sec=0.0, update=update)
         self.DeclareForcedDiscreteUpdateEvent(update=update)
@@ -192,15 +192,14 @@ class GravityPidController(LeafSystem):
         mode = int(context.get_numeric_parameter(self._mode).GetAtIndex(0))
         settings.set_value((np.vstack([gains, self._scales_and_limits]), mode))
 
-    def _make_update(
-        self, step: Callable[..., None], theta: NDArray[np.float64], restart: bool
-    ) -> Callable[[Context, DiscreteValues], None]:
+    def _make_update(self, holding: HoldingArrays, restart: bool) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.
 
         The handler runs between two steps of the plant, which evict Python's data from the processor caches. For speed,
         it accesses few objects, by local names.
         """
         eval_vector_input, settings, period = self.EvalVectorInput, self._settings, self._period
+        step = entry_point(controller_step)
 
         def update(context: Context, discrete_state: DiscreteValues) -> None:
             measured = eval_vector_input(context, 0)
@@ -218,7 +217,7 @@ class GravityPidController(LeafSystem):
                 period,
                 mode,
                 per_joint,
-                theta,
+                holding,
                 group(0),
                 group(1),
                 group(2),

@@ -2,103 +2,98 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import numba
 import numpy as np
 
+from dvrk_drake.dynamics.compiled import compiled_for
+from dvrk_drake.dynamics.holding_torque import HOLDING, holding_torque_into
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 
 #: Values of `mode`: indices into `gravity_pid_controller.Mode`.
 HOLD, GRAVITY, DAMPED = 0, 1, 2
 
 
-@cache
-def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
-    """Returns a compiled function that performs one update of the controller.
+_array = numba.float64[::1]
+_view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # type of Drake's input vectors
+_memory = (_array,) * 6
+_flag = numba.boolean
 
-    The function does not allocate memory. It has these arguments. Vectors have n numbers unless another size is stated.
 
-    - `state` (2n), `desired` (2n): input values; `has_desired`: false if there is no desired state
-    - `restart`: true for the update at initialization
-    - `period`: period of the update [s]
-    - `mode`: index into `Mode`
-    - `per_joint` (5, n): kp, kd, ki, feedforward_scale, effort limits
-    - `theta`: parameters of the model
-    - `effort`, `gravity`, `fault` (1), `integral`: results, which the function writes into these arrays
-    - `latched_q`: array with the pose that is regulated if `has_desired` is false; NaN before the first pose
-    - `last_q`: array with the last valid pose; NaN before the first pose
+@compiled_for(_view, _view, _flag, _flag, numba.float64, numba.int64, numba.float64[:, ::1], HOLDING, *_memory)
+def controller_step(
+    state,
+    desired,
+    has_desired,
+    restart,
+    period,
+    mode,
+    per_joint,
+    model,
+    effort,
+    gravity,
+    fault,
+    integral,
+    latched_q,
+    last_q,
+):  # pragma: no cover - compiled
+    """Performs one update of the controller. Vectors have n numbers unless another size is stated.
+
+    Args:
+        state, desired: Input values (2n).
+        has_desired: False if there is no desired state.
+        restart: True for the update at initialization.
+        period: Period of the update [s].
+        mode: Index into `Mode`.
+        per_joint: Rows (5, n): kp, kd, ki, feedforward scale, effort limits.
+        model: Model of the holding torque.
+        effort, gravity, fault, integral: Results, which the function writes into these arrays. `fault` has one number.
+        latched_q: Pose that is regulated if `has_desired` is False; NaN before the first pose.
+        last_q: Last valid pose; NaN before the first pose.
     """
+    n = effort.size
+    kp, kd, ki, feedforward_scale, limit = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
+    hold, damped = mode == HOLD, mode == DAMPED
 
-    def step(
-        state,
-        desired,
-        has_desired,
-        restart,
-        period,
-        mode,
-        per_joint,
-        theta,
-        effort,
-        gravity,
-        fault,
-        integral,
-        latched_q,
-        last_q,
-    ):
-        n = effort.size
-        kp, kd, ki, feedforward_scale, limit = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
-        hold, damped = mode == HOLD, mode == DAMPED
-
-        if restart:
-            latched_q[:] = np.nan
-            last_q[:] = np.nan
-            integral[:] = 0.0
-        faulty = False
+    if restart:
+        latched_q[:] = np.nan
+        last_q[:] = np.nan
+        integral[:] = 0.0
+    faulty = False
+    for i in range(2 * n):
+        faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true for NaN
+    if not faulty:
+        last_q[:] = state[:n]
+    if hold and has_desired:
         for i in range(2 * n):
-            faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true for NaN
-        if not faulty:
-            last_q[:] = state[:n]
-        if hold and has_desired:
-            for i in range(2 * n):
-                faulty |= not abs(desired[i]) < IMPLAUSIBLE
-        fault[0] = 1.0 if faulty else 0.0
+            faulty |= not abs(desired[i]) < IMPLAUSIBLE
+    fault[0] = 1.0 if faulty else 0.0
 
-        if np.isnan(last_q[0]):
-            gravity[:] = 0.0
-        else:
-            torque_into(last_q, theta, gravity)
-            for i in range(n):
-                gravity[i] *= feedforward_scale[i]
-        if faulty or not hold:
-            latched_q[:] = np.nan
-            for i in range(n):
-                integral[i] = 0.0
-                braking = kd[i] * state[n + i] if damped and not faulty else 0.0
-                effort[i] = min(max(gravity[i] - braking, -limit[i]), limit[i])
-            return
-
-        if np.isnan(latched_q[0]):
-            latched_q[:] = last_q
+    if np.isnan(last_q[0]):
+        gravity[:] = 0.0
+    else:
+        holding_torque_into(last_q, model, gravity)
         for i in range(n):
-            e = (desired[i] if has_desired else latched_q[i]) - state[i]
-            de = (desired[n + i] if has_desired else 0.0) - state[n + i]
-            without_integral = gravity[i] + kp[i] * e + kd[i] * de
-            increment = 0.0 if restart else ki[i] * e * period
-            if ki[i] == 0.0:
-                integral[i] = 0.0
-            command = without_integral + integral[i] + increment
-            far = abs(kp[i] * e) > limit[i]
-            winds_up = (command > limit[i] and increment > 0.0) or (command < -limit[i] and increment < 0.0)
-            if not (far or winds_up):
-                integral[i] += increment
-            effort[i] = min(max(without_integral + integral[i], -limit[i]), limit[i])
+            gravity[i] *= feedforward_scale[i]
+    if faulty or not hold:
+        latched_q[:] = np.nan
+        for i in range(n):
+            integral[i] = 0.0
+            braking = kd[i] * state[n + i] if damped and not faulty else 0.0
+            effort[i] = min(max(gravity[i] - braking, -limit[i]), limit[i])
+        return
 
-    array = numba.float64[::1]
-    matrix = numba.float64[:, ::1]
-    view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # type of Drake's input vectors
-    flag = numba.boolean
-    memory = (array,) * 6
-    signature = numba.void(view, view, flag, flag, numba.float64, numba.int64, matrix, array, *memory)
-    return numba.njit(signature)(step)
+    if np.isnan(latched_q[0]):
+        latched_q[:] = last_q
+    for i in range(n):
+        e = (desired[i] if has_desired else latched_q[i]) - state[i]
+        de = (desired[n + i] if has_desired else 0.0) - state[n + i]
+        without_integral = gravity[i] + kp[i] * e + kd[i] * de
+        increment = 0.0 if restart else ki[i] * e * period
+        if ki[i] == 0.0:
+            integral[i] = 0.0
+        command = without_integral + integral[i] + increment
+        far = abs(kp[i] * e) > limit[i]
+        winds_up = (command > limit[i] and increment > 0.0) or (command < -limit[i] and increment < 0.0)
+        if not (far or winds_up):
+            integral[i] += increment
+        effort[i] = min(max(without_integral + integral[i], -limit[i]), limit[i])

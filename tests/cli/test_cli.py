@@ -16,7 +16,7 @@ from recordings import csv_block
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     arm = load_arm("mtmr")
     generator = np.random.default_rng(0)
-    model = compile_static_model(arm)
+    model = static_model(arm)
     for name, count in (("poses", 40), ("other", 12)):
         q = arm.sample_poses(count, generator, margin=0.05)
         tau = model.torque(q, model.gravity.base_values)
@@ -130,7 +130,7 @@ def test_predict_of_a_psm_in_wpi_coordinates_writes_them(tmp_path):
 
 def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
     arm = load_arm("mtml")
-    model = compile_static_model(arm)
+    model = static_model(arm)
     q = np.random.default_rng(0).uniform(-2, 2, (5, 7))
     expected = model.torque(q, model.gravity.base_values)
 

@@ -10,7 +10,7 @@ from paper_regressor import paper_regressor
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.gravity_regressor import GRAVITY, derive_gravity
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
@@ -105,7 +105,7 @@ def test_dvrk_controller_mapping(arm):
         "m6 c6x": C * c6 * s4 - S * s5 * s6 + C * c4 * c5 * s6,
     }
     tau2 = 9.81 * sum(numbers[name] * column for name, column in p.items())
-    model = compile_static_model(arm)
+    model = static_model(arm)
     theta = gravity.base_values.copy()
     for name in ("m7 c7x", "m7 c7y"):
         theta[gravity.base.names.index(name)] = 0.0
@@ -117,7 +117,7 @@ def test_dvrk_controller_mapping(arm):
 )
 def test_torque_equals_the_holding_torque_of_the_plant(any_arm, random_q, direction):
     mounted = any_arm.with_gravity(direction)
-    model = compile_static_model(mounted)
+    model = static_model(mounted)
     plant = make_arm_plant(mounted)
     context = plant.CreateDefaultContext()
     expected = []
@@ -190,7 +190,7 @@ def test_torque_is_correct_for_random_masses(any_arm, random_q):
         for body in [plant.GetFrameByName(f"dh_{label}").body(), *rotors.get(label, [])]:
             body.SetMass(context, body.default_mass() * factor)
         values[k : k + 4] *= factor
-    model = compile_static_model(arm)
+    model = static_model(arm)
     for q in random_q:
         set_arm_positions(plant, context, arm, q)
         tau = model.torque(q, gravity.base.combination @ values)
@@ -199,7 +199,7 @@ def test_torque_is_correct_for_random_masses(any_arm, random_q):
 
 def test_joint_effects_add_their_torque(arm):
     effects = (ActuatorEffect("joint.wrist_platform", "cable sine", 1.0), ActuatorEffect("joint.outer_yaw", "offset"))
-    plain, model = compile_static_model(arm), compile_static_model(arm, effects)
+    plain, model = static_model(arm), static_model(arm, effects)
     q = np.random.default_rng(0).normal(size=(5, 7))
     beta = plain.gravity.base_values
     extra = model.torque(q, [*beta, 0.3, -0.2]) - plain.torque(q, beta)

@@ -7,7 +7,7 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.dynamics.model_links import MIN_EIGENVALUE_RATIO, nearest_links
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.models.arm_files import load_arm
 
 pytestmark = pytest.mark.numeric
@@ -35,7 +35,7 @@ def test_links_are_consistent_and_have_the_base_parameters(name, size):
     q = arm.sample_poses(100, np.random.default_rng(1))
     parameters = np.concatenate([*(link.parameters for link in links), np.zeros(len(regressor.rotors))])
     tau = regressor.torque(q, np.zeros_like(q), np.zeros_like(q), parameters)
-    expected = compile_static_model(arm).torque(q, values)
+    expected = static_model(arm).torque(q, values)
     np.testing.assert_allclose(tau, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
     assert min(np.linalg.eigvalsh(Z).min() for Z in relative_pseudo_inertias(arm, links)) > 0.99 * MIN_EIGENVALUE_RATIO
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +17,8 @@ from dvrk_drake.dynamics.actuator_effects import (
     position_along,
     spring_over,
 )
+from dvrk_drake.dynamics.static_model import StaticModel, static_model
 from dvrk_drake.models.arm import Arm
-
-if TYPE_CHECKING:
-    from dvrk_drake.dynamics.static_model import StaticModel
 
 #: Prior standard deviation of a base parameter, as a share of the value at which this parameter alone produces the
 #: effort limit of a joint.
@@ -54,11 +51,8 @@ class StaticProblem:
             tau: Joint torques (m, n) [N m, N].
             usable: Mask (m, n) of the measurements that are not excluded.
         """
-        # Imported here, because the import of sympy takes 0.3 s and a motion does not need it.
-        from dvrk_drake.dynamics.static_model import compile_static_model
-
         self.arm, self.q, self.tau, self.usable = arm, q, tau, usable
-        self.base_model = compile_static_model(arm)
+        self.base_model = static_model(arm)
         self._Y = self.base_model.regressor(q)
         self.sigma_floor = SIGMA_FLOOR * arm.effort_limits
 

@@ -27,6 +27,7 @@ from dvrk_drake.dynamics.identified_model import (
     JointStatistics,
     Provenance,
 )
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -104,15 +105,12 @@ def identify_static(
         IdentificationError: The method is unknown, there are too few poses, the recording is a motion, or the base
             parameters are not identifiable (method "paper").
     """
-    # Imported here, because the import of sympy takes 0.3 s and a motion does not need it.
-    from dvrk_drake.dynamics.static_model import compile_static_model
-
     if method not in get_args(Method):
         raise IdentificationError(f'method is "{method}"; allowed: {", ".join(get_args(Method))}')
     known = None if recording.tau is None else recording.measured_joints(arm)
     recording = usable_poses(recording, arm, averaged=method == "robust" and measured is None)
     tau = recording.measured_effort()
-    gravity_model = compile_static_model(arm)
+    gravity_model = static_model(arm)
     Y = gravity_model.regressor(recording.q)
     stacked = Y.reshape(-1, Y.shape[2]) if measured is None else Y[measured]
     rank = int(np.linalg.matrix_rank(stacked, tol=1e-9 * np.linalg.norm(stacked, 2)))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault
-from dvrk_drake.dynamics.codegen import entry_point
-from dvrk_drake.dynamics.static_model import compile_effect_torque
+from dvrk_drake.dynamics.compiled import entry_point
+from dvrk_drake.dynamics.holding_torque import HoldingArrays, holding_torque_into
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import POSITION_KINDS, ArmEffects, EffortEffect, per_actuator
@@ -157,8 +157,7 @@ class DriveForce(LeafSystem):
                 raise StationError(f"{arm.name}: effects: cables, springs: {fault}")
         self._motors, self._from_motors = motors, parts.from_motors
         self._joints = np.array(parts.joint_index, dtype=np.int64)
-        self._torque = compile_effect_torque(arm, kinds) if kinds else None  # owns the compiled code
-        self._coefficients = np.array([law.coefficient for law in laws])
+        self._effects = HoldingArrays.of_effects(arm, kinds, np.array([-law.coefficient for law in laws]))
         n, nv = arm.num_joints, len(parts.from_motors)
         for name, size in (("effort_commanded", n), ("effort_disturbance", n), ("plant_state", 2 * nv)):
             self.DeclareVectorInputPort(name=name, size=size)
@@ -172,11 +171,10 @@ class DriveForce(LeafSystem):
     def _make_calc(self, n: int) -> Callable[[Context, BasicVector], None]:
         """Returns the handler of the port. The handler uses local names for speed; see GravityPidController."""
         eval_vector_input, motors_into = self.EvalVectorInput, entry_point(_force_into)
-        subtract_at = entry_point(_subtract_at)
-        torque_into = None if self._torque is None else entry_point(self._torque)
+        torque_into, add_at = entry_point(holding_torque_into), entry_point(_add_at)
         constants, to_motors, from_motors = self._motors.constants, self._motors.to_motors, self._from_motors
-        joints, coefficients = self._joints, self._coefficients
-        zero, q, tau = np.zeros(n), np.empty(n), np.empty(n)
+        joints, effects, has_effects = self._joints, self._effects, len(self._effects.effects) > 0
+        zero, q, tau, motors = np.zeros(n), np.empty(n), np.empty(n), np.empty(n)
 
         def calc(context: Context, output: BasicVector) -> None:
             command, disturbance = eval_vector_input(context, 0), eval_vector_input(context, 1)
@@ -190,12 +188,12 @@ class DriveForce(LeafSystem):
                 to_motors,
                 from_motors,
                 q,
-                tau,
+                motors,
                 force,
             )
-            if torque_into is not None:
-                torque_into(q, coefficients, tau)
-                subtract_at(tau, joints, force)
+            if has_effects:
+                torque_into(q, effects, tau)
+                add_at(tau, joints, force)
 
         return calc
 
@@ -221,6 +219,6 @@ def _force_into(command, disturbance, state, joints, constants, to_motors, from_
 
 
 @numba.njit("void(float64[::1], int64[::1], float64[::1])", cache=True)
-def _subtract_at(tau, joints, force):
+def _add_at(tau, joints, force):
     for k in range(len(joints)):
-        force[joints[k]] -= tau[k]
+        force[joints[k]] += tau[k]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import effect_step
-from dvrk_drake.dynamics.codegen import entry_point
+from dvrk_drake.dynamics.compiled import entry_point
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.systems.arm_effects.drive_force import round_to_step
@@ -155,7 +155,7 @@ def _move_anchors(state, places, laws, time_step, anchors):
             slip_travel *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
         deflection = side * (position - anchors[actuator])
         # z is the deflection after limiting, divided by `slip_travel`.
-        z, _ = effect_step(code, 0.0, deflection, 0.0, slip_travel)
+        z, _ = effect_step(code, 0.0, deflection, 0.0, 0.0, slip_travel)
         if abs(deflection - z * slip_travel) < 1e-12 * travel:
             continue
         deflection = z * slip_travel

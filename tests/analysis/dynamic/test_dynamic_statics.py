@@ -18,8 +18,9 @@ from dvrk_drake.dynamics.actuator_effects import (
     position_along,
 )
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.holding_torque import holding_torque_into
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -111,11 +112,11 @@ def test_poses_and_motions_use_the_same_columns(case):
     arm = case[0]
     effects = all_effects(arm)
     q = arm.sample_poses(50, np.random.default_rng(2))
-    model = compile_static_model(arm, effects)
+    model = static_model(arm, effects)
     for effect, theta in zip(effects, np.eye(model.num_parameters)[-len(effects) :], strict=True):
         column = np.empty(q.shape)
         for pose, out in zip(q, column, strict=True):
-            model.torque_into(pose, theta, out)
+            holding_torque_into(pose, model.with_parameters(theta), out)
         np.testing.assert_allclose(model.torque(q, theta), column, atol=1e-12, err_msg=str(effect))
         np.testing.assert_allclose(column, effect_column(arm, effect, q), atol=1e-12, err_msg=str(effect))
         a = arm.transmission.position(q)

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import predict_static, validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -32,7 +32,7 @@ def arm():
 def simulated(arm, poses=60, seed=0, noise=0.0, effects=(), coefficients=(), scale=1.0):
     """Returns poses within the limits with exact holding torques plus noise, a share of each joint's effort limit."""
     generator = np.random.default_rng(seed)
-    model = compile_static_model(arm, tuple(effects))
+    model = static_model(arm, tuple(effects))
     theta = np.array([*(scale * model.gravity.base_values), *coefficients])
     q = arm.sample_poses(poses, generator, margin=0.05)
     tau = model.torque(q, theta) + noise * arm.effort_limits * generator.normal(size=q.shape)
@@ -199,7 +199,7 @@ def test_joint_that_did_not_move_has_no_feedforward(arm):
     generator = np.random.default_rng(0)
     q = recording.q.copy()
     q[:, 3:] = [0.5, 0.7, 0.2, 0.1]
-    model = compile_static_model(arm)
+    model = static_model(arm)
     tau = model.torque(q, model.gravity.base_values) + 0.05 * arm.effort_limits * generator.uniform(-1, 1, q.shape)
     result = identify_static(Recording(q=q, tau=tau, source="fixed wrist"), arm).model
     assert np.all(result.feedforward_scale[3:] == 0.0)
