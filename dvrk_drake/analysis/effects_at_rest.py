@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from dvrk_drake.analysis.dynamic.estimates import DRY_KINDS
 from dvrk_drake.analysis.static.linear_fit import blocks
 from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 
 #: Smallest coefficient of a correction in standard errors, and its smallest RMS effort as a share of the dry friction.
@@ -110,7 +110,7 @@ class _Candidate:
 def _candidates(model: IdentifiedModel, q: NDArray[np.float64], residual: NDArray[np.float64]) -> list[_Candidate]:
     arm = model.arm
     rows = arm.effect_coordinates
-    of_motion = [e for e in model.dynamic_model.section.effects if e.kind in DRY_KINDS]
+    of_motion = [e for e in model.dynamic_model.section.effects if EFFECT_KINDS[e.kind].symmetric]
     dry = np.sum([np.abs(rows[e.coordinate] * e.coefficient) for e in of_motion], axis=0) * np.ones(arm.num_joints)
     largest = np.sqrt(np.mean(residual**2, axis=0)) + 1e-9
     workspace = arm.sample_poses(200, np.random.default_rng(0))

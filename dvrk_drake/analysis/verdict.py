@@ -17,6 +17,7 @@ from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.dynamics.friction_compensation import HOLDING_ERROR_FACTOR, HOLDING_TRAVEL
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.recordings.recording import MIN_RANGE, Coordinates
 
 Requirement = Literal["good", "usable"]
@@ -59,7 +60,7 @@ def tolerances(arm: Arm, coordinates: Coordinates) -> list[Tolerance]:
     drives = J if coordinates == "actuator" else np.eye(arm.num_joints)
     with np.errstate(divide="ignore"):
         stiffness = np.min(np.where(drives != 0, at_15_mrad / np.abs(drives), np.inf), axis=1)
-    dry = [e.coefficient * rows[e.coordinate] for e in arm.effects.friction if e.kind != "viscous"]
+    dry = [e.coefficient * rows[e.coordinate] for e in arm.effects.friction if EFFECT_KINDS[e.kind].role == "dry"]
     friction = np.abs(np.reshape(dry, (-1, arm.num_joints)) @ (np.eye(len(J)) if coordinates == "actuator" else J))
     found = [(f or k, k) for f, k in zip(friction.sum(axis=0), stiffness, strict=True)]
     return [Tolerance(float(f), float(k)) for f, k in found]

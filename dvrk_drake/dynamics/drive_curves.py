@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 
 

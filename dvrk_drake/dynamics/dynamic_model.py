@@ -8,18 +8,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.dynamics.actuator_effects import (
-    EFFECT_KINDS,
-    POSITION_KINDS,
-    ActuatorEffect,
-    effect_fault,
-    position_along,
-)
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault, position_along
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, pseudo_inertia
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
 from dvrk_drake.models.schema_fault import number_fault
 
 
@@ -80,7 +75,7 @@ def transmitted_effort(
     """
     tau = rigid
     for effect, coefficient in zip(effects, coefficients, strict=True):
-        if effect.kind in POSITION_KINDS and effect.kind != "offset" and coefficient:
+        if EFFECT_KINDS[effect.kind].role == "position" and coefficient:
             x = position_along(arm, effect.coordinate, q)
             tau = tau + coefficient * effect.column(x, 0 * x)[:, None] * arm.effect_coordinates[effect.coordinate]
     return tau

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, is_prismatic, joint_row
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault, is_prismatic, joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 #: Largest travel before sliding [rad], [m] of the presliding effects that are assumed to hold the arm at rest.
 HOLDING_TRAVEL = 0.015, 0.0015
@@ -184,7 +185,7 @@ def safe_ratios(
         ratios[along] = _largest_ratios(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
     if hysteresis_ratio <= ratio:
         return ratios[index]
-    is_dry = np.array([effect.kind != "viscous" for effect in friction.effects], bool)
+    is_dry = np.array([EFFECT_KINDS[effect.kind].role == "dry" for effect in friction.effects], bool)
     hysteresis = np.bincount(index, friction.coefficients * friction.springs_back, len(names))
     max_compensated = MAX_RATIO * np.bincount(index, friction.coefficients * is_dry, len(names))
     hysteresis_ratios = np.minimum(hysteresis_ratio, max_compensated / np.maximum(hysteresis, 1e-12))

@@ -13,16 +13,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.actuator_effects import (
-    EFFECT_KINDS,
-    ActuatorEffect,
-    effect_step,
-    joint_row,
-    position_along,
-)
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_step, joint_row, position_along
 from dvrk_drake.dynamics.compiled import compiled, compiled_for, sin_cos
 from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 #: Link with its joint frame Z, see `KinematicTree`. R and p are the pose of Z at x = 0 in the joint frame of the
 #: parent, whose index is `parent`. m and h are the mass and the first moment about the origin of Z. The last six fields

@@ -20,9 +20,8 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, NUM
 from dvrk_drake.export.dvrk_mtm_model_parts import model_parts
 from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
-#: Kinds of effects that model dry friction.
-DRY_KINDS = ("coulomb", "presliding")
 #: Number of random poses at which the torques of file and model are compared.
 POSES = 20000
 
@@ -131,7 +130,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
     arm = model.arm
     friction = np.zeros(arm.num_joints)
     for effect in model.dynamics.effects:
-        if effect.kind in DRY_KINDS:
+        if EFFECT_KINDS[effect.kind].symmetric:
             friction += effect.coefficient * np.abs(joint_row(arm, effect.coordinate))
     return tuple(float(f) for f in friction)
 

@@ -22,6 +22,7 @@ from dvrk_drake.models.arm_schema import (
     ViewSettings,
 )
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.immutable import cached, immutable
 from dvrk_drake.models.linear_map import LinearMap
@@ -190,7 +191,7 @@ class Arm:
         """Returns the maximum dry friction (n,) on each joint [N m, N], computed from the arm's effects."""
         dry = np.zeros(self.num_joints)
         for effect in self.effects.friction:
-            if effect.kind != "viscous":
+            if EFFECT_KINDS[effect.kind].role == "dry":
                 row = self.effect_coordinates[effect.coordinate] @ self.transmission.matrix
                 dry += np.abs(effect.coefficient * row)
         return dry

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
 from dvrk_drake.models.immutable import Shared
 from dvrk_drake.models.schema_fault import formerly, number_fault, within
 
@@ -23,7 +24,7 @@ class DriveEffect(Shared):
 
     Attributes:
         coordinate: "actuator.<name>", "joint.<name>", or one of the arm's `friction_coordinates`.
-        kind: Kind of effect, see `dvrk_drake.dynamics.actuator_effects.EFFECT_KINDS`.
+        kind: Kind of effect, see `dvrk_drake.models.effect_kinds.EFFECT_KINDS`.
         scale: Parameter whose meaning depends on the kind: width of the smoothed sign function [rad/s, m/s], travel
             before sliding [rad, m], linear range of a spring [rad, m], or number of periods per revolution.
         coefficient: Coefficient of the effect. The unit depends on the kind: N m, N m s/rad or N m/rad, or N, N s/m or
@@ -182,7 +183,7 @@ class ArmEffects(Shared):
                 raise ArmError(f'{where}: kind is "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
             if effect.coefficient < 0 and effect.kind != "presliding forward":
                 raise ArmError(f"{where}: coefficient of {effect.kind} is {effect.coefficient:g}; allowed: 0 or more")
-            if effect.kind != "viscous" and effect.scale == 0:
+            if EFFECT_KINDS[effect.kind].scale and effect.scale == 0:
                 raise ArmError(f"{where}: scale of {effect.kind} is 0; allowed: more than 0")
             if effect.fall_speed and effect.kind != "presliding":
                 raise ArmError(f"{where}: fall_speed of {effect.kind} is {effect.fall_speed:g}; allowed: 0")
@@ -195,8 +196,6 @@ class ArmEffects(Shared):
 
 #: Kinds that `friction` accepts: friction that the solver of the plant can compute.
 FRICTION_KINDS = ("presliding", "presliding forward", "coulomb", "viscous")
-#: Kinds that `cables` and `springs` accept: effects that have a potential energy.
-POSITION_KINDS = ("offset", "spring", "cable sine", "cable cosine")
 #: Names of all effect groups.
 EFFECT_NAMES = tuple(f.name for f in dataclasses.fields(ArmEffects))
 

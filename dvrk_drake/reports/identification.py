@@ -19,12 +19,13 @@ from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.analysis.verdict import MIN_COVERAGE, cross_validated_verdicts, identified_coverage, rule_text
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_section import CorrelatedEstimates, DynamicSection
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.reports.answers import Answer, answer_of, percent

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, effect_step
+from dvrk_drake.dynamics.actuator_effects import effect_step
 from dvrk_drake.dynamics.friction_compensation import Friction, check_ratios, safe_ratios
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 
 class FrictionCompensator(LeafSystem):

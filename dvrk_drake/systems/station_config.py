@@ -15,11 +15,12 @@ from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 
-from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault
 from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
+from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.schema_fault import formerly, number_fault, schema_fault, with_current_keys, within

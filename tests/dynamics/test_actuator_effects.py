@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, is_prismatic
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, is_prismatic
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 pytestmark = pytest.mark.numeric
 

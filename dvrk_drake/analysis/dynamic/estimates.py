@@ -26,6 +26,7 @@ from dvrk_drake.dynamics.identified_model import BaseParameterEstimate
 from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.dynamics.physical_consistency import reached_bounds
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 #: Largest absolute correlation of two parameters that are identifiable separately.
 STRONG_CORRELATION = 0.95
@@ -271,8 +272,6 @@ def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
 
 #: Smallest identifiability (1 - variance / prior variance) at which a base parameter counts as identifiable.
 MIN_IDENTIFIABILITY = 0.5
-#: Effect kinds that are dry friction.
-DRY_KINDS = ("coulomb", "presliding")
 
 
 class DynamicEstimates:
@@ -343,7 +342,9 @@ class DynamicEstimates:
             dry = [
                 p + k
                 for k, effect in enumerate(self._effects)
-                if effect.coordinate == name and effect.kind in DRY_KINDS and not isinstance(effect, RecordingEffect)
+                if effect.coordinate == name
+                and EFFECT_KINDS[effect.kind].symmetric
+                and not isinstance(effect, RecordingEffect)
             ]
             if dry:
                 variance = float(np.sum(self._covariance[np.ix_(dry, dry)]))

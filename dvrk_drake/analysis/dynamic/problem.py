@@ -13,7 +13,6 @@ from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
-from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
 from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import rotor_links
@@ -24,6 +23,7 @@ from dvrk_drake.dynamics.physical_consistency import (
     consistent_parameters,
     log_det_curvature,
 )
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 #: Prior standard deviation of an inertial parameter about its value in the SDF, as a share of the scale of the
 #: parameter (`LinkScale`). The share was selected by cross-validation.
@@ -143,7 +143,7 @@ class DynamicProblem:
                 deviation[k] = RECORDING_DEVIATION * np.sqrt(max(rows, 1 / self.num_rows))
             elif effect.dissipative:
                 deviation[k] = FRICTION_DEVIATION
-            elif k < self.num_mandatory and effect.kind in POSITION_KINDS and effect.kind != "offset":
+            elif k < self.num_mandatory and EFFECT_KINDS[effect.kind].role == "position":
                 is_second = effect.kind.startswith("cable") and effect.scale > 1
                 first = (effect.coordinate, effect.kind, 1.0)
                 deviation[k] = HARMONIC_DEVIATION if is_second and first in mandatory else KNOWN_DEVIATION

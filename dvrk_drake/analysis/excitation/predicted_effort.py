@@ -8,10 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, joint_row, position_along
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row, position_along
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.plant import inverse_dynamics
 
@@ -53,7 +54,9 @@ class PredictedEffort:
         """Largest dry friction (n,) on each joint [N m, N]."""
         if self.model is None or self.model.dynamics is None:
             return self.arm.dry_friction()
-        rows = [joint_row(self.arm, e.coordinate) * e.coefficient for e in self._effects if _is_dry(e)]
+        rows = [
+            joint_row(self.arm, e.coordinate) * e.coefficient for e in self._effects if EFFECT_KINDS[e.kind].bounded
+        ]
         return np.sum(np.abs(rows).reshape(-1, self.arm.num_joints), axis=0)
 
     def without_dry_friction(
@@ -92,7 +95,7 @@ class PredictedEffort:
             return model.static_model.torque(q, model.theta) - of_sdf
         tau = np.zeros(q.shape)
         for effect in self._effects:
-            if effect.kind == "viscous" or effect.kind in POSITION_KINDS:
+            if EFFECT_KINDS[effect.kind].role != "dry":
                 row = joint_row(self.arm, effect.coordinate)
                 shape = ActuatorEffect.of(effect).column(position_along(self.arm, effect.coordinate, q), v @ row)
                 tau += effect.coefficient * shape[:, None] * row
@@ -102,8 +105,3 @@ class PredictedEffort:
     def _effects(self) -> list[DriveEffect]:
         assert self.model is not None and self.model.dynamics is not None
         return self.model.dynamics.effects
-
-
-def _is_dry(effect: DriveEffect) -> bool:
-    """Returns whether an effect is friction whose largest effort is its coefficient."""
-    return effect.kind in ("coulomb", "coulomb forward", "stribeck", "presliding", "presliding forward")

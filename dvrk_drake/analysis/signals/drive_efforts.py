@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.recordings.recording import Recording
 
 FrictionPart = Literal["dry", "viscous"]
-#: Part of the friction, dry or viscous, for each kind of friction effect. All kinds of one part change together, for
-#: example with temperature or lubrication.
+#: Part of the friction of each kind of friction effect. All kinds of one part change together, for example with
+#: temperature or lubrication.
 FRICTION_PARTS: dict[str, FrictionPart] = {
-    **dict.fromkeys(("coulomb", "coulomb forward", "load coulomb", "position coulomb", "position^2 coulomb"), "dry"),
-    **dict.fromkeys(("stribeck", "presliding", "presliding forward"), "dry"),
-    "viscous": "viscous",
+    name: kind.role for name, kind in EFFECT_KINDS.items() if kind.role == "dry" or kind.role == "viscous"
 }
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from dvrk_drake.analysis.dynamic.estimates import MIN_IDENTIFIABILITY
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, is_prismatic
+from dvrk_drake.dynamics.actuator_effects import is_prismatic
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.html.labels import NO_BREAK
 from dvrk_drake.reports.html.page import Block, Cell, Table

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint, JointActuator, ModelInstanceIndex, PdControllerGains
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import FRICTION_KINDS, ArmEffects, FrictionEffect
 from dvrk_drake.systems.arm_effects.drive_joints import DriveJoints
 from dvrk_drake.systems.ideal_drive import PlantJoints

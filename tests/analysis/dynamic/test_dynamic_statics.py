@@ -8,7 +8,6 @@ from motions import true_dynamics
 
 from dvrk_drake.analysis.dynamic.estimates import base_parameter_estimates
 from dvrk_drake.dynamics.actuator_effects import (
-    POSITION_KINDS,
     ActuatorEffect,
     distinct_coordinates,
     effect_column,
@@ -23,6 +22,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistic
 from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 
 pytestmark = pytest.mark.numeric
