@@ -25,8 +25,8 @@ import dvrk_drake as dvrk
 from dvrk_drake.analysis.static.static_identification import MIN_TORQUE, identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row, position_along
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, estimated_duration
 

@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
     parser.add_argument("--json", help="file for the errors")
     options = parser.parse_args()
-    arm = dvrk.load_arm("psm").with_locked_joints(LOCKED)
+    arm = dvrk.lock_joints(dvrk.load_arm("psm"), LOCKED)
     regressor, console, results = DynamicRegressor(arm), Console(highlight=False, width=200), []
     for name, files in ARMS.items():
         recordings = {file: dvrk.read_recording(options.folder / f"{file}.csv", arm) for file in files}

@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.environment import Environment
+    from dvrk_drake.models.locked_joints import lock_joints
     from dvrk_drake.recordings.periodic_motion import PeriodicMotion
     from dvrk_drake.recordings.reading import read_recording
-    from dvrk_drake.recordings.recording import Recording, write_recording
+    from dvrk_drake.recordings.recording import Recording
     from dvrk_drake.recordings.samples import write_samples
+    from dvrk_drake.recordings.writing import write_recording
     from dvrk_drake.reports.html.write import write_report
     from dvrk_drake.systems.arm_station import ArmStation
     from dvrk_drake.systems.arm_view.page import start_meshcat
@@ -57,6 +59,7 @@ _MODULES = {
     "export_model": "export.model_export",
     "identify": "analysis.identification",
     "load_arm": "models.arm_files",
+    "lock_joints": "models.locked_joints",
     "load_scenario": "experiments.scenario",
     "payload": "analysis.payload.payload",
     "predict": "analysis.validation",
@@ -65,7 +68,7 @@ _MODULES = {
     "simulate": "experiments.simulation",
     "start_meshcat": "systems.arm_view.page",
     "validate": "analysis.validation",
-    "write_recording": "recordings.recording",
+    "write_recording": "recordings.writing",
     "write_report": "reports.html.write",
     "write_samples": "recordings.samples",
 }
@@ -90,6 +93,7 @@ __all__ = [
     "identify",
     "load_arm",
     "load_scenario",
+    "lock_joints",
     "payload",
     "predict",
     "read_recording",

@@ -63,6 +63,14 @@ def test_package_imports_only_allowed_packages(package):
     assert not wrong, "\n".join(sorted(wrong))
 
 
+def test_no_two_modules_import_each_other():
+    imports = {module: imports_of(path.read_text()) for module, path in MODULES.items()}
+    # An imported name is a module, or belongs to one.
+    modules = {m: {n if n in MODULES else n.rpartition(".")[0] for n in names} - {m} for m, names in imports.items()}
+    pairs = [f"{a} and {b}" for a, names in modules.items() for b in names if a < b and a in modules.get(b, ())]
+    assert not pairs, "\n".join(pairs)
+
+
 def test_finds_imports_at_all_places():
     source = """
 import numpy, dvrk_drake.models.arm

@@ -254,7 +254,7 @@ def _visit(
 ) -> None:
     import numpy as np
 
-    from dvrk_drake.models.coupled_limits import offset_pose
+    from dvrk_drake.models.approach import offset_pose
     from dvrk_drake.processes.collector import CollectionSettings, Collector, short_approach_offset
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine

@@ -78,7 +78,7 @@ def excite(
     """
     import numpy as np
 
-    from dvrk_drake.recordings.recording import write_csv
+    from dvrk_drake.recordings.writing import write_csv
     from dvrk_drake.reports.terminal_tables import make_console, print_answer
 
     of_motion = {

@@ -271,7 +271,7 @@ def predict(
             For a motion, it also contains the time t, and the columns lower1..lowern and upper1..uppern are the limits
             of the 95 % prediction interval.
     """
-    from dvrk_drake.recordings.recording import write_csv
+    from dvrk_drake.recordings.writing import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, model, overwrite=overwrite)

@@ -297,7 +297,7 @@ def mounted(arm: Arm, gravity: Sequence[float] | None, locked: Sequence[str] | N
         if name in positions:
             raise ArmError(f"--locked {argument}: {name} is given twice; give one position for each joint")
         positions[name] = position
-    return arm.with_locked_joints(positions)
+    return dvrk.lock_joints(arm, positions)
 
 
 class Steps:

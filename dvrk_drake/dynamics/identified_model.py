@@ -35,7 +35,7 @@ from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.models.locked_joints import locked_text
+from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.schema_fault import formerly, missing_key, schema_fault, with_current_keys, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
@@ -168,7 +168,7 @@ class _Header:
         format: Version of the file's keys.
         arm: URL or name of an arm of this package, or path of an arm file relative to the model file.
         gravity: Gravity vector (3,) in the arm's base frame [m/s^2].
-        locked_joints: Positions of the joints that were not recorded [rad, m], see `Arm.with_locked_joints`.
+        locked_joints: Positions of the joints that were not recorded [rad, m], see `lock_joints`.
     """
 
     format: str = field(default="", metadata=FORMAT.metadata)
@@ -272,7 +272,7 @@ class IdentifiedModel(_Identified):
             raise ModelError(f"{path}: {key} is missing")
         try:
             own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
-            own_arm = own_arm.with_locked_joints(file.locked_joints)
+            own_arm = lock_joints(own_arm, file.locked_joints)
             if arm is not None and own_arm.name != arm.name:
                 raise ModelError(f"the model is for {own_arm.name}, not for {arm.name}")
             if arm is not None and own_arm.joint_names != arm.joint_names:
@@ -453,7 +453,7 @@ def _other_joints(own: Arm, arm: Arm) -> str:
     if not own.locked_joints:
         return f"the model is for the joints {', '.join(own.joint_names)}; allowed: {', '.join(arm.joint_names)}"
     return (
-        f"the model is valid only with locked joints ({locked_text(own)}), because the recording did not contain them; "
+        f"the model is valid only with locked joints ({own.locked_text}), because the recording did not contain them; "
         f"allowed: a model of the joints {', '.join(arm.joint_names)}. Identify a recording of these joints"
     )
 

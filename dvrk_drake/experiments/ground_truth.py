@@ -26,9 +26,9 @@ from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.export.sdf import to_text, with_inertias
+from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation

@@ -21,12 +21,11 @@ from dvrk_drake.models.arm_schema import (
     LoopClosure,
     ViewSettings,
 )
-from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
+from dvrk_drake.models.coupled_limits import can_meet_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.immutable import cached, immutable
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.locked_joints import lock_joints, locked_text
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
 
 #: Maximum norm of the gravity vector [m/s^2].
@@ -70,8 +69,8 @@ class Arm:
             `simulated_effects`.
         separate_joint: Name of the joint that the dVRK publishes on separate ROS topics, e.g. "jaw", or "".
         console_gravity_compensation: Whether the dVRK's controller can compensate the gravity of this arm.
-        locked_joints: Positions of the joints that are locked [rad, m], see `with_locked_joints`. They are not among
-            the n independent joints.
+        locked_joints: Positions of the joints that are locked [rad, m], which are not among the independent joints; see
+            `dvrk_drake.models.locked_joints.lock_joints`.
         view: Close-ups, remote centre and tip for 3D views.
 
     Example:
@@ -116,7 +115,7 @@ class Arm:
             raise ArmError(fault)
 
     def __repr__(self) -> str:
-        locked = f", locked {locked_text(self)}" if self.locked_joints else ""
+        locked = f", locked {self.locked_text}" if self.locked_joints else ""
         return f"<Arm {self.name}: {self.source}{locked}>"
 
     def gains_fault(self, gains: Gains) -> str:
@@ -149,13 +148,13 @@ class Arm:
             yield EFFORTS.fault(f"effort limit of joint {name}", float(self.effort_limits[i]))
         yield self.gains_fault(self.gains)
         for limit in self.coupled_limits:
-            yield coupled_limit_fault(self, limit)
+            yield coupled_limit_fault(limit, self.joint_names, self.prismatic, self.position_lower, self.position_upper)
         for name, row in self.friction_coordinates.items():
             if not np.any(row):
                 yield f"friction_coordinates.{name}: all coefficients are 0; at least one must be nonzero"
         yield number_fault(self)
         checked_gravity(self.gravity)
-        if len(self.coupled_limits) > 1 and not can_meet_coupled_limits(self):
+        if len(self.coupled_limits) > 1 and not can_meet_limits(*self.limit_matrix()):
             yield "coupled_limits: no pose within position_limits meets all coupled limits; widen the limits"
 
     @property
@@ -252,26 +251,10 @@ class Arm:
         """
         return _mounted(self, tuple(checked_gravity(gravity).tolist()))
 
-    def with_locked_joints(self, positions: Mapping[str, float]) -> Arm:
-        """Returns the arm with locked joints, as with `pydrake.multibody.tree.Joint.Lock`.
-
-        The returned arm has only the other joints. Its dynamics are valid while the locked joints are at rest at the
-        given positions. Use it for recordings of only some of the joints.
-
-        Args:
-            positions: Mapping from the name of each locked joint to its position [rad, m].
-
-        Raises:
-            ArmError: A joint is unknown or already locked, a position violates a limit, all joints are locked, or a
-                motor or a position-dependent effect acts on a locked joint and on another joint.
-
-        Example:
-            >>> import dvrk_drake as dvrk
-            >>> arm = dvrk.load_arm("psm").with_locked_joints({"roll": 0, "wrist_pitch": 0, "wrist_yaw": 0, "jaw": 0})
-            >>> arm.num_joints, arm.joint_names
-            (3, ('yaw', 'pitch', 'insertion'))
-        """
-        return lock_joints(self, positions)
+    @property
+    def locked_text(self) -> str:
+        """Locked joints and their positions [rad, m], e.g. "roll = 0, jaw = 0.5", or "" if there are none."""
+        return ", ".join(f"{name} = {x:g}" for name, x in self.locked_joints.items())
 
     def refuse_locked_joints(self, use: str) -> None:
         """Raises ArmError if the arm has locked joints.
@@ -281,7 +264,7 @@ class Arm:
         """
         if self.locked_joints:
             raise ArmError(
-                f"{self.name} has locked joints ({locked_text(self)}), but {use} requires all joints; use a model that "
+                f"{self.name} has locked joints ({self.locked_text}), but {use} requires all joints; use a model that "
                 "was identified from a recording of all joints"
             )
 

@@ -4,27 +4,43 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError, RecordingError
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import CoupledLimit, Gains
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.schema_fault import suggest_name
 
-if TYPE_CHECKING:
-    from dvrk_drake.models.arm import Arm
-
 #: Largest distance of a locked joint from its stated position in a recording [rad, m].
 MAX_LOCKED_ERROR = 0.02
 
 
 def lock_joints(arm: Arm, positions: Mapping[str, float]) -> Arm:
-    """Returns the arm with locked joints. For arguments and errors, see `Arm.with_locked_joints`."""
+    """Returns the arm with locked joints, as with `pydrake.multibody.tree.Joint.Lock`.
+
+    The returned arm has only the other joints. Its dynamics are valid while the locked joints are at rest at the given
+    positions. Use it for recordings of only some of the joints.
+
+    Args:
+        arm: Arm with the joints.
+        positions: Mapping from the name of each locked joint to its position [rad, m].
+
+    Raises:
+        ArmError: A joint is unknown or already locked, a position violates a limit, all joints are locked, or a motor
+            or a position-dependent effect acts on a locked joint and on another joint.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.lock_joints(dvrk.load_arm("psm"), {"roll": 0, "wrist_pitch": 0, "wrist_yaw": 0, "jaw": 0})
+        >>> arm.num_joints, arm.joint_names
+        (3, ('yaw', 'pitch', 'insertion'))
+    """
     positions = {name: float(position) for name, position in positions.items()}
     accepted = f"allowed: {', '.join(arm.joint_names)}"
     for name, position in positions.items():
@@ -65,11 +81,6 @@ def lock_hint(arm: Arm, num_recorded: int) -> str:
         f"If {', '.join(names)} {'were' if len(names) > 1 else 'was'} held, state the positions [rad, m], e.g. "
         f"--locked {stated}"
     )
-
-
-def locked_text(arm: Arm) -> str:
-    """Returns the locked joints and their positions [rad, m], e.g. "roll = 0, jaw = 0.5", or "" if there are none."""
-    return ", ".join(f"{name} = {x:g}" for name, x in arm.locked_joints.items())
 
 
 def locked_option(arm: Arm) -> str:

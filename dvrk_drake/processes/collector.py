@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError
+from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_mover import SETTLE, ArmMover, Steps

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import ControlModel
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
-from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
+from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, REST, REST_TIME, SETTLE, Steps
 from dvrk_drake.processes.collector import MEASURE, CollectionSettings

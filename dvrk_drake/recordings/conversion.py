@@ -13,7 +13,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Coordinates, Recording, write_recording
+from dvrk_drake.recordings.recording import Coordinates, Recording
+from dvrk_drake.recordings.writing import write_recording
 
 
 def convert(

@@ -33,8 +33,9 @@ from dvrk_drake.recordings.csv_rows import (
 )
 from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
-from dvrk_drake.recordings.recording import UNITS, Recording
+from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.topic_choice import check_namespace
+from dvrk_drake.recordings.writing import UNITS
 
 #: Nominal sampling rate of the motions of WPI [Hz].
 WPI_RATE = 200.0

@@ -21,7 +21,7 @@ from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite
 from dvrk_drake.recordings.lcm_log_reader import measurements
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
-from dvrk_drake.recordings.recording import column_names
+from dvrk_drake.recordings.writing import column_names
 
 #: Shortest part that `identify` can use, with a margin [s].
 MIN_PART = 12.0

@@ -17,7 +17,8 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite, read_bytes, read_rows
-from dvrk_drake.recordings.recording import SAME_POSE, Recording, column_names
+from dvrk_drake.recordings.recording import SAME_POSE, Recording
+from dvrk_drake.recordings.writing import column_names
 
 #: Tolerance of the limits [rad, m], because the positions in a file may be rounded.
 _ROUNDING = 1e-9

@@ -22,7 +22,7 @@ from dvrk_drake.recordings.arm_bag import ArmMessages
 from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.mcap_writer import GrowingMcap
-from dvrk_drake.recordings.recording import column_names
+from dvrk_drake.recordings.writing import column_names
 
 #: Ending of the file name of an LCM log.
 LCM_LOG = ".log"

@@ -11,7 +11,7 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import write_recording
+from dvrk_drake.recordings.writing import write_recording
 
 #: Folder of the CSV files.
 SAMPLES_FOLDER = Path(__file__).resolve().parent.parent / "samples"

@@ -21,7 +21,6 @@ from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLo
 from dvrk_drake.export.model_export import ModelExport
 from dvrk_drake.export.sdf import LinkChange, changed_links
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
@@ -149,7 +148,7 @@ def _print_kinematic_compensation(
     """Prints the largest differences from the model, and the links of the kinematic chain in the file."""
     entries = f'"kinematic_gc": "{Path(path).name}", "mounting_pitch": {file.mounting_pitch:.6g}'
     print_answer(console, _loss_text(file.loss), f"enter {entries} in the JSON file of the arm")
-    locked = locked_text(export.model.arm)
+    locked = export.model.arm.locked_text
     columns = (f"with {locked}",) if locked else ("straight instrument", "change by a bent wrist")
     title = "Largest difference from the model at rest, also in % of the effort limit"
     table = make_table(title, "", "", columns[0], "%", *columns[1:])

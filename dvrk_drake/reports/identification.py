@@ -27,7 +27,6 @@ from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.reports.answers import Answer, answer_of, percent
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -83,7 +82,7 @@ def _print_locked_joints(console: Console, arm: Arm) -> None:
     """Prints the locked joints, and the positions for which the model is valid."""
     if arm.locked_joints:
         console.print(
-            f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {locked_text(arm)} "
+            f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {arm.locked_text} "
             "[rad, m], and it has no efforts of these joints.",
             style="yellow",
             markup=False,

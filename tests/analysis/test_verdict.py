@@ -36,7 +36,8 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 ARM = load_arm("mtmr")
 LIMITS = Tolerance(friction=0.4, stiffness=0.6)

@@ -22,7 +22,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.processes import arm_controller, control, simulated_arm
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.recordings import csv_rows
 from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import write_recording
+from dvrk_drake.recordings.writing import write_recording
 
 ARM = load_arm("mtml")
 #: Mapping from a file name to its reader.

@@ -13,6 +13,7 @@ from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, shared_plant
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.arm_station import ArmStation, station_ports
@@ -32,7 +33,7 @@ CASES = [
 def both(name, locked, count=20):
     """Returns the full arm, the arm with locked joints, and a motion of both arms."""
     full = load_arm(name)
-    arm = full.with_locked_joints(locked)
+    arm = lock_joints(full, locked)
     free = [full.joint_names.index(joint) for joint in arm.joint_names]
     motion = np.random.default_rng(0).normal(0, 0.5, (3, count, arm.num_joints))
     whole = np.zeros((3, count, full.num_joints))
@@ -91,25 +92,22 @@ def test_plant_has_the_locked_positions():
 
 def test_equal_arguments_give_the_same_arm():
     arm = load_arm("psm")
-    locked = arm.with_locked_joints(WRIST)
-    assert locked is arm.with_locked_joints(dict(reversed(WRIST.items())))
-    assert arm.with_locked_joints({}) is arm
+    locked = lock_joints(arm, WRIST)
+    assert locked is lock_joints(arm, dict(reversed(WRIST.items())))
+    assert lock_joints(arm, {}) is arm
     assert locked.joint_names == ("yaw", "pitch", "insertion") and locked.locked_joints == WRIST
     assert locked.with_gravity([0, 1, -9]).locked_joints == WRIST
-    twice = arm.with_locked_joints({"roll": 0.4}).with_locked_joints({k: WRIST[k] for k in list(WRIST)[1:]})
+    twice = lock_joints(lock_joints(arm, {"roll": 0.4}), {k: WRIST[k] for k in list(WRIST)[1:]})
     assert twice.joint_names == locked.joint_names and twice.locked_joints == WRIST
 
 
 def test_bounds_of_coupled_limits_include_locked_joints():
-    arm = load_arm("mtml").with_locked_joints({"outer_yaw": 0.1})
+    arm = lock_joints(load_arm("mtml"), {"outer_yaw": 0.1})
     assert arm.coupled_limits == load_arm("mtml").coupled_limits
     sample = load_arm("mtml").coupled_limits[0]
     weighted = dataclasses.replace(sample, coefficients={"outer_yaw": 2.0, "shoulder_pitch": 1.0})
-    (limit,) = (
-        dataclasses.replace(load_arm("mtml"), coupled_limits=(weighted,))
-        .with_locked_joints({"outer_yaw": 0.1})
-        .coupled_limits
-    )
+    arm = dataclasses.replace(load_arm("mtml"), coupled_limits=(weighted,))
+    (limit,) = lock_joints(arm, {"outer_yaw": 0.1}).coupled_limits
     assert limit.coefficients == {"shoulder_pitch": 1.0}
     assert limit.lower == pytest.approx(sample.lower - 0.2, abs=1e-12)
     assert limit.upper == pytest.approx(sample.upper - 0.2, abs=1e-12)
@@ -137,27 +135,27 @@ def test_bounds_of_coupled_limits_include_locked_joints():
 )
 def test_refusals_state_what_is_accepted(name, locked, message):
     with pytest.raises(ArmError, match=message):
-        load_arm(name).with_locked_joints(locked)
+        lock_joints(load_arm(name), locked)
 
 
 def test_a_locked_joint_is_locked_once():
     with pytest.raises(ArmError, match=r"joint roll is already locked at 0\.4"):
-        load_arm("psm").with_locked_joints(WRIST).with_locked_joints({"roll": 0.4})
+        lock_joints(lock_joints(load_arm("psm"), WRIST), {"roll": 0.4})
 
 
 def test_position_effects_of_locked_and_other_joints_are_refused():
     psm = load_arm("psm")
     mixed = {"bend": np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0])}
     with_friction = dataclasses.replace(psm, friction_coordinates=psm.friction_coordinates | mixed)
-    locked = with_friction.with_locked_joints(WRIST)
+    locked = lock_joints(with_friction, WRIST)
     np.testing.assert_allclose(locked.friction_coordinates["bend"], [0.0, 1.0, 0.0], atol=0)
     spring = dataclasses.replace(psm.effects, springs=[DriveEffect("bend", "spring", 1.0, 0.1)])
     with pytest.raises(ArmError, match="bend has position-dependent effects"):
-        dataclasses.replace(with_friction, effects=spring).with_locked_joints(WRIST)
+        lock_joints(dataclasses.replace(with_friction, effects=spring), WRIST)
 
 
 def test_model_file_restores_the_locked_joints(tmp_path):
-    arm = load_arm("psm").with_locked_joints(WRIST)
+    arm = lock_joints(load_arm("psm"), WRIST)
     for dynamics in (False, True):
         model = IdentifiedModel.from_arm(arm, dynamics=dynamics)
         model.save(tmp_path / "m.yaml")
@@ -192,11 +190,11 @@ def controller(arm):
 @pytest.mark.parametrize("create", [ArmStation, station_ports, controller])
 def test_stations_and_controllers_require_all_joints(create):
     with pytest.raises(ArmError, match=r"PSM has locked joints \(roll = 0.4, .*\), but a .* requires all joints"):
-        create(load_arm("psm").with_locked_joints(WRIST))
+        create(lock_joints(load_arm("psm"), WRIST))
 
 
 def test_an_arm_and_its_parts_cannot_be_modified():
-    arm = load_arm("psm").with_locked_joints({"roll": 0})
+    arm = lock_joints(load_arm("psm"), {"roll": 0})
     for change in (
         lambda: setattr(arm, "name", "other"),
         lambda: setattr(arm.gains, "kp", [1.0]),
@@ -226,7 +224,7 @@ def test_threads_get_the_same_arm(tmp_path):
     def load(_):
         start.wait()
         arm = load_arm(tmp_path / "arm.yaml")
-        locked = arm.with_gravity([0, -1, -9.7]).with_locked_joints({"roll": 0})
+        locked = lock_joints(arm.with_gravity([0, -1, -9.7]), {"roll": 0})
         return arm, locked, shared_plant(locked)
 
     with ThreadPoolExecutor(4) as pool:

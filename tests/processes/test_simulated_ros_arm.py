@@ -55,7 +55,7 @@ class Client:
     def __init__(self, arm, namespace, *options):
         self.arm = load_arm(arm)
         self.process = dvrk_drake("arm", "--arm", arm, "--ros", *options)
-        self.domain, self.namespace = ros.RosDomain(), namespace
+        self.domain, self.namespace = ros.RosDomain(0), namespace
         jaw = self.arm.separate_joint
         self.num_main = self.arm.num_joints - bool(jaw)
         jaw_commands = {f"jaw/{name}": JointState for name in ("servo_jp", "servo_jf", "move_jp")}
@@ -213,7 +213,7 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     assert other.wait() == 2
     assert "another arm publishes /dvrk/PSM2/measured_js in ROS domain 0. End it, or " in other.output()
     second = client.domain.advertise("/dvrk/PSM2/measured_js", JointState)
-    observer = ros.RosDomain()
+    observer = ros.RosDomain(0)
 
     def others():
         return other_publishers(observer, client.arm, "/dvrk/PSM2")

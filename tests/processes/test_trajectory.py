@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from sticky_arm import random_poses
 
+from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.processes.teacher import RestDetector
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 

@@ -17,16 +17,18 @@ from recordings import random_recording, six_joint_arm
 from rosbags.highlevel import AnyReader
 
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.recordings.arm_bag import joint_state_topics
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording, Setpoints, write_recording
+from dvrk_drake.recordings.recording import Recording, Setpoints
+from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = pytest.mark.drake_api
 
 ARMS = {name: load_arm(name) for name in ("mtml", "mtmr", "psm")}
-ARMS["three joints"] = ARMS["psm"].with_locked_joints({"roll": 0.3, "wrist_pitch": -0.2, "wrist_yaw": 0.1, "jaw": 0.4})
+ARMS["three joints"] = lock_joints(ARMS["psm"], {"roll": 0.3, "wrist_pitch": -0.2, "wrist_yaw": 0.1, "jaw": 0.4})
 
 
 @pytest.fixture(params=ARMS)

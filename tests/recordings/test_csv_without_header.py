@@ -10,7 +10,7 @@ from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wp
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import write_recording
+from dvrk_drake.recordings.writing import write_recording
 
 ARM = load_arm("mtml")
 

@@ -22,7 +22,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.arm_bag import ArmMessages
 from dvrk_drake.recordings.mcap_writer import GrowingMcap
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 ARMS = {name: load_arm(name) for name in ("mtml", "psm")}
 TOPICS = {"mtml": ["/MTML/measured_js"], "psm": ["/PSM/jaw/measured_js", "/PSM/measured_js"]}

@@ -11,7 +11,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.reading import detect_format, read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 ARRAYS, CSV = "a MATLAB file or NumPy archive", "a CSV"
 

@@ -12,6 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.recordings.reading import detect_format, read_recording
 
 START = 1_700_000_000_000_000_000
@@ -95,7 +96,7 @@ def test_names_the_missing_topic_of_the_jaw(psm, tmp_path):
 
 
 def test_locked_joints_are_absent_or_held(psm, tmp_path):
-    locked = psm.with_locked_joints({"roll": 0, "wrist_pitch": 0, "wrist_yaw": 0, "jaw": 0})
+    locked = lock_joints(psm, {"roll": 0, "wrist_pitch": 0, "wrist_yaw": 0, "jaw": 0})
     q, qd, tau = blocks(5, 3)
     path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": joint_states(stamps(5), psm.joint_names[:3], q, qd, tau)})
     np.testing.assert_array_equal(read_recording(path, locked).q, q)

@@ -19,7 +19,6 @@ from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import COORDINATES_HELP, MIN_RANGE, REST_SPEED, Recording
 
@@ -57,7 +56,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     report = RecordingReport(source, arm.name, "motion" if recording.is_motion else "poses", len(recording))
     findings = [Finding("note", "reading", source, note.removesuffix("."), "") for note in recording.notes]
     if arm.locked_joints:
-        what = f"the recording does not contain these joints, which are assumed at rest at {locked_text(arm)} [rad, m]"
+        what = f"the recording does not contain these joints, which are assumed at rest at {arm.locked_text} [rad, m]"
         advice = "Their friction, motors and efforts are not identifiable. The model is valid only for these positions."
         findings.append(Finding("note", "locked joints", ", ".join(arm.locked_joints), what, advice))
     try:

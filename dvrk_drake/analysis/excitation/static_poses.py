@@ -19,8 +19,8 @@ from dvrk_drake.analysis.static.effect_selection import StaticProblem, candidate
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, MIN_TORQUE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
+from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import refuse_existing
 from dvrk_drake.models.plant import inverse_dynamics

@@ -30,7 +30,8 @@ from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.progress import Progress
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import page_html, start_meshcat

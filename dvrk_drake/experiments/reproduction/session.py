@@ -28,7 +28,8 @@ from dvrk_drake.experiments.transparency import Compensation, OperatorForces, ra
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.progress import Progress
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Case, Study
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.csv_rows import GrowingFile, read_bytes
-from dvrk_drake.recordings.recording import column_names
+from dvrk_drake.recordings.writing import column_names
 
 
 @dataclass(frozen=True)

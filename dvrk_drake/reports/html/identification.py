@@ -15,7 +15,6 @@ from dvrk_drake.analysis.static.static_identification import StaticIdentificatio
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.locked_joints import locked_text
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.answers import answer_of, percent
 from dvrk_drake.reports.html.consistency import consistency_blocks
@@ -117,7 +116,7 @@ def _locked(result: Identification | Validation) -> list[Block]:
         return []
     return [
         Text(
-            f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {locked_text(arm)} "
+            f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {arm.locked_text} "
             "[rad, m], and it has no efforts of these joints.",
             "warning",
         )

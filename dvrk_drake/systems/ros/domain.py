@@ -20,7 +20,6 @@ from cyclonedds.sub import DataReader
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.systems.ros.messages import JointState, dds_type_name, ros_type_name, type_hash
-from dvrk_drake.systems.ros.open_domain import domain_number
 from dvrk_drake.systems.ros.topic import DDS_PREFIX, Message, Publisher, Subscription, ros_qos
 
 #: Number of messages that a latched topic keeps for subscribers that join later, as in the dVRK's ROS interface.
@@ -66,16 +65,12 @@ class RosDomain:
         participant: DDS participant.
     """
 
-    def __init__(self, domain: int | None = None) -> None:
-        """Joins a domain.
-
-        Args:
-            domain: Number of the domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+    def __init__(self, number: int) -> None:
+        """Joins the domain with this number; see `dvrk_drake.systems.ros.open_domain.open_ros_domain`.
 
         Raises:
-            DvrkDrakeError: The number is not valid, or the network of the domain cannot be used.
+            DvrkDrakeError: The network of the domain cannot be used.
         """
-        number = domain_number(domain)
         self.name = f"ROS domain {number}"
         try:
             self.participant = _participant(number)

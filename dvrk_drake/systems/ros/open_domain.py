@@ -49,4 +49,4 @@ def open_ros_domain(domain: int | None = None) -> RosDomain:
     require_cyclonedds()
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    return RosDomain(domain)
+    return RosDomain(domain_number(domain))

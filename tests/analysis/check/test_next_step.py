@@ -6,7 +6,8 @@ from command_output import messages
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 MTML = load_arm("mtml")
 

@@ -24,7 +24,8 @@ from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.reports.terminal_tables import make_table
 
 pytestmark = pytest.mark.slow

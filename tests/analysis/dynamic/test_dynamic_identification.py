@@ -24,7 +24,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.recordings.recording import Recording, file_transmission, write_recording
+from dvrk_drake.recordings.recording import Recording, file_transmission
+from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.reports.identification import print_identification
 from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
 

@@ -21,7 +21,7 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.recordings.recording import write_recording
+from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = pytest.mark.numeric
 

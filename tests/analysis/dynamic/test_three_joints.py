@@ -13,8 +13,10 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = [pytest.mark.numeric, pytest.mark.slow]
 
@@ -28,7 +30,7 @@ FRICTION = [
     DriveEffect("actuator.insertion", "coulomb", 0.01, 0.6),
 ]
 PSM = load_arm("psm")
-ARM = PSM.with_locked_joints(WRIST)
+ARM = lock_joints(PSM, WRIST)
 TRUTH = true_dynamics(PSM, np.random.default_rng(0), FRICTION)
 
 
@@ -132,7 +134,7 @@ def test_real_recordings_of_two_arms(shared_data):
     data = shared_data / "psm_three_joints"
     if not data.is_dir():
         pytest.skip(f"needs the recordings {data}")
-    arm = load_arm("psm").with_locked_joints(dict.fromkeys(WRIST, 0.0))
+    arm = lock_joints(load_arm("psm"), dict.fromkeys(WRIST, 0.0))
     for fitted, other, worst in (("psm1_2", "psm1_3", 0.15), ("psm2_1", "psm2_2", 0.15)):
         model = identify_dynamic([read_recording(data / f"{fitted}.csv", arm)], arm).model
         assert validate_motion(model, read_recording(data / f"{other}.csv", arm)).mean_relative_error < worst

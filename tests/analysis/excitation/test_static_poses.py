@@ -20,7 +20,7 @@ from dvrk_drake.analysis.excitation.static_poses import (
 )
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
-from dvrk_drake.models.coupled_limits import approach_offset, offset_pose
+from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, approaches
 from dvrk_drake.recordings.pose_file import load_poses

@@ -25,7 +25,8 @@ from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.reports.payload import print_payload
 from dvrk_drake.reports.terminal_tables import make_console
 

@@ -11,11 +11,12 @@ from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT, estimate_gr
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 
 #: The first three joints of a PSM, because their gravity model is derived quickly.
 LOCKED = {"roll": 0.0, "wrist_pitch": 0.0, "wrist_yaw": 0.0, "jaw": 0.0}
-ARM = dvrk.load_arm("psm").with_locked_joints(LOCKED)
+ARM = dvrk.lock_joints(dvrk.load_arm("psm"), LOCKED)
 TILTED = [4.905, 0.0, -8.4957]
 
 

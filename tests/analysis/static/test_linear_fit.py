@@ -35,7 +35,7 @@ def test_blocks_are_successive_and_of_similar_size():
 @pytest.mark.slow
 def test_cross_validation_holds_out_neighbouring_poses():
     """A sweep with a smooth error that no effect represents: the error at a pose is predicted from its neighbours."""
-    arm = dvrk.load_arm("psm").with_locked_joints({"roll": 0.0, "wrist_pitch": 0.0, "wrist_yaw": 0.0, "jaw": 0.0})
+    arm = dvrk.lock_joints(dvrk.load_arm("psm"), {"roll": 0.0, "wrist_pitch": 0.0, "wrist_yaw": 0.0, "jaw": 0.0})
     s = np.linspace(0, 1, 60)
     q = np.stack([0.5 * np.sin(2 * np.pi * s), -0.7 + 1.4 * s, 0.06 + 0.12 * s], axis=1)
     regressor = DynamicRegressor(arm)

@@ -16,7 +16,8 @@ from dvrk_drake.experiments.ground_truth import collect_static_poses, perturbed_
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, set_joint_damping
-from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 
 pytestmark = pytest.mark.numeric

@@ -18,6 +18,7 @@ from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
 from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
@@ -173,17 +174,17 @@ def test_unused_subscription_ends(domain):
 
 PUBLISH = """
 import time
-from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
 from dvrk_drake.systems.ros.messages import Empty
-publisher = RosDomain().advertise("/often", Empty)
+publisher = open_ros_domain().advertise("/often", Empty)
 while True:
     publisher.publish(Empty())
     time.sleep(5e-4)
 """
 SUBSCRIBE = """
-from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
 from dvrk_drake.systems.ros.messages import Empty
-domain = RosDomain()
+domain = open_ros_domain()
 for _ in range(1500):
     subscription = domain.subscribe("/often", Empty)
     assert domain.wait_until(subscription.take, 60.0)
@@ -295,7 +296,7 @@ def test_bytes_on_the_network_end_with_zeros(domain, arm):
 def test_invalid_domain_is_refused(value, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", value)
     with pytest.raises(module.DvrkDrakeError, match=f"ROS domain {value}: allowed: 0 to 232"):
-        module.RosDomain()
+        open_ros_domain()
 
 
 def test_configuration_of_the_user_is_kept(domain):
