@@ -16,6 +16,11 @@ import numpy as np
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
+def read_only(dimension: int) -> numba.types.Array:
+    """Returns the type of an argument that a function only reads: any C-contiguous array of float64."""
+    return numba.types.Array(numba.float64, dimension, "C", readonly=True)
+
+
 def compiled_for(*arguments: numba.types.Type) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Returns a decorator as `compiled` for a function without result, whose arguments have these types only.
 

@@ -135,7 +135,7 @@ class DynamicRegressor:
         return tau
 
     def _fill(self, motion: tuple[NDArray, ...], gravity: NDArray, Y: NDArray) -> None:
-        fill_regressor(*motion, np.array(gravity), self._tree.arrays, self._rotor_rows, Y)
+        fill_regressor(*motion, gravity, self._tree.arrays, self._rotor_rows, Y)
 
     @cached_property
     def _rotor_rows(self) -> NDArray[np.float64]:

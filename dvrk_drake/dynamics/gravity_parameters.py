@@ -134,7 +134,8 @@ def _regressor_at_rest(
     place = np.full(4 * len(tree.links), -1)
     place[columns] = np.arange(len(columns))
     Y = np.empty((*q.shape, len(columns)))
-    fill_gravity_regressor(np.array(q, dtype=np.float64), np.array(gravity), tree.arrays, place.reshape(-1, 4), Y)
+    q = np.ascontiguousarray(q, dtype=np.float64)
+    fill_gravity_regressor(q, gravity, tree.arrays, place.reshape(-1, 4), Y)
     return Y
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_step, joint_row, position_along
-from dvrk_drake.dynamics.compiled import compiled, compiled_for, sin_cos
+from dvrk_drake.dynamics.compiled import compiled, compiled_for, read_only, sin_cos
 from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
@@ -93,7 +93,6 @@ class HoldingArrays(NamedTuple):
         return HoldingArrays(links, self.effects, np.concatenate([self.rows[:1], tree.G, self.rows[1:]]))
 
 
-_numbers = numba.float64[::1]
 #: Type of `HoldingArrays` for compiled functions.
 HOLDING = numba.types.NamedTuple(
     (numba.from_dtype(LINK)[::1], numba.from_dtype(EFFECT)[::1], numba.float64[:, ::1]), HoldingArrays
@@ -113,7 +112,7 @@ def _add_effort(effort, row, torque):  # pragma: no cover - compiled
         torque[j] += effort * row[j]
 
 
-@compiled_for(_numbers, HOLDING, _numbers)
+@compiled_for(read_only(1), HOLDING, numba.float64[::1])
 def holding_torque_into(q, model, torque):  # pragma: no cover - compiled
     """Writes the torque (n,) [N m, N] that holds an arm at pose q (n,) [rad, m] to `torque`.
 
@@ -156,7 +155,7 @@ def holding_torque_into(q, model, torque):  # pragma: no cover - compiled
         _add_effort(effect.coefficient * shape, row, torque)
 
 
-@compiled_for(numba.float64[:, ::1], HOLDING, numba.float64[:, ::1])
+@compiled_for(read_only(2), HOLDING, numba.float64[:, ::1])
 def holding_torques_into(q, model, torque):  # pragma: no cover - compiled
     """Writes the holding torques (m, n) at poses q (m, n) to `torque`, see `holding_torque_into`."""
     for i in range(len(q)):

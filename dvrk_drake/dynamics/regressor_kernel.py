@@ -34,6 +34,7 @@ from dvrk_drake.dynamics.compiled import (
     compiled_for,
     cross,
     dot,
+    read_only,
     scale,
     sin_cos,
     times,
@@ -228,7 +229,7 @@ def _rotor_torques(a, b, vd, out):  # pragma: no cover - compiled
                     out[s, j] += inertia * vd[k * BLOCK + s]
 
 
-@compiled_for(*(_number[:, ::1],) * 3, _number[::1], TREE, _number[:, :, ::1], _number[:, :, ::1])
+@compiled_for(*(read_only(2),) * 3, read_only(1), TREE, _number[:, :, ::1], _number[:, :, ::1])
 def fill_regressor(q, v, vd, gravity, tree, rotors, out):  # pragma: no cover - compiled
     """Computes the regressor (m, n, 10 l + r) of an arm with n independent joints, l links and r rotor parameters.
 
@@ -305,7 +306,7 @@ def _torques_of_weight(C, weight, torques):  # pragma: no cover - compiled
         _store(torques, 1, s, transposed_times(R, b))
 
 
-@compiled_for(_number[:, ::1], _number[::1], TREE, numba.int64[:, ::1], _number[:, :, ::1])
+@compiled_for(read_only(2), read_only(1), TREE, numba.int64[:, ::1], _number[:, :, ::1])
 def fill_gravity_regressor(q, gravity, tree, columns, out):  # pragma: no cover - compiled
     """Computes columns of the regressor of an arm at rest. It equals `fill_regressor`, without all that is zero.
 

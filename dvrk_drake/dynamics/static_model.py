@@ -50,7 +50,7 @@ class StaticModel:
 
     def torque(self, q: ArrayLike, theta: ArrayLike) -> NDArray[np.float64]:
         """Returns the holding torque [N m or N]: (n,) for one pose q (n,), (m, n) for m poses (m, n)."""
-        poses = np.array(q, dtype=np.float64, ndmin=2)
+        poses = np.atleast_2d(np.ascontiguousarray(q, dtype=np.float64))
         tau = np.empty(poses.shape)
         holding_torques_into(poses, self.with_parameters(theta), tau)
         return tau if np.ndim(q) == 2 else tau[0]

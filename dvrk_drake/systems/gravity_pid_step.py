@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from dvrk_drake.dynamics.compiled import compiled_for
+from dvrk_drake.dynamics.compiled import compiled_for, read_only
 from dvrk_drake.dynamics.holding_torque import HOLDING, holding_torque_into
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 
@@ -14,12 +14,13 @@ HOLD, GRAVITY, DAMPED = 0, 1, 2
 
 
 _array = numba.float64[::1]
-_view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # type of Drake's input vectors
 _memory = (_array,) * 6
 _flag = numba.boolean
 
 
-@compiled_for(_view, _view, _flag, _flag, numba.float64, numba.int64, numba.float64[:, ::1], HOLDING, *_memory)
+@compiled_for(
+    read_only(1), read_only(1), _flag, _flag, numba.float64, numba.int64, numba.float64[:, ::1], HOLDING, *_memory
+)
 def controller_step(
     state,
     desired,
