@@ -1,6 +1,7 @@
 """Packages import in one direction: `models` is the lowest package, `cli` the highest."""
 
 import ast
+from functools import cache
 
 import pytest
 from repository import ROOT
@@ -27,6 +28,7 @@ MODULES = {
 }
 
 
+@cache
 def imports_of(source: str) -> set[str]:
     """Returns the names of all modules that a source imports, also in functions and under TYPE_CHECKING."""
     found = set()

@@ -6,7 +6,10 @@ notices changes of the file of a function, but not of the files of the functions
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -26,8 +29,31 @@ def compiled_for(*arguments: numba.types.Type) -> Callable[[Callable[..., None]]
 
     The import of its module compiles the function or reads it from the cache, so calls never wait for the compiler.
     """
-    signature = numba.void(*arguments)
-    return numba.njit(signature, cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        dispatcher = compiled(function)
+        if not _is_cached(function, Path(dispatcher.stats.cache_path or "")):
+            _announce()
+        dispatcher.compile(numba.void(*arguments))
+        dispatcher.disable_compile()
+        return dispatcher
+
+    return decorate
+
+
+def _is_cached(function: Callable[..., None], folder: Path) -> bool:
+    """Returns whether a folder of numba's cache has an index of the present file of the function."""
+    source = Path(function.__code__.co_filename)
+    index = folder.glob(f"{source.stem}.{function.__name__}-{function.__code__.co_firstlineno}.py*.nbi")
+    return any(file.stat().st_mtime > source.stat().st_mtime for file in index)
+
+
+@cache
+def _announce() -> None:
+    """Prints once why the first import takes long."""
+    print(
+        "dvrk_drake compiles its functions once per installation, which takes about 10 s", file=sys.stderr, flush=True
+    )
 
 
 def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:

@@ -56,12 +56,12 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
     parameters = gravity_parameters(arm, frames, serial)
     plant = SymbolicPlant(arm, frames)
     chosen = [parameters.standard_parameters[column] for column in parameters.base.columns]
-    # `potential_energy` returns simplified terms, so the opposite rotations in a linkage cancel before differentiation.
-    energies, ring = [plant.potential_energy(p.label, p.axis) for p in chosen], plant.ring
-    columns = [[ring.to_sympy(ring.shortest(ring.derivative(e, q))) for e in energies] for q in plant.q]
+    # `potential_energy` returns short forms, so the opposite rotations in a linkage cancel before differentiation.
+    energies = [plant.potential_energy(p.label, p.axis) for p in chosen]
+    rows = [[plant.shortest(sympy.diff(energy, q)) for energy in energies] for q in plant.q]
     return SymbolicGravity(
         **{part.name: getattr(parameters, part.name) for part in fields(parameters)},
         q=plant.q,
-        regressor=sympy.ImmutableDenseMatrix(GRAVITY * sympy.Matrix(columns)),
-        potential=sympy.ImmutableDenseMatrix([[GRAVITY * ring.to_sympy(energy) for energy in energies]]),
+        regressor=sympy.ImmutableDenseMatrix(GRAVITY * sympy.Matrix(rows)),
+        potential=sympy.ImmutableDenseMatrix([[GRAVITY * energy for energy in energies]]),
     )

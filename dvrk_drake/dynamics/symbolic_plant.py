@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.dynamics.gravity_parameters import exact_rotation, link_frames
-from dvrk_drake.dynamics.trigonometric_ring import Polynomial, TrigonometricRing, exact_half
+from dvrk_drake.dynamics.trigonometric_form import exact_half, shortest_form
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant, tree_selector
 
@@ -26,7 +26,6 @@ class SymbolicPlant:
         bodies: Label ("1" to "7", "crank", ...) -> moving body B and the pose X_BF of its frame F, see
             `link_frames`.
         q: Joint positions as sympy symbols q1, ..., qn [rad, m].
-        ring: Ring of polynomials in q and in sines and cosines of sums of q.
     """
 
     def __init__(self, arm: Arm, frames: str = "dh") -> None:
@@ -47,7 +46,8 @@ class SymbolicPlant:
         drake_q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]
         self.q = tuple(sympy.Symbol(f"q{i + 1}", real=True) for i in range(arm.num_joints))
         self._heights: dict[str, list[symbolic.Expression]] = {}
-        self.ring = TrigonometricRing(self.q, _parallel_sums(self.numeric, arm, self.q))
+        self._memo: dict = {}
+        self._sums = _parallel_sums(self.numeric, arm, self.q)
         q_plant = np.empty(self._plant.num_positions(), dtype=object)
         q_plant[tree_selector(self.numeric, arm)] = _tree_positions(arm, drake_q)
         self._plant.SetPositions(self._context, q_plant)
@@ -63,14 +63,22 @@ class SymbolicPlant:
             X_BF_exact = _exact_matrix(X_BF)
             X_0B = [[_dot(row, column) for column in X_WB.T] for row in X_0W]
             poses[label] = sympy.ImmutableDenseMatrix(
-                [[self._simplified(_dot(column, row)) for column in X_BF_exact.T] for row in X_0B]
+                [[self._from_drake(_dot(column, row)) for column in X_BF_exact.T] for row in X_0B]
             )
         return poses
 
-    def _simplified(self, expression: symbolic.Expression) -> sympy.Expr:
-        return self.ring.to_sympy(self.ring.shortest(self.ring.from_drake(expression)))
+    def shortest(self, expression: sympy.Expr) -> sympy.Expr:
+        """Returns a short form of an expression in q, see `shortest_form`."""
+        return shortest_form(expression, self._sums)
 
-    def potential_energy(self, label: str, axis: str) -> Polynomial:
+    def _from_drake(self, expression: symbolic.Expression) -> sympy.Expr:
+        converted = symbolic.to_sympy(expression, memo=self._memo)
+        converted = converted.xreplace({s: self.q[int(s.name[1:]) - 1] for s in converted.free_symbols})
+        trigonometric = converted.atoms(sympy.sin, sympy.cos)
+        exact = {x: x.xreplace({f: exact_half(float(f)) for f in x.atoms(sympy.Float)}) for x in trigonometric}
+        return self.shortest(converted.xreplace(exact))
+
+    def potential_energy(self, label: str, axis: str) -> sympy.Expr:
         """Returns the potential energy per unit of a parameter of a link, for gravity of 1 m/s^2.
 
         The potential energy is linear in mass and first moments. A unit mass at the origin of F contributes
@@ -89,7 +97,7 @@ class SymbolicPlant:
             # The row is -g_W' (R_WB, p_WBo). `_dot` omits zeros, so the expressions contain no terms with factor 0.
             self._heights[label] = [_dot(-g_W, X_WB[:3, j]) for j in range(4)]
         column = _exact_matrix(self.bodies[label][1])[:, "xyz".index(axis) if axis else 3]
-        return self.ring.shortest(self.ring.from_drake(_dot(column, self._heights[label])))
+        return self._from_drake(_dot(column, self._heights[label]))
 
 
 def _dot(numbers: NDArray[np.float64], expressions: Sequence[symbolic.Expression]) -> symbolic.Expression:
