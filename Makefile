@@ -77,6 +77,7 @@ benchmark: $(VENV)/.installed-benchmark
 	$(BIN)/python benchmarks/gravity_regressor.py
 	$(BIN)/python benchmarks/dynamic_regressor.py
 	$(BIN)/python benchmarks/control_step.py
+	$(BIN)/python benchmarks/first_tick.py
 	$(BIN)/python benchmarks/psm_simulation.py
 
 $(VENV)/bin/python:

@@ -332,7 +332,7 @@ def fill_gravity_regressor(q, gravity, tree, columns, out):  # pragma: no cover 
     for k in range(3):
         base[4 * k * BLOCK : (4 * k + 1) * BLOCK] = 1.0
     # Link whose hinge moved last, from the base to each link, by each independent joint.
-    last = np.full((num_links, n), -1)
+    last = np.empty((num_links, n), np.int64)
     for start in range(0, len(q), BLOCK):
         part = out[start : start + BLOCK]
         part.reshape(-1)[:] = 0.0
@@ -343,6 +343,9 @@ def fill_gravity_regressor(q, gravity, tree, columns, out):  # pragma: no cover 
             _place_link(tree.pose_terms[i], joint, X)
             _place_in_base(X, links[parent] if parent >= 0 else base, links[i])
             _weight_on_hinge(links[i], tree.hinges[i], gravity, hinge)
+            has_columns = False
+            for k in range(4):
+                has_columns |= columns[i, k] >= 0
             for j in range(n):
                 before = last[parent, j] if parent >= 0 else -1
                 factor = tree.G[i, j]
@@ -350,7 +353,7 @@ def fill_gravity_regressor(q, gravity, tree, columns, out):  # pragma: no cover 
                 if factor != 0.0:
                     for s in range(4 * BLOCK):
                         weights[i, j, s] = factor * hinge[s] + (weights[before, j, s] if before >= 0 else 0.0)
-                if last[i, j] >= 0 and columns[i].max() >= 0:
+                if last[i, j] >= 0 and has_columns:
                     _torques_of_weight(links[i], weights[last[i, j], j], torques)
                     for k in range(4):
                         column = columns[i, k]

@@ -56,14 +56,14 @@ def controller_step(
     hold, damped = mode == HOLD, mode == DAMPED
 
     if restart:
-        latched_q[:] = np.nan
-        last_q[:] = np.nan
-        integral[:] = 0.0
+        for i in range(n):
+            latched_q[i], last_q[i], integral[i] = np.nan, np.nan, 0.0
     faulty = False
     for i in range(2 * n):
         faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true for NaN
     if not faulty:
-        last_q[:] = state[:n]
+        for i in range(n):
+            last_q[i] = state[i]
     if hold and has_desired:
         for i in range(2 * n):
             faulty |= not abs(desired[i]) < IMPLAUSIBLE
@@ -76,15 +76,15 @@ def controller_step(
         for i in range(n):
             gravity[i] *= feedforward_scale[i]
     if faulty or not hold:
-        latched_q[:] = np.nan
         for i in range(n):
-            integral[i] = 0.0
+            latched_q[i], integral[i] = np.nan, 0.0
             braking = kd[i] * state[n + i] if damped and not faulty else 0.0
             effort[i] = min(max(gravity[i] - braking, -limit[i]), limit[i])
         return
 
     if np.isnan(latched_q[0]):
-        latched_q[:] = last_q
+        for i in range(n):
+            latched_q[i] = last_q[i]
     for i in range(n):
         e = (desired[i] if has_desired else latched_q[i]) - state[i]
         de = (desired[n + i] if has_desired else 0.0) - state[n + i]

@@ -183,7 +183,8 @@ def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out)
     queue_size = len(queue)
     measured = out
     if queue_size:
-        out[:] = queue[: 2 * n]
+        for i in range(2 * n):
+            out[i] = queue[i]
         for i in range(queue_size - 2 * n):
             queue[i] = queue[i + 2 * n]
         measured = queue[queue_size - 2 * n :]
