@@ -1,8 +1,9 @@
-"""Installs the wheel and the source distribution into empty environments, and runs the demo and an identification.
+"""Installs the wheel into an empty environment, then the source distribution instead, and runs commands with each.
 
 python tools/test_package.py dist
 
-The environments are outside the repository, so the commands find only files that the packages contain.
+The commands are the demo and an identification. The environment is outside the repository, so the commands find only
+files that the packages contain. The dependencies of both packages are those of pyproject.toml, and are installed once.
 """
 
 import os
@@ -13,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 CONSTRAINTS = Path(__file__).resolve().parents[1] / "constraints.txt"
-#: Commands to run in each environment.
+#: Commands to run with each package.
 IDENTIFICATION = (
     "samples samples",
     "identify samples/mtm_poses.csv --arm mtmr --output model.yaml --report report.html",
@@ -21,14 +22,12 @@ IDENTIFICATION = (
 )
 
 
-def run_from_package(package: Path, commands: tuple[str, ...]) -> None:
-    """Installs `package` into a new environment, and runs `dvrk-drake` with each of `commands`."""
+def run_from_package(programs: Path, package: Path, options: tuple[str, ...], commands: tuple[str, ...]) -> None:
+    """Installs `package` with the pip of `programs`, and runs `dvrk-drake` with each of `commands` in a new folder."""
     # Modules of the repository must not be found.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     with TemporaryDirectory() as folder:
-        venv.create(Path(folder) / "venv", with_pip=True)
-        programs = Path(folder) / "venv" / "bin"
-        install = [programs / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        install = [programs / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *options]
         subprocess.run([*install, "-c", CONSTRAINTS, package.resolve()], check=True, cwd=folder, env=environment)
         for command in commands:
             print(f"{package.name}: dvrk-drake {command}", flush=True)
@@ -39,5 +38,9 @@ def run_from_package(package: Path, commands: tuple[str, ...]) -> None:
 if __name__ == "__main__":
     dist = Path(sys.argv[1])
     (wheel,), (source,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
-    run_from_package(wheel, ("demo --folder demo", *IDENTIFICATION))
-    run_from_package(source, IDENTIFICATION)
+    with TemporaryDirectory() as folder:
+        venv.create(folder, with_pip=True)
+        programs = Path(folder) / "bin"
+        run_from_package(programs, wheel, (), ("demo --folder demo", *IDENTIFICATION))
+        # pip removes all files of the wheel first.
+        run_from_package(programs, source, ("--force-reinstall", "--no-deps"), IDENTIFICATION)

@@ -76,8 +76,22 @@ def same_models(first, second):
     )
 
 
+def assert_same_recordings(first, second, arm):
+    first, second = read_recording(first, arm), read_recording(second, arm)
+    for name in ("t", "q", "qd", "tau"):
+        np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", KINDS)
-def test_static_poses(tmp_path, kind, capsys):
+def test_static_poses_are_those_of_the_csv(tmp_path, kind):
+    arm = load_arm("mtmr")
+    assert_same_recordings(*both(tmp_path, "poses", arm, kind, poses(arm, 0), "/MTMR/measured_js"), arm)
+    assert_same_recordings(*both(tmp_path, "other", arm, kind, poses(arm, 1), "/lab/MTMR/measured_js"), arm)
+
+
+@pytest.mark.parametrize("kind", [BAG_KINDS[0], *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS[1:])])
+def test_commands_with_static_poses(tmp_path, kind, capsys):
+    """All commands read all formats with `read_recording`, so the other formats repeat this test."""
     arm = load_arm("mtmr")
     csv, bag = both(tmp_path, "poses", arm, kind, poses(arm, 0), "/MTMR/measured_js")
     other = both(tmp_path, "other", arm, kind, poses(arm, 1), "/lab/MTMR/measured_js")
@@ -97,9 +111,7 @@ def test_convert_writes_the_csv_of_a_bag(tmp_path):
     csv, bag = both(tmp_path, "poses", arm, "mcap", poses(arm, 0), "/MTMR/measured_js")
     out = tmp_path / "converted.csv"
     assert main(["convert", bag, "--arm", "mtmr", "--output", str(out)]) == 0
-    first, second = read_recording(csv, arm), read_recording(out, arm)
-    for name in ("t", "q", "qd", "tau"):
-        np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-12)
+    assert_same_recordings(csv, out, arm)
 
 
 @pytest.mark.parametrize(
@@ -147,10 +159,7 @@ def results_from_csv(tmp_path_factory, motions):
 @pytest.mark.parametrize("kind", (*BAG_KINDS, "v5"))
 def test_motion(tmp_path, kind, motions):
     arm = load_arm("psm")
-    csv, other = both(tmp_path, "motion", arm, kind, motions[0], "/PSM1/measured_js")
-    first, second = read_recording(csv, arm), read_recording(other, arm)
-    for name in ("t", "q", "qd", "tau"):
-        np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-12)
+    assert_same_recordings(*both(tmp_path, "motion", arm, kind, motions[0], "/PSM1/measured_js"), arm)
 
 
 @pytest.mark.slow

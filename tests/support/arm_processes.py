@@ -13,12 +13,15 @@ from own_network import join_network
 from waiting import TIMEOUT
 
 from dvrk_drake import cli
+from dvrk_drake.processes import recorder
 
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
 #: Driver configurations at 500 Hz: with default timeouts, and with long ones, suitable for a busy computer.
 HALF_RATE_DRIVER = Path(__file__).with_name("half_rate_driver.yaml")
 LONG_TIMEOUT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
+#: Time for which `impatient_dvrk_drake record` waits for the first status [s], instead of 10 s.
+PATIENCE = 2
 
 # The fork server imports the modules to compile from this path.
 os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]).rstrip(":")
@@ -65,11 +68,11 @@ class Forked:
 
 
 class CommandLine(Forked):
-    """Process of `dvrk-drake run`, started on the command line."""
+    """Process of `dvrk-drake`, started on the command line."""
 
-    def __init__(self, name, *options):
+    def __init__(self, *arguments):
         descriptor, self.path = tempfile.mkstemp()
-        command = [sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name, *options]
+        command = [sys.executable, "-m", "dvrk_drake.cli", *map(str, arguments)]
         self.process = subprocess.Popen(command, stdout=descriptor, stderr=descriptor)
         os.close(descriptor)
 
@@ -96,6 +99,17 @@ def run_program(main, arguments, path, parent, environment):
 def dvrk_drake(*arguments):
     """Starts a command of the command line with its options."""
     return Forked(cli.main, *map(str, arguments))
+
+
+def impatient_dvrk_drake(*arguments):
+    """Starts a command whose recorder waits only `PATIENCE` for the first status."""
+    return Forked(impatient_main, *map(str, arguments))
+
+
+def impatient_main(arguments):
+    """Runs a command. The process was forked, so the change of the module remains in it."""
+    recorder.FIRST_STATUS = PATIENCE
+    return cli.main(arguments)
 
 
 def start_arm(name, *options):

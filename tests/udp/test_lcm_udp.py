@@ -21,6 +21,7 @@ from arm_processes import (
     POSES,
     CommandLine,
     Forked,
+    dvrk_drake,
     start_arm,
     start_controller,
     start_run,
@@ -241,8 +242,8 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
 def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     name, _, observer = arm
     expired = observer.last.num_expired
-    starts = CommandLine if (name, mode) == ("mtml", "gravity") else start_run
-    process = starts(name, "--mode", mode, "--realtime")
+    starts = CommandLine if (name, mode) == ("mtml", "gravity") else dvrk_drake
+    process = starts("run", "--arm", name, "--mode", mode, "--realtime")
     try:
         begun = observer.until(accepts_efforts, "run", process=process)
         observer.during(2.0)

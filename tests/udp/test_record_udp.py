@@ -1,24 +1,27 @@
-"""`dvrk-drake record` beside LCM's own lcm-logger and lcm-logplayer, all real processes on a network of their own."""
+"""`dvrk-drake record` beside LCM's own lcm-logger and lcm-logplayer, all real processes on a network of their own.
+
+The processes of dvrk-drake are forked from one that has imported the package; one test uses the command line.
+"""
 
 import contextlib
 import os
 import signal
 import struct
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import lcm
 import numpy as np
 import pytest
+from arm_processes import PATIENCE, POSES, CommandLine, dvrk_drake, impatient_dvrk_drake, start_arm
 from mcap.exceptions import EndOfFile
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from own_network import end, start
 from recordings import csv_block
 from status_logs import ARM, log_bytes, statuses
-from waiting import TIMEOUT, wait_until, within_time_limit
+from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, measurements
@@ -32,13 +35,12 @@ pytestmark = [
 ]
 
 
-def start_records(paths, *options, arms=("mtml", "mtml")):
-    """Starts recorders together and waits until they listen, because each waits only 10 s for a status."""
-    command = [sys.executable, "-m", "dvrk_drake.cli", "record"]
-    started = [(start(*command, path, "--arm", arm, *options), arm) for path, arm in zip(paths, arms, strict=False)]
+def start_records(paths, *options, arms=("mtml", "mtml"), start=dvrk_drake):
+    """Starts recorders together and waits until they listen, because each waits only some seconds for a status."""
+    started = [(start("record", path, "--arm", arm, *options), arm) for path, arm in zip(paths, arms, strict=False)]
     for process, arm in started:
-        line = within_time_limit(process.stdout.readline, "first line")
-        assert line.startswith(f"recording {arm.upper()} on LCM udpm://239.255.76.67:76"), line
+        line = f"recording {arm.upper()} on LCM udpm://239.255.76.67:76"
+        wait_until(lambda process=process, line=line: process.output().startswith(line), line, process)
     return [process for process, _ in started]
 
 
@@ -64,9 +66,9 @@ def by_utime(path):
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """Writes a log of two seconds at 1 kHz for lcm-logplayer."""
+    """Writes a log of one second at 1 kHz for lcm-logplayer."""
     path = tmp_path_factory.mktemp("played") / "played.log"
-    path.write_bytes(log_bytes(statuses(2000)))
+    path.write_bytes(log_bytes(statuses(1000)))
     return path
 
 
@@ -104,22 +106,22 @@ def end_logger(logger, path):
 
 
 def test_log_and_recording_of_live_arm_agree(tmp_path):
-    pose, driver = ["0.1", "0.4", "-0.25", "0.6", "0.9", "0.1", "0.5"], tmp_path / "driver.yaml"
+    driver = tmp_path / "driver.yaml"
     # The network buffer then holds half a second, so a busy computer loses nothing.
     driver.write_text("status_period: 0.005\n")
-    command = ["arm", "--arm", "mtml", "--realtime", "--driver", str(driver), "--pose", *pose]
-    arm = start(sys.executable, "-m", "dvrk_drake.cli", *command)
+    arm = start_arm("mtml", "--driver", driver)
     paths = [tmp_path / name for name in ("logger.log", "record.csv", "record.log")]
     try:
-        while not (line := within_time_limit(arm.stdout.readline, "a line")).startswith("simulated MTML"):
-            assert line == "starting the simulated MTML\n" or "warning: " in line  # scheduling may not be permitted
+        wait_until(lambda: "\nsimulated MTML" in arm.output(), "start of the arm", arm)
+        for line in arm.output().partition("simulated MTML on")[0].splitlines():
+            assert line == "starting the simulated MTML" or "warning: " in line  # scheduling may not be permitted
         logger = start_logger(paths[0])
-        for recorder in start_records(paths[1:], "--duration", "2"):
-            assert recorder.wait(TIMEOUT) == 0, recorder.stdout.read()
-            assert "rows" in recorder.stdout.read()
+        for recorder in start_records(paths[1:], "--duration", "1", start=CommandLine):
+            assert recorder.wait() == 0, recorder.output()
+            assert "rows" in recorder.output()
         end_logger(logger, paths[0])
     finally:
-        end(arm, signal.SIGINT)
+        arm.end(signal.SIGINT)
     logged, *recorded = map(by_utime, paths)
     for rows in recorded:
         assert len(rows) > 100
@@ -129,7 +131,7 @@ def test_log_and_recording_of_live_arm_agree(tmp_path):
     for path in paths:
         recording = read_recording(path, ARM)
         assert np.all(np.diff(recording.t) > 0)
-        np.testing.assert_allclose(recording.q[-1], [float(q) for q in pose], atol=0.02)
+        np.testing.assert_allclose(recording.q[-1], POSES["mtml"], atol=0.02)
         assert recording.motion(ARM) == ""
 
 
@@ -139,8 +141,8 @@ def test_record_reads_log_from_lcm_logplayer(tmp_path, played):
     play(played, "--speed=0.25")  # slowly: nothing is lost on a busy computer either
     wait_for(max(by_utime(played)), *paths[:2])
     for recorder in recorders:
-        said = end(recorder, signal.SIGINT)
-        assert recorder.returncode == 0, said
+        said = recorder.end(signal.SIGINT)
+        assert recorder.wait() == 0, said
     end_logger(logger, paths[2])
     original = read_recording(played, ARM)
     for path in paths:
@@ -159,19 +161,20 @@ def missing_at_first(path):
 
 
 def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
-    """Kills the process when the first file has a given number of 2000 rows."""
+    """Kills the process when the first file has a given number of 1000 rows."""
     original = by_utime(played)
-    for count in (1, 100, 300, 600):
+    for count in (1, 100, 300):
         paths = [tmp_path / f"{count}{name}" for name in (".csv", ".log", "logger.log")]
-        processes = [start_logger(paths[2]), *start_records(paths[:2])]
+        logger, recorders = start_logger(paths[2]), start_records(paths[:2])
         player = start(str(TOOLS / "lcm-logplayer"), str(played))
-        wait_until(lambda count=count, path=paths[0]: rows_in(path) >= count, f"{count} rows", processes[1])
+        wait_until(lambda count=count, path=paths[0]: rows_in(path) >= count, f"{count} rows", recorders[0])
         # lcm-logger flushes ten times per second.
         read = paths if count > 1 else paths[:2]
         wait_until(lambda read=read: all(map(has_status, read[1:])), "a whole status")
         before = [path.read_bytes() for path in read]
-        for process in processes:
-            end(process, signal.SIGKILL)
+        end(logger)
+        for recorder in recorders:
+            recorder.end()
         end(player)
         for path, was in zip(read, before, strict=True):
             assert path.read_bytes().startswith(was)
@@ -189,9 +192,9 @@ def test_bag_ends_with_index_and_survives_kill(tmp_path, played):
     last = max(by_utime(played))
     stamp = struct.pack("<iI", last // 10**6, last % 10**6 * 1000)
     wait_until(lambda: all(stamp in path.read_bytes() for path in paths), "the last message")
-    said = end(recorders[0], signal.SIGTERM)
-    assert recorders[0].returncode == 0, said
-    end(recorders[1], signal.SIGKILL)
+    said = recorders[0].end(signal.SIGTERM)
+    assert recorders[0].wait() == 0, said
+    recorders[1].end(signal.SIGKILL)
     original, recording = read_recording(played, ARM), read_recording(paths[0], ARM)
     assert len(recording) >= 0.95 * len(original)
     for name in ("q", "qd", "tau"):
@@ -212,21 +215,24 @@ def test_missing_status_is_explained(tmp_path, played):
             publisher.publish("DVRK_STATUS_MTML", os.urandom(300))
 
     threading.Thread(target=send_garbage, daemon=True).start()
-    (alone,) = start_records([tmp_path / "alone.csv"], "--lcm-url", "udpm://239.255.76.67:7668?ttl=0")
-    arms = ("psm", "mtmr", "mtml")
-    waiting = dict(zip(arms, start_records([tmp_path / f"{arm}.csv" for arm in arms], arms=arms), strict=True))
-    said = end(waiting.pop("mtmr"), signal.SIGINT)
+    other = ["--lcm-url", "udpm://239.255.76.67:7668?ttl=0"]
+    (alone,) = start_records([tmp_path / "alone.csv"], *other, start=impatient_dvrk_drake)
+    arms = ("psm", "mtml")
+    paths = [tmp_path / f"{arm}.csv" for arm in arms]
+    waiting = dict(zip(arms, start_records(paths, arms=arms, start=impatient_dvrk_drake), strict=True))
+    (interrupted,) = start_records([tmp_path / "mtmr.csv"], arms=["mtmr"])
+    said = interrupted.end(signal.SIGINT)
     assert "mtmr.csv was not written: the recording ended before the first status of MTMR" in said
     messages = {
-        "psm": "no message within 10 s on channel DVRK_STATUS_PSM of udpm://239.255.76.67:7667?ttl=0. "
+        "psm": f"no message within {PATIENCE} s on channel DVRK_STATUS_PSM of udpm://239.255.76.67:7667?ttl=0. "
         "Channels with messages: DVRK_STATUS_MTML",
-        "mtml": "no status of MTML within 10 s on channel DVRK_STATUS_MTML of udpm://239.255.76.67:7667?ttl=0: "
-        "messages omitted, not an lcmt_dvrk_status of version 1.0",
+        "mtml": f"no status of MTML within {PATIENCE} s on channel DVRK_STATUS_MTML of udpm://239.255.76.67:7667?"
+        "ttl=0: messages omitted, not an lcmt_dvrk_status of version 1.0",
     }
     for arm, process in waiting.items():
-        assert process.wait(TIMEOUT) == 2
-        assert messages[arm] in process.stdout.read()
+        assert process.wait() == 2
+        assert messages[arm] in process.output()
     ended.set()
-    assert alone.wait(TIMEOUT) == 2
-    assert "Check that the arm's process or bridge runs on this network." in alone.stdout.read()
+    assert alone.wait() == 2
+    assert "Check that the arm's process or bridge runs on this network." in alone.output()
     assert not list(tmp_path.glob("*.csv"))
