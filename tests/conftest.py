@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from chromium import chromium_browser, open_page  # noqa: F401
+from identified_poses import identified_poses  # noqa: F401
 from own_network import (  # noqa: F401
     pytest_runtest_protocol,
     pytest_sessionfinish,

@@ -77,14 +77,10 @@ def test_docstring_example_runs(name, tmp_path, monkeypatch):
     assert not failures, "".join(failures)
 
 
-@pytest.fixture(scope="module")
-def poses():
+@pytest.fixture
+def poses(identified_poses):
     """Returns an arm, its nominal model, and a recording of 40 static poses with the holding torque of the model."""
-    arm, generator = dvrk.load_arm("mtmr"), np.random.default_rng(0)
-    model = dvrk.IdentifiedModel.from_arm(arm)
-    q = arm.sample_poses(40, generator, margin=0.05)
-    tau = model.holding_torque(q) + 0.003 * arm.effort_limits * generator.normal(size=q.shape)
-    return arm, model, dvrk.Recording(q=q, tau=tau, source="poses.csv", sha256="1" * 64)
+    return identified_poses.arm, identified_poses.nominal, identified_poses.recording
 
 
 def test_error_contains_the_findings(poses):
@@ -108,19 +104,16 @@ def test_warnings_are_from_recording_and_result(poses):
         errors.save("model.yaml")
 
 
-def test_progress_reports_the_steps_in_order(poses):
-    arm, _, recording = poses
-    steps = []
-    dvrk.identify(recording, arm, progress=lambda step, share: steps.append((step, share)))
+def test_progress_reports_the_steps_in_order(identified_poses):
+    steps = identified_poses.progress
     assert list(dict(steps)) == ["checking the recording", "identifying"]
     for name in dict(steps):
         shares = [share for step, share in steps if step == name]
         assert shares == sorted(shares) and shares[0] == 0.0 and 0.9 < shares[-1] <= 1.0
 
 
-def test_result_replaces_a_file_only_on_request(poses, tmp_path):
-    arm, model, recording = poses
-    result = dvrk.identify(recording, arm, method="paper")
+def test_result_replaces_a_file_only_on_request(identified_poses, tmp_path):
+    model, result = identified_poses.nominal, identified_poses.result
     result.save(tmp_path / "model.yaml")
     with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml already exists\. .* overwrite=True"):
         result.save(tmp_path / "model.yaml")
@@ -268,15 +261,12 @@ def test_changed_arm_file_is_read_again(tmp_path):
     assert (first.name, dvrk.load_arm(path).name) == ("MTMR", "OTHER")
 
 
-def test_verdicts_do_not_replace_other_files(exact, tmp_path):
-    arm, recording = exact
-    result = dvrk.identify(recording, arm)
+def test_verdicts_do_not_replace_other_files(identified_poses, tmp_path):
+    recording, result = identified_poses.recording, identified_poses.result
     own, other = tmp_path / "own.yaml", tmp_path / "other.csv"
     result.save(own)
     other.write_text("mine")
-    q = arm.sample_poses(40, np.random.default_rng(1))
-    tau = dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
-    validation = dvrk.validate(result.model, dvrk.Recording(q=q, tau=tau, source="others.csv"))
+    validation = dvrk.validate(result.model, dataclasses.replace(identified_poses.other, source="others.csv"))
     with pytest.raises(DvrkDrakeError, match="already exists"):
         validation.save(other)
     assert other.read_text() == "mine"

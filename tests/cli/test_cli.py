@@ -27,19 +27,12 @@ from dvrk_drake.recordings.writing import write_recording
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory, identified_poses):
     """Returns a folder with two recordings of static poses and the model identified from the first."""
     folder = tmp_path_factory.mktemp("cli")
-    arm = load_arm("mtmr")
-    generator = np.random.default_rng(0)
-    model = static_model(arm)
-    for name, count in (("poses", 40), ("other", 12)):
-        q = arm.sample_poses(count, generator, margin=0.05)
-        tau = model.torque(q, model.gravity.base_values)
-        tau += 0.003 * arm.effort_limits * generator.normal(size=q.shape)
-        write_recording(Recording(q=q, tau=tau), folder / f"{name}.csv")
-    command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", f"{folder}/model.yaml"]
-    assert main([*command, "--plots", f"{folder}/plots"]) == 0
+    write_recording(identified_poses.recording, folder / "poses.csv")
+    write_recording(identified_poses.other, folder / "other.csv")
+    identified_poses.result.save(folder / "model.yaml")
     return folder
 
 
@@ -49,26 +42,25 @@ def fails(capsys, *arguments):
     return refusal(capsys.readouterr().err)
 
 
-def test_identify_writes_a_model_and_plots(folder):
-    model = IdentifiedModel.load(folder / "model.yaml")
-    nominal = IdentifiedModel.from_arm(load_arm("mtmr"))
-    q = read_recording(folder / "other.csv").q
-    limits = load_arm("mtmr").effort_limits
-    error = (model.holding_torque(q) - nominal.holding_torque(q)) / limits
-    assert np.sqrt(np.mean(error[:, 1:6] ** 2, axis=0)).max() < 0.005
-    assert {p.name for p in (folder / "plots").iterdir()} == {"torque_error.png", "predicted.png"}
-
-
-def test_verbose_identify_prints_all_parameters(folder, tmp_path, monkeypatch, capsys):
+def test_identify_writes_model_and_plots_and_prints_all_parameters(
+    folder, identified_poses, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("COLUMNS", "160")  # names on one line
-    model = tmp_path / "model.yaml"
-    assert main(["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", str(model), "-v"]) == 0
+    path, plots = tmp_path / "model.yaml", tmp_path / "plots"
+    command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", str(path)]
+    assert main([*command, "--plots", str(plots), "-v"]) == 0
     printed = capsys.readouterr()
-    assert f"wrote {model}\n" in printed.out
+    assert f"wrote {path}\n" in printed.out
     assert messages(printed.err) == []
-    text = "".join(printed.out.split())
-    for parameter in IdentifiedModel.load(model).base_parameters:
+    model, text = IdentifiedModel.load(path), "".join(printed.out.split())
+    for parameter in model.base_parameters:
         assert "".join(parameter.name.split()) in text
+    q = identified_poses.other.q
+    error = (model.holding_torque(q) - identified_poses.nominal.holding_torque(q)) / identified_poses.arm.effort_limits
+    assert np.sqrt(np.mean(error[:, 1:6] ** 2, axis=0)).max() < 0.005
+    # The function gives the same model.
+    np.testing.assert_allclose(model.theta, identified_poses.result.model.theta, rtol=1e-6, atol=1e-9)
+    assert {p.name for p in plots.iterdir()} == {"torque_error.png", "predicted.png"}
 
 
 def test_validate_writes_json(folder, capsys):
@@ -272,7 +264,7 @@ def test_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkeypa
         ("predict {0}/poses.csv --model {0}/model.yaml --output o.csv", ["o.csv"]),
         ("validate {0}/other.csv --model {0}/model.yaml --json o.json --plots p", ["o.json", "p"]),
         ("export --model {0}/model.yaml --sdf o.sdf --urdf o.urdf", ["o.sdf", "o.urdf", "o_meshes"]),
-        ("simulate --arm psm --set duration=0.02 --output o.csv --plots p", ["o.csv", "p"]),
+        ("simulate --arm mtmr --set duration=0.02 --output o.csv --plots p", ["o.csv", "p"]),
         ("collect --arm psm --poses o.yaml --random 3", ["o.yaml"]),
         ("key --output o.key", ["o.key"]),
     ],
@@ -285,13 +277,14 @@ def test_commands_print_the_written_paths(command, written, folder, tmp_path, mo
     assert {path.name for path in tmp_path.iterdir()} >= set(written)
 
 
-def test_validate_keeps_a_folder_with_files(folder, capsys):
-    validate = ["validate", f"{folder}/other.csv", "--model", f"{folder}/model.yaml", "--plots", f"{folder}/plots"]
-    before = {path: path.read_bytes() for path in (folder / "plots").iterdir()}
+def test_validate_keeps_a_folder_with_files(folder, tmp_path, capsys):
+    validate = ["validate", f"{folder}/other.csv", "--model", f"{folder}/model.yaml", "--plots", str(tmp_path)]
+    mine = tmp_path / "predicted.png"
+    mine.write_text("mine")
     assert "folder is not empty" in fails(capsys, *validate)
-    assert {path: path.read_bytes() for path in (folder / "plots").iterdir()} == before
+    assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
     assert main([*validate, "--overwrite"]) == 0
-    assert f"wrote {folder}/plots\n" in capsys.readouterr().out
+    assert f"wrote {tmp_path}\n" in capsys.readouterr().out and mine.read_bytes().startswith(b"\x89PNG")
 
 
 def test_overwrite_replaces_an_existing_output(tmp_path, capsys):
@@ -457,10 +450,15 @@ def test_model_is_saved_before_a_closed_pipe(folder, tmp_path):
     read, write = os.pipe()
     os.close(read)
     command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", f"{tmp_path}/m.yaml"]
-    program = [sys.executable, "-m", "dvrk_drake.cli", *command]
-    done = subprocess.run(program, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+
+    def program():
+        os.dup2(write, 1)
+        sys.stdout = os.fdopen(1, "w")
+        return main(command)
+
+    code, errors = forked_program(program)
     os.close(write)
-    assert done.returncode == 128 + signal.SIGPIPE and "Traceback" not in done.stderr
+    assert code == 128 + signal.SIGPIPE and "Traceback" not in errors
     assert IdentifiedModel.load(tmp_path / "m.yaml").arm.name == "MTMR"
 
 

@@ -67,6 +67,7 @@ def test_recording_has_the_published_numbers(publisher, tmp_path):
     assert len(recording) >= 0.95 * (numbers[-1] - numbers[0] + 1)
 
 
+@pytest.mark.parametrize("publisher", ["reliable"], indirect=True)
 def test_messages_name_the_topics_that_exist(publisher, tmp_path, monkeypatch):
     monkeypatch.setattr(discovery, "_DISCOVERY", 1.5)
     found = r"Topics with JointState messages: /dvrk/PSM1/jaw/measured_js, /dvrk/PSM1/measured_js\."

@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from dvrk_drake.analysis.dynamic.validation import ActuatorError, DynamicValidation, ErrorShares
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.simulation import scenario_of_arm, simulate
+from dvrk_drake.experiments.simulation import Simulation, scenario_of_arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.figures import colours, identification, motion, simulation
@@ -34,6 +34,7 @@ def test_rules_find_faults():
     one.plot([0, 1], [0, 1], label="curve")
     one.set_xlabel("time", fontsize=7)
     one.legend()
+    figure.canvas.draw()
     faults = " ".join(figure_faults(figure))
     for text in ("7", "no title", "is empty", "legend over the data", 'axis label "time" has no unit'):
         assert text in faults
@@ -47,6 +48,7 @@ def test_legend_has_each_label_once_and_is_outside_the_panels():
         ax.plot([0, 1], [1, 0], label="another long label of a curve in all panels")
     set_title(figure, "A long title " * 20)
     add_legend(figure)
+    figure.canvas.draw()
     assert not figure_faults(figure)
     assert len(figure.legends[0].get_texts()) == 2
     plt.close(figure)
@@ -103,8 +105,12 @@ def test_outliers_do_not_determine_the_range_of_a_panel(monkeypatch, tmp_path):
 def test_simulation_shows_position_error_effort_and_disturbance(monkeypatch, tmp_path):
     scenario = scenario_of_arm(MTM, False, np.zeros(7), ())
     scenario.mounted_arm = MTM
-    done = simulate(MTM, effects=False, duration=0.1, start=np.zeros(7))
-    done.hand[3:6] = 1.0
+    t, generator = np.arange(11) / 100, np.random.default_rng(0)
+    q, noise = 0.1 * np.sin(t[:, None] + np.arange(7)), 1e-3 * generator.normal(size=(11, 7))
+    hand = np.zeros((11, 6))
+    hand[3:6] = 1.0
+    recording = Recording(q=q + noise, qd=np.gradient(q, t, axis=0), tau=0.1 * q, t=t)
+    done = Simulation(recording, np.hstack([q, q]), hand, desired=q)
     with checked_figures(monkeypatch) as figures:
         simulation.plot_simulation(tmp_path / "a.png", done, scenario)
         simulation.plot_simulation(tmp_path / "b.png", dataclasses.replace(done, desired=None), scenario)

@@ -13,8 +13,7 @@ WITHOUT_UNIT = ("",)
 
 
 def figure_faults(figure):
-    """Returns the violated rules of a figure, one text each."""
-    figure.canvas.draw()
+    """Returns the violated rules of a figure that was drawn or saved, one text each."""
     faults = []
     if figure.get_figwidth() > WIDTH + 1e-9:
         faults.append(f"width {figure.get_figwidth()} inch")

@@ -5,7 +5,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 NOBODY = 65534
@@ -47,8 +47,10 @@ def forked_program(main: Callable[[], int]) -> tuple[int, str]:
                 code = error.code if isinstance(error.code, int) else 1
             except BaseException:
                 traceback.print_exc()
-            output.flush()
-            os._exit(code)
+            finally:
+                with suppress(Exception):  # the program may have closed its output
+                    output.flush()
+                os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         output.seek(0)
         return code, output.read()

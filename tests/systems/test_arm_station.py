@@ -21,7 +21,7 @@ from dvrk_drake.systems.arm_view.page import start_meshcat
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.drake_api
 
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)

@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.systems.effort_ramp import EffortRamp
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.drake_api
 
 
 def test_ramp_starts_when_enabled_and_restarts():

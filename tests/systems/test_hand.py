@@ -14,7 +14,7 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.hand import Grip, Hand
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.drake_api
 
 ARM = load_arm("mtml")
 Q = np.array([0.1, 0.3, -0.1, 0.2, 1.0, 0.1, 0.3])

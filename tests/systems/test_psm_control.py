@@ -14,8 +14,6 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
-
 ARM = load_arm("psm")
 NOMINAL = IdentifiedModel.from_arm(ARM)
 N = ARM.num_joints
@@ -104,13 +102,14 @@ def test_step_of_each_joint_settles_within_a_second(gravity_factor, poses):
     check_steps(Bench(gravity_factor), step_poses()[poses], 0.12)
 
 
-def test_step_settles_with_three_times_the_inertia():
+@pytest.mark.parametrize("index", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_step_settles_with_three_times_the_inertia(index):
     """A real arm has up to twice the inertia of the SDF. Here it is three times, with 20 % gravity error."""
     bench = Bench(gravity_factor=0.8 * 3, inertia_factor=3)
     # Gravity exceeds the effort limits in part of the range, so poses with reserve are used.
     poses = ARM.sample_poses(200, np.random.default_rng(5), margin=0.1)
     light = np.all(np.abs(3 * NOMINAL.holding_torque(poses)) < 0.6 * ARM.effort_limits, axis=1)
-    check_steps(bench, poses[light][:2], 0.15)
+    check_steps(bench, poses[light][index : index + 1], 0.15)
 
 
 def test_saturating_step_does_not_wind_up():

@@ -17,7 +17,7 @@ from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.station_config import ArmConfig, StationConfig, load_station_config, make_arm_station
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.drake_api
 
 FILE = """
 arm: psm

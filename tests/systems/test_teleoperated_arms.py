@@ -16,7 +16,7 @@ from dvrk_drake.experiments.demo.teleoperation import (
 from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.drake_api
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from teleoperation_loop import MTM, PERIOD, PSM, Q_F, Q_M, SPEED, Loop, angle, h
 from dvrk_drake.errors import ArmError, ControllerError
 from dvrk_drake.systems.teleoperation import MAX_LAG, MIN_DEPTH, Teleoperation, _velocity_limits
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.numeric
 
 
 @pytest.mark.parametrize("seed", range(4))

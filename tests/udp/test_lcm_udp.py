@@ -117,14 +117,14 @@ def test_command_and_status_round_trip(arm):
     try:
         before = observer.last.num_accepted
         first = observer.until(lambda status: status.num_accepted > before, "first command")
-        last = observer.until(lambda status: status.num_accepted > before + 2000, "2000 commands")
+        last = observer.until(lambda status: status.num_accepted > before + 500, "500 commands")
     finally:
         controller.end()
     received = observer.received[first : last + 1]
     check_clock(received)
     assert all(map(is_holding, received))
     assert received[-1].num_refused == received[0].num_refused
-    assert received[-1].command_sequence > 2000
+    assert received[-1].command_sequence > 500
     assert drift(*received) < 1e-4
 
 
@@ -140,7 +140,7 @@ def test_arm_holds_after_controller_is_killed(name, tmp_path):
         observer.until(lambda status: True, "first status", process=arm)
         observer.until(accepts_efforts, "start of the controller", process=controller)
         # A busy computer may make commands expire; then they start again.
-        wait_until(lambda: all(map(accepts_efforts, observer.during(1.0))), "a second of efforts", controller)
+        wait_until(lambda: all(map(accepts_efforts, observer.during(0.5))), "half a second of efforts", controller)
         realtime = not make_realtime()  # this thread too: it shares Python's lock with the observer's
         controller.send_signal(signal.SIGKILL)
         first = len(observer.received)
@@ -148,7 +148,7 @@ def test_arm_holds_after_controller_is_killed(name, tmp_path):
         last_command = max(
             k for k in range(held) if observer.received[k].num_accepted < observer.received[held].num_accepted
         )
-        worst = drift(*observer.received[first:], *observer.during(2.0))
+        worst = drift(*observer.received[first:], *observer.during(1.0))
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # processes started later would inherit it
         print(controller.end(), arm.end(signal.SIGINT))
@@ -246,7 +246,7 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     process = starts("run", "--arm", name, "--mode", mode, "--realtime")
     try:
         begun = observer.until(accepts_efforts, "run", process=process)
-        observer.during(2.0)
+        observer.during(1.5)  # the ramp of the efforts takes a second
         acting = observer.received[begun:]
     finally:
         said = process.end(signal.SIGINT)
@@ -301,7 +301,8 @@ def test_run_stops_on_fault_and_refuses_faulty_arm():
     assert "MTML has a fault, which is reset now: the amplifier is hot" in said
 
 
-def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
+@pytest.mark.parametrize("count", [3_000, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_invalid_messages_neither_stop_nor_move_the_arm(arm, count):
     name, process, observer = arm
     generator = np.random.default_rng(7)
     network = lcm.LCM()
@@ -315,7 +316,7 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
         return status.num_refused + status.num_ignored
 
     before, first = unaccepted(observer.last), len(observer.received)
-    for k in range(10_000):
+    for k in range(count):
         command.status_utime, command.sequence, command.utime = observer.last.utime, k, observer.last.utime
         data = bytearray(command.encode() if k % 2 else generator.bytes(int(generator.integers(0, 400))))
         for _ in range(generator.integers(0, 6)):
@@ -326,7 +327,7 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
             # No faster than the arm reads on a busy machine: what the system drops says nothing about the arm.
             wait_until(lambda k=k: k <= unaccepted(observer.last) - before + 100, "refusals", process)
     # UDP may lose a few messages.
-    observer.until(lambda status: unaccepted(status) - before > 9_000, "refusals", first, process)
+    observer.until(lambda status: unaccepted(status) - before > 0.9 * count, "refusals", first, process)
     received = observer.received[first:]
     check_clock(received)
     assert all(map(is_holding, received))

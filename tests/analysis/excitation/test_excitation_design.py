@@ -147,6 +147,8 @@ def test_wrong_arguments_are_rejected(argument, message):
 
 def test_command_writes_the_motion(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    # The motion need not be optimal. Slow tests design optimal motions.
+    monkeypatch.setattr("dvrk_drake.analysis.excitation.design.MAX_ITERATIONS", 5)
     short = ["--period", "4", "--duration", "8", "--harmonics", "3", "--starts", "1"]
     assert main(["excite", "--arm", "mtmr", "--output", "m.yaml", "--csv", "m.csv", "--rate", "100", *short]) == 0
     out = capsys.readouterr().out

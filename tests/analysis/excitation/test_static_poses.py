@@ -188,7 +188,8 @@ def test_wrong_arguments_are_rejected(count, limits, message):
 def test_command_writes_a_pose_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     command = ["excite", "--arm", "mtml", "--static", "8", "--seed", "2"]
-    assert main([*command, "--output", "p.yaml"]) == 0
+    (tmp_path / "p.yaml").write_text("mine")
+    assert main([*command, "--output", "p.yaml", "--overwrite"]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "MTML: 8 static poses. Expected error of predicted holding efforts:" in out
     assert "% with 8 random poses" in out
@@ -211,5 +212,4 @@ def test_command_writes_a_pose_file(tmp_path, monkeypatch, capsys):
         assert message in refusal(capsys.readouterr().err)
     assert main([*command[:4], "3", "--output", "n.yaml"]) == 2
     assert "the number of poses is 3; allowed: 8 to 300" in refusal(capsys.readouterr().err)
-    assert main([*command, "--output", "p.yaml", "--overwrite"]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.yaml"]

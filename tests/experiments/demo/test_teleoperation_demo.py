@@ -14,8 +14,6 @@ from dvrk_drake.experiments.demo.teleoperation import (
 )
 from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
 
-pytestmark = pytest.mark.drake_api
-
 
 @pytest.mark.slow
 def test_tip_follows_hand_within_half_a_millimetre():

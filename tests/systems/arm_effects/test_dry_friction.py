@@ -11,7 +11,7 @@ from dvrk_drake.models.plant import tree_selector
 from dvrk_drake.systems.arm_effects.dry_friction import RELAXATION
 from dvrk_drake.systems.arm_station import ArmStation
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.numeric
 
 
 @pytest.mark.slow

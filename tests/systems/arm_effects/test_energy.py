@@ -13,7 +13,7 @@ from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.hand import Grip, Hand
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.numeric
 
 HANDLES = {"mtml": "dh_7", "psm": "dh_6"}
 GRIPS = {

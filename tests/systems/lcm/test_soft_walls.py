@@ -10,10 +10,10 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
-pytestmark = pytest.mark.drake_api
+ARMS = ["mtml", pytest.param("psm", marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+@pytest.mark.parametrize("name", ARMS)
 def test_feedforward_velocity_keeps_joints_inside_limits(name):
     """Constant positions just inside the limits with outward velocities. The plant has no stops."""
     lcm = DrakeLcm("memq://")
@@ -82,8 +82,11 @@ def test_full_motor_effort_keeps_joints_inside_limits(name, row, side):
 
 
 #: Arm and a joint of its wrist.
-WRISTS = [("mtml", 6), ("psm", 3)]
-WRISTS += [pytest.param(*wrist, marks=pytest.mark.slow) for wrist in (("mtml", 3), ("mtml", 5), ("psm", 4), ("psm", 6))]
+WRISTS = [("mtml", 6)]
+WRISTS += [
+    pytest.param(*wrist, marks=pytest.mark.slow)
+    for wrist in (("mtml", 3), ("mtml", 5), ("psm", 3), ("psm", 4), ("psm", 6))
+]
 
 
 @pytest.mark.parametrize(("name", "joint"), WRISTS)
@@ -105,7 +108,7 @@ def test_wrist_on_soft_wall_comes_to_rest(name, joint):
     assert np.abs([status.velocity[joint] for status in last]).max() < 0.1
 
 
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+@pytest.mark.parametrize("name", ARMS)
 def test_unpowered_arm_falls_into_soft_wall(name):
     worst, status = pushed(name, np.zeros(7), 2.0)
     assert worst < 0.5

@@ -15,7 +15,7 @@ from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 from dvrk_drake.systems.ros.sim_crtk_driver import SimCrtkDriver
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = pytest.mark.drake_api
 
 #: Pose inside the limits of the arm, away from its equilibrium.
 POSES = {"mtml": np.array([0.2, 0.3, -0.2, 0.1, 0.3, 0.1, 0.1]), "psm": np.array([0.2, 0.3, 0.1, 0.1, 0.2, 0.3, 0.4])}
