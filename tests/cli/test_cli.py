@@ -42,9 +42,7 @@ def fails(capsys, *arguments):
     return refusal(capsys.readouterr().err)
 
 
-def test_identify_writes_model_and_plots_and_prints_all_parameters(
-    folder, identified_poses, tmp_path, monkeypatch, capsys
-):
+def test_identify_writes_files_and_prints_parameters(folder, identified_poses, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "160")  # names on one line
     path, plots = tmp_path / "model.yaml", tmp_path / "plots"
     command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", str(path)]
