@@ -71,7 +71,7 @@ def echo(namespace: str, realtime: bool, plain: bool) -> None:
         make_realtime()
     if plain:
         JointState.serialize, JointState.deserialize = IdlStruct.serialize, classmethod(IdlStruct.deserialize.__func__)
-    domain = RosDomain()
+    domain = RosDomain(0)
     measured = domain.subscribe(f"{namespace}/measured_js", JointState, depth=100)
     answer = domain.advertise(f"{namespace}/servo_jf", JointState)
     while True:
@@ -195,7 +195,7 @@ def guard_counters() -> str:
 def measure(name: str, seconds: float, realtime: bool, folder: str) -> tuple[np.ndarray, np.ndarray]:
     """Measures one path over DDS. Returns times of sending and round-trip times [s]."""
     is_bridge = name.endswith("bridge")
-    domain, namespace = RosDomain(), "/MTML" if is_bridge else f"/ECHO_{name[-3:].strip().upper()}"
+    domain, namespace = RosDomain(0), "/MTML" if is_bridge else f"/ECHO_{name[-3:].strip().upper()}"
     arm = Arm(domain, namespace)
     if is_bridge:
         processes = start((bridge, folder, realtime, name != "bridge"), (controller, realtime))

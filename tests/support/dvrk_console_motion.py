@@ -144,7 +144,7 @@ def write_configuration(folder, options, outputs, motions, port):
 
 def exchange(console, stream, control, control_port, arm, rate, outputs, motions):
     """Forwards messages between the topics and the console until the console ends."""
-    domain = RosDomain()
+    domain = RosDomain(0)
     publishers = {name: domain.advertise(f"/{arm}/{name}", kind) for name, (_, kind) in outputs.items()}
     state = domain.advertise(f"/{arm}/operating_state", m.OperatingState, latched=True)
     kinds = {name: kind for name, (_, kind) in motions.items()} | TEXTS

@@ -30,7 +30,7 @@ class BadArm:
         from dvrk_drake.systems.ros import messages as m
         from dvrk_drake.systems.ros.domain import RosDomain
 
-        self.m, self.domain = m, RosDomain()
+        self.m, self.domain = m, RosDomain(0)
         topics = {
             "measured_js": m.JointState,
             "gravity_compensation/setpoint_js": m.JointState,
@@ -142,7 +142,7 @@ def test_random_commands_of_others_stop_the_bridge(arm, tmp_path):
 
     operator, controller = Operator("mtml"), start_controller("mtml")
     bridge = start_bridge("mtml", tmp_path, "--poll")
-    other, generator = RosDomain(), np.random.default_rng(6)
+    other, generator = RosDomain(0), np.random.default_rng(6)
     try:
         wait_for_line(bridge, "effort, sender")
         publishers = [other.advertise("/MTML/servo_jf", arm.m.JointState)]

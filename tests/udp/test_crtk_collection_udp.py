@@ -46,7 +46,7 @@ COMMAND = [
 OTHER = (
     "from dvrk_drake.systems.ros.domain import RosDomain\n"
     "from dvrk_drake.systems.ros.messages import JointState\n"
-    "publisher = RosDomain().advertise('/MTML/servo_jp', JointState)\n"
+    "publisher = RosDomain(0).advertise('/MTML/servo_jp', JointState)\n"
     "import time\n"
     "time.sleep(1000)"
 )
@@ -65,7 +65,7 @@ def simulated_arm(*options):
     """Context in which a simulated MTML runs, enabled and homed."""
     process = dvrk_drake("arm", "--arm", "mtml", "--ros", "--rate", "100", "--enabled", *options)
     try:
-        domain = ros.RosDomain()
+        domain = ros.RosDomain(0)
         state = domain.subscribe("/MTML/operating_state", OperatingState, depth=100, latched=True)
         KEPT.extend((domain, state))
         last = [OperatingState()]
