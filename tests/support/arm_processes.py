@@ -1,4 +1,4 @@
-"""Processes of the package in a network namespace, forked from a process that has compiled the controllers."""
+"""Processes of the package in a network namespace, forked from a process that has imported the package."""
 
 import multiprocessing
 import os
@@ -23,10 +23,10 @@ LONG_TIMEOUT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
 #: Time for which `impatient_dvrk_drake record` waits for the first status [s], instead of 10 s.
 PATIENCE = 2
 
-# The fork server imports the modules to compile from this path.
+# The fork server imports the modules from this path.
 os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]).rstrip(":")
 FORKSERVER = multiprocessing.get_context("forkserver")
-FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
+FORKSERVER.set_forkserver_preload(["lcm_preloaded"])
 
 
 class Forked:

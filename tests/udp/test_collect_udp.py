@@ -1,6 +1,6 @@
 """From poses to a compensated arm, with real processes and UDP multicast in a separate network.
 
-This file starts itself again inside a network namespace. Processes are forked from one that has compiled everything.
+This file starts itself again inside a network namespace. Processes are forked from one that has imported the package.
 """
 
 import signal

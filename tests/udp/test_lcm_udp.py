@@ -1,6 +1,6 @@
 """Arm process and its controllers over real UDP multicast.
 
-Processes are forked from one that has compiled everything; where a test starts them by their command line, it says so.
+Processes are forked from one that has imported the package; where a test starts them by their command line, it says so.
 """
 
 import os
@@ -238,8 +238,10 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
     assert "the guard of MTML held the arm, and the operator resumes now: " in runs[-1].output()
 
 
+@pytest.mark.watchdog
 @pytest.mark.parametrize("mode", ["gravity", "hold"])
 def test_run_starts_ramps_and_ends_in_hold(arm, mode):
+    """A watchdog test, since `run` ends if the computer stops the arm's guard for 40 ms."""
     name, _, observer = arm
     expired = observer.last.num_expired
     starts = CommandLine if (name, mode) == ("mtml", "gravity") else dvrk_drake
