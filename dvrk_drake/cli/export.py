@@ -37,6 +37,7 @@ def export(
     urdf: Annotated[str | None, Parameter(metavar="FILE.urdf")] = None,
     dvrk_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
     dvrk_kinematic_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
+    configuration: Annotated[str | None, Parameter(metavar="ARM.json")] = None,
     meshes: Literal["gltf", "obj"] = "gltf",
     diff: Annotated[bool, Parameter(show_default=False)] = False,
     overwrite: Overwrite = False,
@@ -57,6 +58,8 @@ def export(
         urdf: URDF file to write, with the inertias of the model. Joints of the linkage become mimic joints.
         dvrk_gc: Gravity-compensation file to write for an MTM, in the format of the dVRK controller.
         dvrk_kinematic_gc: Gravity-compensation file to write for a PSM, in the format of the dVRK controller.
+        configuration: Configuration of the PSM in the dVRK, whose mounting_pitch is checked. Default: the JSON file
+            beside --dvrk-kinematic-gc that names this file under kinematic_gc.
         meshes: Format of the meshes of the SDF and URDF. PyBullet and MuJoCo require obj.
         diff: Print the differences between the SDF of the arm and the exported SDF.
         gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: the dry
@@ -68,7 +71,7 @@ def export(
         saturation: Speed above which the full --friction-ratio applies [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
-    from dvrk_drake.export.model_export import prepare_export
+    from dvrk_drake.export.model_export import configuration_beside, prepare_export
     from dvrk_drake.export.sdf import mesh_folder, refuse_existing_meshes, sdf_difference
     from dvrk_drake.reports.export import print_export
     from dvrk_drake.reports.terminal_tables import make_console
@@ -84,9 +87,11 @@ def export(
         raise DvrkDrakeError(f"no output is given; use {', '.join('--' + format for format in requested)} or --diff")
     if friction and coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb exclude each other; give one of them")
+    if configuration is not None and dvrk_kinematic_gc is None:
+        raise DvrkDrakeError("--configuration requires --dvrk-kinematic-gc; only the file of a PSM uses mounting_pitch")
     loaded = load_model(model, arm)
     for format, path in outputs.items():
-        check_output(path, model or "", overwrite=overwrite)
+        check_output(path, model or "", configuration or "", overwrite=overwrite)
         if format in ("sdf", "urdf"):
             refuse_existing_meshes(path, overwrite)
     settings: dict[str, Any] = {
@@ -96,6 +101,7 @@ def export(
         "dead_band": dead_band,
         "saturation": saturation,
         "meshes": meshes,
+        "configuration": configuration or (configuration_beside(dvrk_kinematic_gc) if dvrk_kinematic_gc else None),
     }
     # All files are computed before the first file is written, so that an error leaves no partial output.
     origin = model or arm or ""

@@ -12,12 +12,13 @@ of insertion is disabled. Link 7 then has none, so the torque of insertion is 0.
 negative, because the controller requires masses of at least 0.
 
 The controller computes the direction of gravity in the base frame from the angle `mounting_pitch`, which is not part of
-the file but of the arm's configuration beside it. This angle describes a rotation about the x axis of the base only.
+the file but of the arm's configuration beside it (JSON with comments). This angle describes a rotation about the x axis of the base only.
 """
 
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.files import atomic_write, read_json_input
 from dvrk_drake.models.plant import shared_plant
 
 ARM_JOINTS = ("yaw", "pitch", "insertion")
@@ -47,6 +48,8 @@ CONTROLLER_GRAVITY = 9.81
 #: Sideways tilt [rad] above which it is named as the cause of a difference. It is below the last digit of a gravity
 #: vector that is given with six digits.
 _LEAST_TILT = 1e-6
+#: Keys of an arm's configuration for the compensation file and for the angle: since dVRK 2.4, and before.
+_FILE_KEYS, _PITCH_KEYS = ("kinematic_gc", "kinematic-gc"), ("mounting_pitch", "mounting-pitch")
 #: Index of a link of the chain -> bodies of the arm that it represents.
 _BODIES = {
     0: ("yaw_link",),
@@ -71,9 +74,10 @@ class KinematicCompensation:
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
         mounting_pitch: Angle [rad] that the arm's configuration must contain, see `controller_gravity`.
+        configured_pitch: Angle [rad] in the arm's configuration, None if no configuration is known.
         loss: Largest differences between the torques of file and model on yaw, pitch and insertion. The torques of the
-            file are computed with the controller's gravity for `mounting_pitch`, with a straight instrument (all
-            instrument joints at zero) or with the instrument joints at their locked positions.
+            file are computed with the controller's gravity for `configured_pitch`, or else for `mounting_pitch`, with a
+            straight instrument (all instrument joints at zero) or with the instrument joints at their locked positions.
         wrist: Largest changes (3,) of the model's torques on these joints due to the positions of the instrument
             joints [N m, N m, N]. The file does not represent these changes. Not meaningful if the instrument joints are
             locked.
@@ -88,6 +92,7 @@ class KinematicCompensation:
     mounting_pitch: float
     loss: CompensationLoss
     wrist: NDArray[np.float64]
+    configured_pitch: float | None = None
 
     def save(self, path: str | Path) -> None:
         """Writes the file atomically."""
@@ -125,6 +130,34 @@ def controller_gravity(pitch: float) -> NDArray[np.float64]:
     return -CONTROLLER_GRAVITY * np.array([0.0, np.sin(pitch), np.cos(pitch)])
 
 
+def configuration_beside(path: str | Path) -> Path | None:
+    """Returns the arm's configuration in the folder of a compensation file. Its key `kinematic_gc` names the file."""
+    for other in sorted(Path(path).parent.glob("*.json")):
+        with suppress(ModelError):
+            content = read_json_input(other, ModelError)
+            names = [content.get(key) for key in _FILE_KEYS] if isinstance(content, dict) else []
+            if any(isinstance(name, str) and Path(name).name == Path(path).name for name in names):
+                return other
+    return None
+
+
+def configured_pitch(path: str | Path) -> float:
+    """Returns `mounting_pitch` [rad] of an arm's configuration. The controller uses 0 if the key is missing.
+
+    Raises:
+        ModelError: The file is missing or not a JSON object, or the value is not an angle in rad.
+    """
+    content = read_json_input(path, ModelError)
+    if not isinstance(content, dict):
+        raise ModelError(f"{path}: is not a configuration of an arm, because it is not a JSON object")
+    given = [(key, content[key]) for key in _PITCH_KEYS if key in content]
+    for key, value in given:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (is_number and abs(value) <= np.pi):
+            raise ModelError(f"{path}: {key} is {json.dumps(value)[:30]}; allowed: a number from -pi to pi [rad]")
+    return float(given[0][1]) if given else 0.0
+
+
 def _sideways_tilt(gravity: NDArray[np.float64]) -> float:
     """Returns the angle [rad] between a gravity vector (3,) and the y-z plane of the base."""
     return float(np.arcsin(abs(gravity[0]) / np.linalg.norm(gravity)))
@@ -135,7 +168,9 @@ def is_psm(arm: Arm) -> bool:
     return arm.joint_names[:3] == ARM_JOINTS and shared_plant(arm).HasBodyNamed("back_crank_link")
 
 
-def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = None) -> KinematicCompensation:
+def kinematic_compensation(
+    model: IdentifiedModel, tolerance: float | None = None, configuration: str | Path | None = None
+) -> KinematicCompensation:
     """Converts the gravity torque of yaw, pitch and insertion to the controller's chain, for a straight instrument.
 
     If the instrument joints of the model are locked, the chain represents the instrument at the locked positions.
@@ -145,10 +180,12 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
         tolerance: Largest accepted difference between the torques of the file and of the model on any joint [N m, N].
             Joint effects, feedforward scales below 1 and a sideways tilt of the base cause differences. None: the dry
             friction of each joint, see `gravity_compensation_loss.accepted_differences`.
+        configuration: Configuration of the arm in the dVRK, whose `mounting_pitch` the controller uses. None: the
+            configuration will contain the `mounting_pitch` of the result.
 
     Raises:
         ModelError: The model is not of a PSM, the net mass on the insertion joint is negative and its weight exceeds
-            `tolerance`, or a torque difference exceeds `tolerance`.
+            `tolerance`, a torque difference exceeds `tolerance`, or the configuration is invalid.
     """
     arm = model.arm
     plant = shared_plant(arm)
@@ -188,18 +225,25 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float | None = Non
     step = np.linalg.lstsq(unknown, (tau - np.einsum("mjlk,lk->mj", Y, known)).ravel(), rcond=1e-9)[0]
     known[_FITTED, 1:] += step.reshape(-1, 3)
     tau_model = model.holding_torque(straight)[:, :3]
-    tau_file = np.einsum("mjlk,lk->mj", Y, known)
+    installed = None if configuration is None else configured_pitch(configuration)
+    tau_pitch = tau_file = np.einsum("mjlk,lk->mj", Y, known)
+    if installed is not None:
+        Y = np.array([_regressor(X, controller_gravity(installed)) for X in frames])
+        tau_file = np.einsum("mjlk,lk->mj", Y, known)
     tilt = _sideways_tilt(arm.gravity)
     if tilt > _LEAST_TILT:
         cause = f"sideways base tilt of {np.rad2deg(tilt):.2g} deg, which mounting_pitch cannot express"
     else:
         cause = "feedforward scale other than 1" if net > 0 else "negative net mass on the insertion joint"
-    causes = {cause: tau_file - tau, **_omitted_effects(model, straight)}
+    causes = {cause: tau_pitch - tau, **_omitted_effects(model, straight)}
+    if installed is not None:
+        setting = f"mounting_pitch {installed:.6g} in {configuration}, but the model requires {pitch:.6g}"
+        causes[setting] = tau_file - tau_pitch
     loss = make_loss(arm, straight, tau_file - tau_model, causes)
     loss.check(accepted)
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
     wrist = np.abs(model.holding_torque(q)[:, :3] - tau_model).max(axis=0)
-    return KinematicCompensation(alpha, A, theta, D, mass, center, pitch, loss, wrist)
+    return KinematicCompensation(alpha, A, theta, D, mass, center, pitch, loss, wrist, installed)
 
 
 def _refuse_disabled_joints(model: IdentifiedModel) -> None:

@@ -13,7 +13,12 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.export.dvrk_psm_gravity_compensation import KinematicCompensation, is_psm, kinematic_compensation
+from dvrk_drake.export.dvrk_psm_gravity_compensation import (
+    KinematicCompensation,
+    configuration_beside,
+    is_psm,
+    kinematic_compensation,
+)
 from dvrk_drake.export.sdf import MeshFormat, refuse_existing_meshes, write_sdf
 from dvrk_drake.export.urdf import touching_shapes, write_urdf
 from dvrk_drake.models.arm import Arm
@@ -34,6 +39,7 @@ class ModelExport:
             formats.
         compensation: Content of a file for the dVRK's controller. None for SDF and URDF.
         meshes: Format of the meshes of an SDF or URDF.
+        configuration: Configuration of the arm in the dVRK with which the file of a PSM was checked, or None.
     """
 
     model: IdentifiedModel
@@ -42,6 +48,7 @@ class ModelExport:
     bodies: ModelBodies | None = None
     compensation: GravityCompensationFile | KinematicCompensation | None = None
     meshes: MeshFormat = "gltf"
+    configuration: str | Path | None = None
 
     @property
     def omitted_shapes(self) -> tuple[tuple[str, str], ...]:
@@ -86,6 +93,7 @@ def prepare_export(
     dead_band: Sequence[float] | None = None,
     saturation: Sequence[float] | None = None,
     meshes: MeshFormat = "gltf",
+    configuration: str | Path | None = None,
 ) -> ModelExport:
     """Returns the content that `export_model` writes. See `export_model` for arguments and errors."""
     origin = origin or f"a model of {model.arm.name}"
@@ -98,8 +106,8 @@ def prepare_export(
     if format in ("sdf", "urdf"):
         return ModelExport(model, format, origin, bodies=model_bodies(model), meshes=meshes)
     if format == "dvrk-kinematic-gc":
-        file = kinematic_compensation(model, tolerance)
-        return ModelExport(model, format, origin, compensation=file)
+        file = kinematic_compensation(model, tolerance, configuration)
+        return ModelExport(model, format, origin, compensation=file, configuration=configuration)
     coulomb = None if friction is False else dry_friction(model) if friction is True else friction
     given = {
         "tolerance": tolerance,
@@ -124,6 +132,7 @@ def export_model(
     dead_band: Sequence[float] | None = None,
     saturation: Sequence[float] | None = None,
     meshes: MeshFormat = "gltf",
+    configuration: str | Path | None = None,
     overwrite: bool = False,
 ) -> ModelExport:
     """Writes a model to a file for another program, as `dvrk-drake export` does.
@@ -146,6 +155,8 @@ def export_model(
             "dvrk-gc". None uses typical values.
         meshes: Format of the meshes of an SDF or URDF: "gltf" keeps the meshes of the arm. "obj" converts them for
             programs that do not read glTF, such as PyBullet and MuJoCo.
+        configuration: Configuration of the arm in the dVRK (JSON), for "dvrk-kinematic-gc". The torques of the file are
+            compared for its `mounting_pitch`. None: a JSON file beside `path` whose key `kinematic_gc` names `path`.
         overwrite: Whether to replace existing files.
 
     Returns:
@@ -180,6 +191,7 @@ def export_model(
         dead_band=dead_band,
         saturation=saturation,
         meshes=meshes,
+        configuration=configuration or configuration_beside(path),
     )
     export.write(path)
     return export

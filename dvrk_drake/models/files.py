@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterable, Iterator
@@ -94,18 +95,31 @@ def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
         raise error(f"{path} is not a UTF-8 text file: {cause.reason} at byte {cause.start}") from cause
 
 
+#: A text or a comment in JSON. The dVRK's own files contain comments.
+_TEXT_OR_COMMENT = re.compile(r'("(?:\\.|[^"\\])*")|//[^\n]*|/\*.*?\*/', re.DOTALL)
+
+
 def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX_TEXT) -> Any:
-    """Returns the content of a JSON file.
+    """Returns the content of a JSON file, which may contain comments (// and /* */).
 
     Raises:
         DvrkDrakeError: See `read_text_input`; additionally if the text is not JSON.
     """
     try:
-        return json.loads(read_text_input(path, error, largest))
+        text = read_text_input(path, error, largest)
+        try:
+            return json.loads(text)
+        except ValueError:
+            return json.loads(_TEXT_OR_COMMENT.sub(_without_comment, text))
     except RecursionError as cause:
         raise error(f"{path}: invalid JSON: arrays and objects are nested too deeply") from cause
     except ValueError as cause:
         raise error(f"{path}: invalid JSON: {cause}") from cause
+
+
+def _without_comment(match: re.Match[str]) -> str:
+    """Returns a text unchanged, and the newlines of a comment, so that the line numbers of faults stay correct."""
+    return match[1] or " " + "\n" * match[0].count("\n")
 
 
 #: Error codes of write operations for which the disk is the cause, not the code of the caller.

@@ -147,7 +147,11 @@ def _print_kinematic_compensation(
 ) -> None:
     """Prints the largest differences from the model, and the links of the kinematic chain in the file."""
     entries = f'"kinematic_gc": "{Path(path).name}", "mounting_pitch": {file.mounting_pitch:.6g}'
-    print_answer(console, _loss_text(file.loss), f"enter {entries} in the JSON file of the arm")
+    where = "the JSON file of the arm" if export.configuration is None else f"{export.configuration}"
+    print_answer(console, _loss_text(file.loss), f"enter {entries} in {where}")
+    if file.configured_pitch is not None:
+        what = f"mounting_pitch of {export.configuration}, {file.configured_pitch:.6g} rad (0 if it is not stated)"
+        console.print(f"Compared with the {what}. The model requires {file.mounting_pitch:.6g}.\n", markup=False)
     locked = export.model.arm.locked_text
     columns = (f"with {locked}",) if locked else ("straight instrument", "change by a bent wrist")
     title = "Largest difference from the model at rest, also in % of the effort limit"

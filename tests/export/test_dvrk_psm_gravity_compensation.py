@@ -147,6 +147,33 @@ def test_gravity_that_mounting_pitch_cannot_express_is_refused(tmp_path, capsys,
     assert 'enter "kinematic_gc": "gc.json", "mounting_pitch": -0.785398 in the JSON file of the arm' in printed
 
 
+def test_mounting_pitch_of_the_configuration_is_checked(tmp_path, capsys, monkeypatch):
+    """The configuration is given, or lies beside the file. The controller uses 0 if it has no mounting_pitch."""
+    monkeypatch.chdir(tmp_path)
+    IdentifiedModel.from_arm(load_arm("psm").with_gravity([0.0, 6.9367, -6.9367])).save("psm.yaml")
+    command = ["export", "--model", "psm.yaml", "--dvrk-kinematic-gc", "gc.json", "--overwrite"]
+    required = "but the model requires -0.785398"
+    beside, other = tmp_path / "arm.json", tmp_path / "other.txt"
+    for content, message in {
+        '{"kinematic_gc": "gc/gc.json" /* none */}': f"mounting_pitch 0 in arm.json, {required}",
+        '{"kinematic-gc": "gc.json", "mounting-pitch": 0.785398}': f"mounting_pitch 0.785398 in arm.json, {required}",
+        '{"kinematic_gc": "gc.json", "mounting_pitch": -45}': "arm.json: mounting_pitch is -45; allowed: a number",
+    }.items():
+        beside.write_text(content)
+        assert main(command) == 2
+        assert message in refusal(capsys.readouterr().err) and not os.path.exists("gc.json")
+    beside.write_text('{"kinematic_gc": "other.json"}')
+    assert main(command) == 0
+    other.write_text('{"mounting_pitch": -0.785398, // -45.0 degrees, "https://a"\n "kinematic_gc": "gc.json"}')
+    capsys.readouterr()
+    assert main([*command, "--configuration", "other.txt"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "are equal at rest" not in printed  # -0.785398 has six digits
+    assert "Compared with the mounting_pitch of other.txt, -0.785398 rad" in printed
+    assert main(["export", "--arm", "psm", "--sdf", "a.sdf", "--configuration", "other.txt"]) == 2
+    assert "--configuration requires --dvrk-kinematic-gc" in refusal(capsys.readouterr().err)
+
+
 def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):
     out = tmp_path / "psm.json"
     assert main(["export", "--arm", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
