@@ -18,6 +18,7 @@ from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.recordings.recording import Recording
 
 TRUE_EFFECTS = {
@@ -49,15 +50,18 @@ def main() -> int:
         q = arm.sample_poses(options.poses, generator, margin=0.05)
         tau = truth.torque(q, [*beta, *TRUE_EFFECTS.values()])
         tau += options.noise * arm.effort_limits * generator.normal(size=q.shape)
-        fit = StaticProblem(arm, q, tau, np.ones(q.shape, dtype=bool)).fit(tuple(TRUE_EFFECTS)).fit
-        correct.append(np.abs(fit.theta - theta) < 1.96 * np.sqrt(np.diag(fit.covariance)))
+        robust = StaticProblem(arm, q, tau, np.ones(q.shape, dtype=bool)).fit(tuple(TRUE_EFFECTS))
+        errors = zip(np.sqrt(np.diag(robust.fit.covariance)), robust.degrees_of_freedom, strict=True)
+        correct.append(np.abs(robust.fit.theta - theta) < [half_width(*error) for error in errors])
         model = identify_static(Recording(q=q, tau=tau, source=f"seed {seed}"), arm).model
         for estimate, value in zip(model.base_parameters, beta, strict=True):
-            base.append(abs(estimate.value - value) < 1.96 * estimate.standard_error)
+            half = half_width(estimate.standard_error, estimate.degrees_of_freedom)
+            base.append(abs(estimate.value - value) < half)
         for e in model.effects:
             value = TRUE_EFFECTS.get(ActuatorEffect.of(e))
             spurious += value is None
-            effects.append(abs(e.coefficient - (value or 0.0)) < 1.96 * e.standard_error)
+            half = half_width(e.standard_error, e.degrees_of_freedom)
+            effects.append(abs(e.coefficient - (value or 0.0)) < half)
     print(f"{options.recordings} recordings of {options.poses} poses, noise {100 * options.noise:g} % of the limits")
     print("coverage of the 95 % intervals:")
     base_given, effects_given = np.array(correct)[:, : len(beta)], np.array(correct)[:, len(beta) :]

@@ -24,6 +24,7 @@ from dvrk_drake.analysis.signals.repetition import period_of
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.effects_schema import half_width
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
@@ -87,14 +88,17 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     residual = problem.columns.tau - problem.predict(chosen, fit.x)
     cut_off = grid.settings.effort_cut_off
     series = [ResidualSeries(slice(0, len(residual)), grid.rate, period)]
-    covariance, prior = parameter_covariance(problem, fit, residual, cut_off, series)
+    covariance, prior, freedom = parameter_covariance(problem, fit, residual, cut_off, series)
     p = problem.num_rigid
     B = derive_base_parameters(problem.regressor).combination[:, :p]
     B = B[np.any(B, axis=1)]
     standard_error = np.sqrt(np.diag(B @ covariance[:p, :p] @ B.T))
     prior_error = np.sqrt(np.diag(B @ prior[:p, :p] @ B.T))
     z = B @ (fit.x[:p] - truth.parameters[:p]) / standard_error
-    return z, standard_error / prior_error, (fit.x[p:] - truth.coefficients) / np.sqrt(np.diag(covariance))[p:]
+    z_effects = (fit.x[p:] - truth.coefficients) / np.sqrt(np.diag(covariance))[p:]
+    # A normal distribution has the same share inside 1.96 standard errors as Student's distribution inside its limits.
+    scale = half_width(1.0, None) / half_width(1.0, freedom)
+    return scale * z, standard_error / prior_error, scale * z_effects
 
 
 if __name__ == "__main__":

@@ -112,7 +112,9 @@ set: [duration=1]
 random_poses: {count: 3, seed: 1, margin: 0.1}
 seeds: [0, 1]
 variations: [{name: a, set: []}, {name: b, set: [controller.mode=gravity]}]
-measures: [{kind: drift, time: 0.5}, {kind: held, name: stays, band: 0.1, time: 0.5, joints: [yaw]}]
+measures:
+- {kind: drift, time: 0.5, joints: [insertion]}
+- {kind: held, name: stays, band: 0.1, time: 0.5, joints: [yaw]}
 """
 DRIVER = """status_period: 0.001
 control_modes: [position, effort]

@@ -76,6 +76,7 @@ def with_effects_at_rest(model: IdentifiedModel, poses: StaticIdentification) ->
             c.effect.scale,
             float(value + (known.get(c.effect.coordinate, 0.0) if c.effect.kind == "offset" else 0.0)),
             standard_error=float(error),
+            degrees_of_freedom=float(max(len(q) - len(selected), 1)),
         )
         for c, value, error in zip(selected, fit.coefficients, fit.standard_errors, strict=True)
         if c.effect.kind != "presliding"

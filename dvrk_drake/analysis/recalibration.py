@@ -17,7 +17,7 @@ from dvrk_drake.analysis.signals.drive_efforts import (
     refuse_opposite_efforts,
 )
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.repetition import period_of, phase_folds
+from dvrk_drake.analysis.signals.repetition import correlation_of, period_of, phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -192,7 +192,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
         if not coordinate.startswith("actuator.")
     }
     section = _section(model.dynamic_model.section, fit, x, fit.standard_errors(free, held_out))
-    section.actuators = fit.statistics(x, held_out)
+    section.actuators, section.error_correlation = fit.statistics(x, held_out), correlation_of(held_out).tolist()
     return Recalibration(
         model=model.recalibrated(section, recording.source),
         actuators=actuators,
@@ -290,7 +290,7 @@ class _Fit:
         """
         k, fixed = len(self.keys), self._fixed(free)
         H, P = self._information(np.ones(len(self.tau), dtype=bool))[0], np.diag(self._deviation**-2.0)
-        block = np.arange(len(self.tau)) // max(int(_BLOCK * self.rate), 1)
+        block = self._blocks()
         scores = np.hstack([np.einsum("rik,ri->rk", self.friction, self._weight * held_out), self._weight * held_out])
         of_blocks = np.array([np.sum(scores[block == b], axis=0) for b in range(block[-1] + 1)])
         A = np.linalg.inv(H[np.ix_(~fixed, ~fixed)])
@@ -298,6 +298,14 @@ class _Fit:
         errors = np.zeros(k + len(self.names))
         errors[~fixed] = np.sqrt(np.diag(A @ middle @ A))
         return errors
+
+    def _blocks(self) -> NDArray[np.int_]:
+        return np.arange(len(self.tau)) // max(int(_BLOCK * self.rate), 1)
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Degrees of freedom of `standard_errors`: the number of blocks minus 1."""
+        return float(max(self._blocks()[-1], 1))
 
     def _fixed(self, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
@@ -364,9 +372,15 @@ def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64], errors:
         elif effect.kind == "offset" and effect.coordinate in offsets:
             i = offsets.pop(effect.coordinate)
             coefficient, error = coefficient + x[i], errors[i]
-        effects.append(replace(effect, coefficient=float(coefficient), standard_error=float(error)))
+        freedom = effect.degrees_of_freedom if error == effect.standard_error else fit.degrees_of_freedom
+        new = replace(effect, coefficient=float(coefficient), standard_error=float(error), degrees_of_freedom=freedom)
+        effects.append(new)
     effects += [
-        DriveEffect(coordinate, "offset", 0.0, float(x[i]), standard_error=float(errors[i]))
+        DriveEffect(
+            *(coordinate, "offset", 0.0, float(x[i])),
+            standard_error=float(errors[i]),
+            degrees_of_freedom=fit.degrees_of_freedom,
+        )
         for coordinate, i in offsets.items()
     ]
     return replace(section, effects=effects)

@@ -132,11 +132,10 @@ def predict(
     share = step_progress(progress, "predicting")
     share(0.0)
     tau = predict_motion(model, recording)
-    half_width = model.dynamic_model.half_width
+    to_actuator = np.eye(arm.num_joints)
     if (coordinates := coordinates or recording.coordinates) != "actuator":
         to_actuator = arm.transmission.matrix @ file_transmission(arm, coordinates).inverse.matrix
         tau = tau @ to_actuator
-        # The errors of the actuators are independent.
-        half_width = np.sqrt(half_width**2 @ to_actuator**2)
+    half_width = model.dynamic_model.combined_half_width(to_actuator.T)
     share(1.0)
     return Prediction(tau, half_width if np.all(half_width > 0) else None, report.warnings)

@@ -15,6 +15,7 @@ from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
+from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.models.schema_fault import number_fault
 
 
@@ -87,8 +88,6 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: 97.5 % quantile of the standard normal distribution.
-NORMAL_95 = 1.96
 #: Gravity effort above which an actuator is considered loaded by gravity [N m, N]. Smaller efforts are rounding errors.
 MIN_WEIGHT = 1e-9
 #: Number of random poses at which the gravity efforts are compared with `MIN_WEIGHT`.
@@ -158,8 +157,22 @@ class DynamicModel:
         day. For a model of several recordings, the held-out parts are whole recordings, so the variance between their
         days is included. They are 0 for a model without this error.
         """
-        errors = {a.name: a.rms_cross_validation for a in self.section.actuators}
-        return np.array([NORMAL_95 * errors.get(name, 0.0) for name in self.arm.joint_names])
+        widths = {a.name: half_width(a.rms_cross_validation, None) for a in self.section.actuators}
+        return np.array([widths.get(name, 0.0) for name in self.arm.joint_names])
+
+    def combined_half_width(self, combinations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the half widths (k,) of the prediction intervals of linear combinations of the actuator efforts.
+
+        They are 0 if the half width of an actuator in the combination is unknown.
+
+        Args:
+            combinations: Coefficients (k, n), e.g. the transposed matrix of `Arm.transmission` for the joint efforts.
+        """
+        correlation = self.section.error_correlation
+        scaled = combinations * self.half_width
+        squares = scaled @ (np.eye(len(self.half_width)) if correlation is None else np.array(correlation))
+        is_known = np.all((combinations == 0) | (self.half_width > 0), axis=1)
+        return np.where(is_known, np.sqrt(np.maximum(np.sum(squares * scaled, axis=1), 0.0)), 0.0)
 
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """Returns the actuator efforts (m, n) [N m, N] without effects for a joint motion (m, n)."""
@@ -219,6 +232,9 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
             )
     if [rotor.actuator for rotor in section.rotors] != list(arm.joint_names):
         raise ModelError(f"dynamics.rotors must have these actuators in this order: {', '.join(arm.joint_names)}")
+    n, correlation = arm.num_joints, section.error_correlation
+    if correlation is not None and [len(row) for row in correlation] != [n] * n:
+        raise ModelError(f"dynamics.error_correlation must have {n} rows of {n} numbers")
     _check_effects(arm, section)
     settings = section.signals
     for which, values in (

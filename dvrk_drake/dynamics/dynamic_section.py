@@ -4,7 +4,7 @@
 from dataclasses import dataclass, field
 
 from dvrk_drake.models.arm_schema import GRAVITIES
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect
 from dvrk_drake.models.schema_fault import formerly, within
 
 #: Allowed range of estimates. It is wide because parameters that a recording does not identify can have any value.
@@ -13,6 +13,7 @@ STANDARD_ERRORS = within(0.0, 1e9)
 RMS_EFFORTS = within(0.0, 1e6, "N m or N")
 #: Range from 0 to 1 with a tolerance for rounding.
 SHARES = within(-1e-6, 1.0 + 1e-6)
+_CORRELATIONS = within(-1.0 - 1e-6, 1.0 + 1e-6)
 _CUT_OFFS = within(0.01, 1e5, "Hz")
 
 
@@ -59,7 +60,7 @@ class CorrelatedEstimates:
 
     first: str = ""
     second: str = ""
-    correlation: float = field(default=0.0, metadata=within(-1.0 - 1e-6, 1.0 + 1e-6))
+    correlation: float = field(default=0.0, metadata=_CORRELATIONS)
 
 
 @dataclass
@@ -107,7 +108,8 @@ class DynamicSection:
     `gravity` is the gravity vector that was estimated from the motion, in the base frame [m/s^2]. `gravity_expected` is
     the vector that was assumed before identification. The two vectors differ if the base was tilted. `base_parameters`
     are the identifiable combinations of link and rotor parameters. `correlations` lists pairs of parameters that are
-    not identifiable separately.
+    not identifiable separately. `degrees_of_freedom` are those of the standard errors. `error_correlation` (n, n) is
+    the correlation of the errors of `rms_cross_validation`. Both are None if they are unknown.
     """
 
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
@@ -119,3 +121,5 @@ class DynamicSection:
     gravity_expected: list[float] = field(default_factory=list, metadata=GRAVITIES)
     base_parameters: list[MotionParameterEstimate] = field(default_factory=list)
     correlations: list[CorrelatedEstimates] = field(default_factory=list)
+    degrees_of_freedom: float | None = field(default=None, metadata=FREEDOMS)
+    error_correlation: list[list[float]] | None = field(default=None, metadata=_CORRELATIONS)

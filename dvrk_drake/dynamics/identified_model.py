@@ -32,7 +32,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect, half_width
 from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.locked_joints import lock_joints
@@ -43,8 +43,9 @@ from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
 #: Format of the files that `IdentifiedModel.save` writes.
+#: Versions before 5.1 have no degrees of freedom.
 #: Versions 2 to 4 have no locked joints. In version 2, `arm` is a name or an absolute path.
-FORMAT = FileFormat("dvrk_drake identified model", 5, oldest=2)
+FORMAT = FileFormat("dvrk_drake identified model", 5, 1, oldest=2)
 #: Text between the method of an identification and the recording of the last recalibration.
 _RECALIBRATED = ", recalibrated on "
 #: Allowed range of measured positions, which may be beyond the limits of a joint.
@@ -55,13 +56,23 @@ _POSITIONS = within(-50.0, 50.0, "rad or m")
 class BaseParameterEstimate:
     """Estimate of a base parameter [kg m, or kg for a mass].
 
-    `distinguishable` is true if the absolute value exceeds two standard errors.
+    `degrees_of_freedom` are those of the standard error, None if they are unknown. `distinguishable` is true if the
+    95 % interval excludes 0.
     """
 
     name: str = ""
     value: float = field(default=0.0, metadata=ESTIMATES)
     standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
     distinguishable: bool = False
+    degrees_of_freedom: float | None = field(default=None, metadata=FREEDOMS)
+
+    @classmethod
+    def of(
+        cls, name: str, value: float, standard_error: float, degrees_of_freedom: float | None
+    ) -> "BaseParameterEstimate":
+        """Returns an estimate, with the result of the comparison of its interval with 0."""
+        excludes_0 = abs(value) > half_width(standard_error, degrees_of_freedom)
+        return cls(name, float(value), float(standard_error), bool(excludes_0), degrees_of_freedom)
 
 
 def _earlier(name: str) -> dict[str, object]:

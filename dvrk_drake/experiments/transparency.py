@@ -30,8 +30,8 @@ from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 SAMPLE_PERIOD = 5e-3
 #: Duration of the initial transient of the grasp, which is excluded from the evaluation [s].
 GRASP_TIME = 1.0
-#: Maximum excess over the joint limits [rad, m]. A recording with a larger excess is rejected.
-MAX_LIMIT_EXCESS = 0.1
+#: Maximum excess over the joint limits [rad], [m]. A recording with a larger excess is rejected.
+MAX_LIMIT_EXCESS = 0.1, 0.01
 
 
 @dataclass(frozen=True)
@@ -117,11 +117,13 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
         raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
     A, lower, upper = arm.limit_matrix()
     excess = np.max(np.maximum(lower - recording.q @ A.T, recording.q @ A.T - upper), axis=0)
-    if np.any(excess > MAX_LIMIT_EXCESS):
-        j = int(np.argmax(excess))
+    shares = excess / arm.per_limit(*MAX_LIMIT_EXCESS)
+    if np.any(shares > 1):
+        j = int(np.argmax(shares))
         name = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)][j]
+        unit = "m" if j < arm.num_joints and arm.prismatic[j] else "rad"
         raise ScenarioError(
-            f"{recording.source}: {name} exceeds the limits of {arm.name} by {excess[j]:.2g} rad or m. Check that the "
+            f"{recording.source}: {name} exceeds the limits of {arm.name} by {excess[j]:.2g} {unit}. Check that the "
             "recording is of this arm and contains joint positions, not actuator positions."
         )
     t, keep = np.unique(recording.t, return_index=True)

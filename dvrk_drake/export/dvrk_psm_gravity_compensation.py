@@ -12,7 +12,7 @@ of insertion is disabled. Link 7 then has none, so the torque of insertion is 0.
 negative, because the controller requires masses of at least 0.
 
 The controller computes the direction of gravity in the base frame from the angle `mounting_pitch`, which is not part of
-the file but of the arm's configuration beside it (JSON with comments). This angle describes a rotation about the x axis of the base only.
+the file but of the arm's configuration beside it. This angle describes a rotation about the x axis of the base only.
 """
 
 from __future__ import annotations

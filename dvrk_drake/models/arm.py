@@ -203,11 +203,20 @@ class Arm:
         upper = np.concatenate([self.position_upper, [limit.upper for limit in self.coupled_limits]])
         return A, lower, upper
 
-    def limit_violations(self, q: ArrayLike, tolerance: float = 0.0) -> list[str]:
-        """Returns messages on the limits that a pose q (n,) violates by more than `tolerance` [rad or m].
+    def per_limit(self, revolute: float, prismatic: float) -> NDArray[np.float64]:
+        """Returns an array with one value per row of `limit_matrix`. Coupled limits have the value `revolute`."""
+        return np.append(self.per_joint(revolute, prismatic), np.full(len(self.coupled_limits), revolute))
+
+    def limit_violations(self, q: ArrayLike, tolerance: ArrayLike = 0.0) -> list[str]:
+        """Returns messages on the limits that a pose q (n,) violates by more than a tolerance.
 
         The list is empty if the pose is within all limits.
+
+        Args:
+            q: Pose (n,) [rad, m].
+            tolerance: Tolerance of all limits, or of each limit as from `per_limit` [rad, m].
         """
+        tolerance = np.asarray(tolerance, float)
         A, lower, upper = self.limit_matrix()
         names = [*self.joint_names, *(limit.name for limit in self.coupled_limits)]
         value = A @ np.asarray(q, float)

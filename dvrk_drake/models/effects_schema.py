@@ -16,6 +16,20 @@ from dvrk_drake.models.schema_fault import formerly, number_fault, within
 
 #: Accepted quantization steps and noise of efforts. One bit of a dVRK wrist motor is 1e-5 N m.
 _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
+#: Accepted degrees of freedom of an estimated standard error.
+FREEDOMS = within(1e-3, 1e12)
+
+
+def half_width(standard_error: float, degrees_of_freedom: float | None) -> float:
+    """Returns half the width of a 95 % interval, from Student's t distribution.
+
+    Args:
+        standard_error: Standard error, itself estimated from residuals.
+        degrees_of_freedom: Degrees of freedom of this estimate. None: unknown and assumed to be many.
+    """
+    from scipy.special import stdtrit  # takes 0.1 s, and most commands form no interval
+
+    return float(stdtrit(np.inf if degrees_of_freedom is None else degrees_of_freedom, 0.975)) * standard_error
 
 
 @dataclass
@@ -30,6 +44,7 @@ class DriveEffect(Shared):
         coefficient: Coefficient of the effect. The unit depends on the kind: N m, N m s/rad or N m/rad, or N, N s/m or
             N/m for a prismatic coordinate.
         standard_error: Standard error of the coefficient, in the same unit; 0 if the effect was not identified.
+        degrees_of_freedom: Degrees of freedom of the standard error, see `half_width`.
     """
 
     coordinate: str = ""
@@ -37,11 +52,12 @@ class DriveEffect(Shared):
     scale: float = field(default=0.0, metadata=within(1e-6, 1000.0, also=(0.0,)))
     coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad") | formerly("value"))
     standard_error: float = field(default=0.0, kw_only=True, metadata=within(0.0, 1e9))
+    degrees_of_freedom: float | None = field(default=None, kw_only=True, metadata=FREEDOMS)
 
     @property
     def distinguishable(self) -> bool:
-        """Returns whether the absolute value of the coefficient exceeds two standard errors."""
-        return abs(self.coefficient) > 2 * self.standard_error
+        """Returns whether the 95 % interval of the coefficient excludes 0."""
+        return abs(self.coefficient) > half_width(self.standard_error, self.degrees_of_freedom)
 
 
 @dataclass

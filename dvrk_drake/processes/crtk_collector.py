@@ -43,8 +43,8 @@ STALL, _PROGRESS = 2.0, 0.005
 _APPROACH_SPEED = 0.4
 #: Time for which the arm must be at rest at the start of an approach [s].
 APPROACH_REST = 0.2
-#: Distance [rad, m] outside the limits that is accepted at the start, because the limits of two arms differ.
-_START_TOLERANCE = 0.05
+#: Distance outside the limits that is accepted at the start [rad], [m], because the limits of two arms differ.
+_START_TOLERANCE = 0.05, 0.005
 #: Time after a pause during which the Enter key has no effect [s], because an operator may press it repeatedly.
 _PAUSE = 1.0
 #: Largest time step of a motion [s]. It prevents a distant goal after this process was suspended.
@@ -184,7 +184,7 @@ class CrtkCollector:
 
     def _collect(self) -> Steps:
         """Measures the remaining poses. After a pause, a new call repeats the present pose from the beginning."""
-        if outside := self._arm.limit_violations(self._monitor.q, _START_TOLERANCE):
+        if outside := self._arm.limit_violations(self._monitor.q, self._arm.per_limit(*_START_TOLERANCE)):
             raise CollectionError(
                 f"{self._arm.name} cannot start: {'; '.join(outside)} [rad, m]. Move the arm inside its limits first"
             )

@@ -15,7 +15,7 @@ import io
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.io
@@ -405,6 +405,8 @@ def _messages(value: object) -> list[JointState]:
 
 def _members(value: object) -> dict[str, NDArray]:
     """Returns the members of a record, or of an array with one record, by their names in lower case."""
+    if isinstance(value, dict):
+        return value
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     return (
@@ -420,19 +422,56 @@ def _read_hdf5(content: bytes) -> dict[str, object]:
 
     found: dict[str, object] = {}
 
-    def visit(name: str, item: object) -> None:
+    def is_of_references(item: Any) -> bool:
+        return isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is not None
+
+    def value(item: Any) -> Any:
+        """Returns a text, an array, or a dictionary of the members of a structure."""
+        if isinstance(item, h5py.Group):
+            return {name.lower(): value(member) for name, member in item.items()}
+        if "MATLAB_empty" in item.attrs:
+            return np.empty(0)
+        # MATLAB stores arrays by columns, HDF5 by rows.
+        numbers = np.asarray(item).T
+        if is_of_references(item):
+            return [value(item.file[reference]) for reference in numbers.reshape(-1)]
+        is_text = item.attrs.get("MATLAB_class", b"double") == b"char"
+        return "".join(map(chr, numbers.reshape(-1, order="F"))) if is_text else numbers
+
+    def visit(name: str, item: Any) -> None:
         # MATLAB stores references under names that begin with #.
-        if isinstance(item, h5py.Dataset) and not name.startswith("#") and "MATLAB_empty" not in item.attrs:
+        if name.startswith("#"):
+            return
+        if isinstance(item, h5py.Group):
+            # The members of a structure array are arrays of references to the values of its elements.
+            if len(item) and all(is_of_references(own) and "MATLAB_class" not in own.attrs for own in item.values()):
+                members = {key.lower(): value(member) for key, member in item.items()}
+                read_messages(
+                    name,
+                    [dict(zip(members, own, strict=True)) for own in zip(*members.values(), strict=True)],
+                    "struct",
+                )
+            else:
+                for key, member in item.items():
+                    visit(f"{name}.{key}" if name else key, member)
+        elif "MATLAB_empty" not in item.attrs:
             matlab_class = item.attrs.get("MATLAB_class", b"double").decode()
             if matlab_class in _NUMERIC_CLASSES:
-                # MATLAB stores arrays by columns, HDF5 by rows.
-                found[name.replace("/", ".")] = np.asarray(item).T
+                found[name] = np.asarray(item).T
+            elif matlab_class == "cell":
+                read_messages(name, value(item), matlab_class)
             elif matlab_class not in ("char", "logical"):
-                # The content of an object, or of a cell array, is not an array of numbers.
+                # The content of an object is not an array of numbers.
                 found[f"object {len(found)}"] = matlab_class
 
+    def read_messages(name: str, items: list[object], matlab_class: str) -> None:
+        elements = np.empty(len(items), dtype=object)
+        elements[:] = items
+        messages = _messages(elements)
+        found[name if messages else f"object {len(found)}"] = messages or matlab_class
+
     with h5py.File(io.BytesIO(content), "r") as file:
-        file.visititems(visit)
+        visit("", file)
     return found
 
 

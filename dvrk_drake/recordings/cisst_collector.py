@@ -21,7 +21,7 @@ from dvrk_drake.models.files import open_input, read_input
 from dvrk_drake.models.locked_joints import check_held
 from dvrk_drake.recordings.csv_rows import CsvReader, read_numbers
 from dvrk_drake.recordings.file_options import FileOptions
-from dvrk_drake.recordings.joint_states import MAX_LATE, arm_joint_names
+from dvrk_drake.recordings.joint_states import arm_joint_names, order_in_time
 from dvrk_drake.recordings.recording import Coordinates, Recording
 
 #: Lines of a description before the names of the columns.
@@ -43,7 +43,8 @@ def is_collector_file(path: Path) -> bool:
 def read_collector(path: Path, options: FileOptions) -> Recording:
     """Reads the measured joint states of an arm.
 
-    Rows of invalid data, and rows that are not later than the previous one, are omitted and noted.
+    Rows of invalid data, and rows with the time of another one, are omitted and noted. Rows that are not in order are
+    sorted and noted.
 
     Joints are assigned by their names. Actuators, and joints without names, are assigned by their order. The jaw of a
     PSM is read from the signal "jaw/measured_js".
@@ -91,24 +92,16 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
         sha256 = reader.sha256()
     t = found.blocks["t"][:, 0]
     valid = found.blocks["valid"][:, 0] != 0
-    latest = np.maximum.accumulate(np.where(valid, t, -np.inf))
-    before = np.concatenate([[-np.inf], latest[:-1]])
-    if np.any(early := valid & (t < before - MAX_LATE)):
-        row = int(np.argmax(early))
-        raise RecordingError(
-            f"{data}, line {found.lines[row]}: the time of {signal} is {before[row] - t[row]:g} s before that of an "
-            "earlier row. Cut the file where the clock was set."
-        )
-    new = valid & (t > before)
-    notes = [*found.notes, *name_notes]
-    for count, reason in (
-        (np.sum(~valid), "marked invalid"),
-        (np.sum(valid & ~new), "not later than the previous row"),
-    ):
-        if count:
-            notes.append(f"{count} rows of {signal} omitted: {reason}")
-    if not np.any(new) or np.sum(valid & ~new) > np.sum(new):
-        raise RecordingError(f"{data}: {signal} has {np.sum(new)} usable rows ({'; '.join(notes)})")
+    notes, usable = [*found.notes, *name_notes], np.flatnonzero(valid)
+    if len(usable) < len(valid):
+        notes.append(f"{len(valid) - len(usable)} rows of {signal} omitted: marked invalid")
+    if not len(usable):
+        raise RecordingError(f"{data}: {signal} has no usable row ({'; '.join(notes)})")
+    stamps = np.round(1e9 * t[usable]).astype(np.int64)
+    in_time, time_notes = order_in_time(
+        data, f"rows of {signal}", stamps, found.lines[usable], lambda line: f"line {line}", "time"
+    )
+    new, notes = usable[in_time], [*notes, *time_notes]
     check_held(f"{data}: {signal}", list(held), found.blocks["held"][new], arm)
     recording = Recording(
         found.blocks["q"][new],

@@ -134,7 +134,7 @@ def collect_joint_states(
             has = next(number for number in numbers if number not in set(absent_in))
             raise RecordingError(f"{path}: {item(absent_in[0])} has no {name}, but {item(has)} has. Cut the recording.")
     stamp_array, number_array = np.frombuffer(stamps, np.int64), np.frombuffer(numbers, np.int64)
-    order, time_notes = _order_in_time(path, topic, stamp_array, number_array, item)
+    order, time_notes = order_in_time(path, f"messages of {topic}", stamp_array, number_array, item)
     table = {name: np.frombuffer(block).reshape(len(stamps), -1)[order] for name, block in blocks.items()}
     return JointStates(
         *(topic, names, stamp_array[order], table["position"], table.get("velocity"), table.get("effort")),
@@ -225,13 +225,26 @@ def _not_finite(where: str, names: tuple[str, ...], rows: Mapping[str, NDArray[n
     return f"{where} has numbers that are too large"
 
 
-def _order_in_time(
-    path: Path, topic: str, stamps: NDArray[np.int64], numbers: NDArray[np.int64], item: Callable[[int], str]
+def order_in_time(
+    path: Path,
+    what: str,
+    stamps: NDArray[np.int64],
+    numbers: NDArray[np.int_],
+    item: Callable[[int], str],
+    stamp: str = "header stamp",
 ) -> tuple[NDArray[np.intp], list[str]]:
-    """Returns the order (k,) of the messages in time, without repeated stamps, and notes.
+    """Returns the order (k,) of measurements in time, without repeated times, and notes.
+
+    Args:
+        path: Path of the file, for messages of errors.
+        what: Name of the measurements, e.g. "messages of /PSM1/measured_js".
+        stamps: Times (m,) in the order of the file [ns].
+        numbers: Numbers (m,) of the measurements in the file.
+        item: Function that returns the text of such a number, e.g. "message 3".
+        stamp: Name of a time.
 
     Raises:
-        RecordingError: The clock was set back, or most stamps are repeated.
+        RecordingError: The clock was set back, or most times are repeated.
     """
     latest = np.concatenate([stamps[:1], np.maximum.accumulate(stamps)[:-1]])
     is_late = stamps < latest
@@ -249,20 +262,20 @@ def _order_in_time(
         row = int(np.argmax(set_back))
         before = int(np.argmax(stamps[:row]))
         raise RecordingError(
-            f"{path}: the header stamp of {item(numbers[row])} is {1e-9 * (latest[row] - stamps[row]):g} s before that "
-            f"of message {numbers[before]}. Cut the recording where the clock was set, or record again."
+            f"{path}: the {stamp} of {item(numbers[row])} is {1e-9 * (latest[row] - stamps[row]):g} s before that of "
+            f"{item(numbers[before])}. Cut the recording where the clock was set, or record again."
         )
     order = np.argsort(stamps, kind="stable")
     order = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
     repeated, late = len(stamps) - len(order), int(np.sum(is_late[order]))
     if repeated > len(order):
         raise RecordingError(
-            f"{path}: the header stamps of {topic} do not increase in {repeated} of {len(stamps)} messages. Record "
-            "while the console publishes measured data."
+            f"{path}: the {stamp}s do not increase in {repeated} of {len(stamps)} {what}. Record while the console "
+            "publishes measured data."
         )
-    notes = [f"{repeated} messages of {topic} omitted: same header stamp as another message"] if repeated else []
+    notes = [f"{repeated} {what} omitted: same {stamp} as another one"] if repeated else []
     if late:
-        notes.append(f"{late} messages of {topic} were not in order, and are sorted by their header stamps")
+        notes.append(f"{late} {what} were not in order, and are sorted by their {stamp}s")
     return order, notes
 
 

@@ -13,7 +13,7 @@ import math
 import mmap
 import struct
 from array import array
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +26,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
 from dvrk_drake.models.lcm_messages import MESSAGE_VERSION, STATUS_PREFIX, decode, status_channel
 from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.joint_states import MAX_LATE
 from dvrk_drake.recordings.recording import Recording
 
 _MAGIC = bytes.fromhex("EDA1DA01")
@@ -132,7 +133,8 @@ def _event(content: mmap.mmap, start: int) -> LcmEvent:
 
 _UNREADABLE = f"not an lcmt_dvrk_status of version {MESSAGE_VERSION}"
 _FOREIGN = "of another arm or number of joints"
-_LATE = "not later than the previous one"
+_LATE = f"more than {MAX_LATE:g} s before an earlier one"
+_REPEATED = "with the time of another one"
 _NOT_FINITE = "with a measurement that is not finite"
 _OFF = "with the motors off"
 
@@ -143,8 +145,9 @@ class StatusStream:
     Attributes:
         arm_name: Name of the arm whose statuses are used.
         num_joints: Number of joints that the statuses must have.
-        last: Last status of the arm, including unusable statuses; None before the first status.
+        last: Latest status of the arm, including unusable statuses; None before the first status.
         num_lost: Number of statuses missing in the sequence.
+        num_late: Number of statuses that arrived after a later one, by up to `MAX_LATE`.
         num_used: Number of used statuses.
         first_utime: Time of the first used status [us], at which t of the recording is 0.
     """
@@ -153,7 +156,8 @@ class StatusStream:
         """Creates a stream for the named arm."""
         self.arm_name, self.num_joints = arm_name, num_joints
         self.last: lcmt_dvrk_status | None = None
-        self.num_lost, self.num_used, self.first_utime = 0, 0, 0
+        self.num_lost, self.num_late, self.num_used, self.first_utime = 0, 0, 0, 0
+        self._recent: deque[int] = deque()
         self._sessions: list[int] = []
         self._omitted: Counter[str] = Counter()
 
@@ -182,6 +186,8 @@ class StatusStream:
         notes = [f"messages omitted, {reason}: {count}" for reason, count in self._omitted.items()]
         if self.num_lost:
             notes.append(f"messages lost (gaps in the sequence numbers): {self.num_lost}")
+        if self.num_late:
+            notes.append(f"messages not in order, sorted by their times: {self.num_late}")
         if len(self._sessions) > 1:
             notes.append(f"restarts of {self.arm_name} during the recording: {len(self._sessions) - 1}")
         return notes
@@ -190,12 +196,22 @@ class StatusStream:
         """Returns the reason why a status is not usable, or "" if it is usable. Also counts the lost statuses."""
         if status.arm_name != self.arm_name or status.num_joints != self.num_joints:
             return _FOREIGN
-        continues = self._follow_session(status.session_id)
-        if self.last is not None and status.utime <= self.last.utime:
-            return _LATE
-        if continues and self.last is not None:
-            self.num_lost += max(0, status.sequence - self.last.sequence - 1)
-        self.last = status
+        continues, last = self._follow_session(status.session_id), self.last
+        if last is not None and status.utime <= last.utime:
+            if last.utime - status.utime > 1e6 * MAX_LATE:
+                return _LATE
+            if status.utime in self._recent:
+                return _REPEATED
+            # The gap in the sequence was counted when the later status arrived.
+            self.num_lost = max(0, self.num_lost - 1)
+            self.num_late += 1
+        else:
+            if continues and last is not None:
+                self.num_lost += max(0, status.sequence - last.sequence - 1)
+            self.last = status
+            while self._recent and status.utime - self._recent[0] > 1e6 * MAX_LATE:
+                self._recent.popleft()
+        self._recent.append(status.utime)
         if not all(map(math.isfinite, measurements(status))):
             return _NOT_FINITE
         return _OFF if status.guard_state == lcmt_dvrk_status.STATE_OFF else ""
@@ -225,8 +241,9 @@ _LISTED = 8
 def read_status_log(path: Path, options: FileOptions) -> Recording:
     """Reads an LCM log written by lcm-logger or `dvrk-drake record`. Messages of other channels are ignored.
 
-    A message is omitted and counted in `notes` if it cannot be read, is of another arm, is not later than the previous
-    message, contains a number that is not finite, or was sent while the motors were off.
+    A message is omitted and counted in `notes` if it cannot be read, is of another arm, has the time of another one,
+    contains a number that is not finite, or was sent while the motors were off. Messages that are late by up to
+    `MAX_LATE` are sorted and counted.
 
     Args:
         path: Path of the log.
@@ -261,10 +278,11 @@ def read_status_log(path: Path, options: FileOptions) -> Recording:
     notes = [*log.notes, *(stream.notes() if stream else [])]
     if not events:
         raise RecordingError(f"{path}: {_no_usable_status(channel, arm, channels, notes)}")
-    q, qd, tau = np.array(rows).reshape(len(events), 3, -1).transpose(1, 0, 2)
-    numbers, sha256 = np.array(events), log.sha256()
+    order = np.argsort(times, kind="stable")
+    q, qd, tau = np.array(rows).reshape(len(events), 3, -1).transpose(1, 0, 2)[:, order]
+    t, numbers, sha256 = np.array(times)[order], np.array(events)[order], log.sha256()
     return Recording(
-        *(q, tau, qd, np.array(times), "joint", str(path), numbers, sha256, tuple(notes), "event"),
+        *(q, tau, qd, t - t[0], "joint", str(path), numbers, sha256, tuple(notes), "event"),
         file_coordinates="joint",
         arm_name=arm.name if arm else "",
     )

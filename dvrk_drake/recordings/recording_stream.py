@@ -6,6 +6,7 @@ lost.
 
 from __future__ import annotations
 
+import heapq
 import os
 import tempfile
 from collections.abc import Callable
@@ -17,9 +18,11 @@ import numpy as np
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.recordings.arm_bag import ArmMessages
 from dvrk_drake.recordings.csv_rows import GrowingFile
+from dvrk_drake.recordings.joint_states import MAX_LATE
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.mcap_writer import GrowingMcap
 from dvrk_drake.recordings.writing import column_names
@@ -90,6 +93,8 @@ def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> Rec
 
 
 class _CsvFile(GrowingFile):
+    """CSV with rows in the order of arrival. At the end, the rows are sorted by their times if a status was late."""
+
     def __init__(self, path: str | Path, stream: StatusStream, arm: Arm) -> None:
         super().__init__(path)
         self._stream, self._end = stream, f",joint,{arm.name}\n"
@@ -99,6 +104,20 @@ class _CsvFile(GrowingFile):
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         if status is not None:
             self.append(self._row(status))
+
+    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
+        super().close(progress)
+        if self._stream.num_late:
+            with open(self._path, "rb") as rows, atomic_write(self._path, "wb") as ordered:
+                ordered.write(next(rows))
+                waiting: list[tuple[float, bytes]] = []
+                for row in rows:
+                    t = float(row.partition(b",")[0])
+                    heapq.heappush(waiting, (t, row))
+                    # A later row of the file is at most MAX_LATE earlier.
+                    while waiting[0][0] < t - MAX_LATE:
+                        ordered.write(heapq.heappop(waiting)[1])
+                ordered.writelines(row for _, row in sorted(waiting))
 
     def _row(self, status: lcmt_dvrk_status) -> bytes:
         numbers = (self._stream.time(status), *measurements(status))

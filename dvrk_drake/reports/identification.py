@@ -26,7 +26,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import DriveEffect, half_width
 from dvrk_drake.reports.answers import Answer, answer_of, percent
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -274,13 +274,13 @@ def _print_base_parameters(console: Console, section: DynamicSection) -> None:
     table.columns[0].max_width = _NAME_WIDTH
     for p in section.base_parameters:
         remark = "" if p.identifiability >= MIN_IDENTIFIABILITY else "from the SDF"
-        if not remark and abs(p.value) < 2 * p.standard_error:
+        if not remark and abs(p.value) < half_width(p.standard_error, section.degrees_of_freedom):
             remark = "zero?"
         table.add_row(escape(p.name), f"{p.value:+.3g}", f"{p.standard_error:.1g}", p.unit, remark)
     console.print(table)
     print_note(
         console,
-        "from the SDF: the motion does not determine this parameter. zero?: smaller than two standard errors.",
+        "from the SDF: the motion does not determine this parameter. zero?: the 95 % interval contains 0.",
     )
 
 
@@ -379,7 +379,7 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
     print_note(
         console,
         f"Method {provenance.method}, rank {provenance.rank} of {len(model.base_parameters)}, condition number "
-        f"{provenance.condition_number:.3g}. zero?: smaller than two standard errors.",
+        f"{provenance.condition_number:.3g}. zero?: the 95 % interval contains 0.",
     )
     if model.effects:
         table = make_table("Joint effects [N m; N]", "", "value", "standard error", "")

@@ -8,7 +8,7 @@ from command_output import messages
 from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError
 
-STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1}]\n"
+STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1, joints: [yaw]}]\n"
 #: Mapping from a command to its options and to the function that does the work.
 COMMANDS = {
     "simulate": (["--arm", "psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),

@@ -274,6 +274,10 @@ def test_a_time_series_is_named_as_a_limitation(tmp_path):
     limitation = r"objects of the MATLAB class timeseries are not read; save their numbers as arrays, e\.g\. q = data"
     path = with_objects(write_arrays(tmp_path, "v5", {"gain": np.ones(3)}), "timeseries")
     assert_refused(limitation, read_recording, path)
+    other = np.empty((2, 1), object)
+    other[:, 0] = "left", np.ones(3)
+    path = write_arrays(tmp_path, "v7.3", {"notes": other})
+    assert_refused("objects of the MATLAB class cell are not read", read_recording, path)
     path = write_arrays(tmp_path, "v7.3", {"q": np.arange(14, dtype=np.uint32).reshape(2, 7)})
     with h5py.File(path, "r+") as file:
         file["q"].attrs["MATLAB_class"] = np.bytes_("timeseries")
@@ -282,7 +286,8 @@ def test_a_time_series_is_named_as_a_limitation(tmp_path):
 
 @pytest.mark.parametrize("as_cells", [True, False])
 @pytest.mark.parametrize("ros", [1, 2])
-def test_messages_of_the_ros_toolbox_are_read(tmp_path, as_cells, ros):
+@pytest.mark.parametrize("kind", ["v5", "v7.3"])
+def test_messages_of_the_ros_toolbox_are_read(tmp_path, as_cells, ros, kind):
     """`readMessages` of MATLAB's ROS Toolbox returns a cell array of structures. Its members are capital in ROS 1."""
     arm, (q, qd, tau) = load_arm("mtml"), blocks(6)
     cells = np.empty((7, 1), object)
@@ -299,7 +304,7 @@ def test_messages_of_the_ros_toolbox_are_read(tmp_path, as_cells, ros):
         value[:, 0] = messages
     else:
         value = np.array([tuple(message.values()) for message in messages], [(name, object) for name in messages[0]])
-    path = write_arrays(tmp_path, "v5", {"log": value, "gain": np.ones(3)})
+    path = write_arrays(tmp_path, kind, {"log": value, "gain": np.ones(3)})
     read = read_recording(path, arm)
     for name, expected in (("q", q), ("qd", qd), ("tau", tau)):
         np.testing.assert_array_equal(getattr(read, name), expected)

@@ -78,7 +78,17 @@ def test_omits_invalid_and_repeated_rows(mtm, tmp_path):
     path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, t, q, qd, tau, valid))
     read = read_recording(path, mtm)
     np.testing.assert_array_equal(read.lines, [2, 3, 4, 6, 7, 8])
-    assert [note.partition(": ")[2] for note in read.notes[:2]] == ["marked invalid", "not later than the previous row"]
+    assert [note.partition(": ")[2] for note in read.notes[:2]] == ["marked invalid", "same time as another one"]
+
+
+def test_sorts_and_counts_late_rows(mtm, tmp_path):
+    q, qd, tau = blocks(8, 7)
+    order = [0, 1, 4, 3, 2, 5, 7, 6]
+    signal = joint_state("measured_js", mtm.joint_names, times(8)[order], q[order], qd[order], tau[order])
+    read = read_recording(write_collection(tmp_path, JOINTS, signal), mtm)
+    np.testing.assert_array_equal(read.q, q)
+    np.testing.assert_allclose(read.t, 0.005 * np.arange(8), atol=1e-9)
+    assert read.notes[0] == "3 rows of measured_js were not in order, and are sorted by their times"
 
 
 def test_chooses_a_signal(mtm, tmp_path):
@@ -100,7 +110,12 @@ def test_faults_are_refused(mtm, psm, tmp_path):
     assert_refused(r"needs the arm .*--arm", read_recording, path)
     assert_refused("has the joints outer_yaw.*but PSM has yaw.*Check --arm", read_recording, path, psm)
     still = joint_state("measured_js", mtm.joint_names, np.ones(4), q, qd, tau)
-    assert_refused("has 1 usable rows", read_recording, write_collection(tmp_path, JOINTS, still), mtm)
+    assert_refused(
+        "the times do not increase in 3 of 4 rows of measured_js",
+        read_recording,
+        write_collection(tmp_path, JOINTS, still),
+        mtm,
+    )
     tau[2, 6] = np.nan
     bad = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, times(4), q, qd, tau))
     assert_refused(r", line 3: measured_js\.Effort\[6\] is nan; only finite", read_recording, bad, mtm)
@@ -118,7 +133,7 @@ def test_a_clock_that_was_set_and_missing_columns_are_refused(mtm, tmp_path):
     t = times(6)
     t[4:] -= 2.0
     path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, t, q, qd, tau))
-    assert_refused(r", line 5: the time of measured_js is 1\.99\d* s before", read_recording, path, mtm)
+    assert_refused(r"the time of line 5 is 1\.99\d* s before that of line 4", read_recording, path, mtm)
     path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, times(6), q, qd, tau))
     description = path.with_suffix(".desc")
     description.write_text(description.read_text().replace("measured_js.Valid:", "measured_js.Other:"))

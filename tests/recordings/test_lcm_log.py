@@ -138,7 +138,8 @@ def changed(k, **changes):
             [*statuses()[:7], b"garbage", *statuses()[8:]],
             "messages omitted, not an lcmt_dvrk_status of version 1.0: 1",
         ),
-        (changed(7, utime=START + 2000), "messages omitted, not later than the previous one: 1"),
+        (changed(7, utime=START + 2000), "messages omitted, with the time of another one: 1"),
+        (changed(7, utime=START - 95_000), "messages omitted, more than 0.1 s before an earlier one: 1"),
         (changed(7, position=[float("nan")] * N), "messages omitted, with a measurement that is not finite: 1"),
         (
             changed(7, guard_state=Status.STATE_OFF),
@@ -151,6 +152,29 @@ def test_unusable_statuses_are_omitted_and_noted(tmp_path, messages, note):
     recording = read_recording(write_log(tmp_path / "a.log", messages), ARM)
     assert_same_numbers(recording, [*statuses()[:7], *statuses()[8:]])
     assert any(n.startswith(note) for n in recording.notes), recording.notes
+
+
+#: Statuses 5 and 6 arrive after status 7.
+LATE = [*range(5), 7, 6, 5, *range(8, 20)]
+
+
+def test_late_statuses_are_sorted_and_counted(tmp_path):
+    messages = statuses()
+    recording = read_recording(write_log(tmp_path / "a.log", [messages[k] for k in LATE]), ARM)
+    assert_same_numbers(recording, messages)
+    assert recording.notes == ("messages not in order, sorted by their times: 2",)
+    np.testing.assert_array_equal(recording.lines, [LATE.index(k) for k in range(20)])
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".log", ".mcap"])
+def test_recording_with_late_statuses_is_in_order(tmp_path, suffix):
+    stream, path, messages = StatusStream("MTML", N), tmp_path / f"a{suffix}", statuses(300)
+    file = open_recording_file(path, ARM, stream)
+    for k in [*LATE, *range(20, 300)]:
+        file.write(messages[k].encode(), messages[k].utime, stream.accept(messages[k].encode()))
+    file.close()
+    assert stream.notes() == ["messages not in order, sorted by their times: 2"]
+    assert_same_numbers(read_recording(path, ARM), messages)
 
 
 def test_restart_is_noted_and_duplicate_arms_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Writes MATLAB files and NumPy archives for tests."""
 
 import io
+import itertools
 import struct
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import scipy.io
 
 #: Kinds of files: MATLAB version 5 and 7.3, NumPy archive.
 KINDS = ("v5", "v7.3", "npz")
+#: Names of referenced elements.
+_NUMBERS = itertools.count()
 
 
 def write_arrays(folder: Path, kind: str, arrays: dict) -> Path:
@@ -44,6 +47,17 @@ def with_objects(path: Path, *classes: str) -> Path:
     return path
 
 
+def _references(file, values) -> np.ndarray:
+    """Stores the elements of an array, as MATLAB does for a cell array, and returns references to them."""
+    targets = file.require_group("#refs#")
+    references = np.empty(values.T.shape, h5py.ref_dtype)
+    for index, element in np.ndenumerate(values.T):
+        name = str(next(_NUMBERS))
+        _store(targets, {name: element})
+        references[index] = targets[name].ref
+    return references
+
+
 def _store(group, arrays: dict) -> None:
     for name, value in arrays.items():
         if isinstance(value, dict):
@@ -51,5 +65,13 @@ def _store(group, arrays: dict) -> None:
         elif isinstance(value, str):
             group[name] = np.frombuffer(value.encode("utf-16-le"), np.uint16)[:, None]
             group[name].attrs["MATLAB_class"] = np.bytes_("char")
+        elif isinstance(value, np.ndarray) and value.dtype.names:
+            members = group.create_group(name)
+            members.attrs["MATLAB_class"] = np.bytes_("struct")
+            for member in value.dtype.names:
+                members[member] = _references(group.file, value[member])
+        elif isinstance(value, np.ndarray) and value.dtype == object:
+            group[name] = _references(group.file, value)
+            group[name].attrs["MATLAB_class"] = np.bytes_("cell")
         else:
             group[name] = np.asarray(value).T

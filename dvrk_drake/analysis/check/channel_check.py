@@ -190,7 +190,7 @@ def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
     The gain in log-likelihood is -inf if exchanged positions are beyond the joint limits.
     """
     recording, arm = fit.recording, fit.arm
-    allowed = _limit_excess(recording, arm) + _limit_margin(arm)
+    allowed = _limit_excess(recording, arm) + arm.per_limit(*LIMIT_MARGIN)
     for i, j in combinations(map(int, fit.used), 2):
         order = _exchanged(arm.num_joints, i, j)
         qd = None if recording.qd is None else recording.qd[:, order]
@@ -235,7 +235,7 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
     The gain in log-likelihood is -inf if inverted positions are beyond the joint limits.
     """
     recording, arm = fit.recording, fit.arm
-    allowed = _limit_excess(recording, arm) + _limit_margin(arm)
+    allowed = _limit_excess(recording, arm) + arm.per_limit(*LIMIT_MARGIN)
     for i in map(int, fit.used):
         signs = np.where(np.arange(arm.num_joints) == i, -1.0, 1.0)
         qd = None if recording.qd is None else recording.qd * signs
@@ -256,10 +256,6 @@ def _gain_of(other: Recording, fit: ChannelFit) -> float:
     """
     clock = fit.clock if fit.recording.coordinates == "actuator" else None
     return ChannelFit(other, fit.arm, clock).log_likelihood - fit.log_likelihood
-
-
-def _limit_margin(arm: Arm) -> NDArray[np.float64]:
-    return np.append(arm.per_joint(*LIMIT_MARGIN), np.full(len(arm.coupled_limits), LIMIT_MARGIN[0]))
 
 
 def _scales(fit: ChannelFit) -> Iterator[Finding]:

@@ -38,8 +38,10 @@ MIN_ROTOR_DEVIATION = 3e-6
 OVERSAMPLING = 2.5
 #: Duration that is excluded at each end because of filter transients [s].
 ENDS = 1.0
-#: Largest assumed number of independent measurements of an effort. More measurements do not average out model errors.
-MAX_INDEPENDENT = 220.0
+#: Largest assumed numbers of independent measurements of an effort in a motion and in poses. More measurements do not
+#: average out model errors. The number of poses is that of the largest public recording of poses (`mtm_2015_good72`),
+#: for which the limits of the gain at rest are set.
+MAX_INDEPENDENT, MAX_INDEPENDENT_POSES = 220.0, 72.0
 #: Smallest assumed RMS residual of an actuator's effort, as a share of the RMS effort.
 MIN_ERROR = 0.02
 #: In poses at rest, an actuator counts as moving if the range of its positions exceeds this value [rad], [m].
@@ -102,7 +104,7 @@ class ChannelFit:
             self._q = recording.in_joint_coordinates(arm).q
             self._v = self._vd = np.zeros_like(self._q)
             self._tau = recording.in_actuator_coordinates(arm).measured_effort()
-            independent = len(recording)
+            independent = min(len(recording), MAX_INDEPENDENT_POSES)
             moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*MIN_RANGE)
         self._independent = min(independent, MAX_INDEPENDENT)
         measured = np.any(recording.measured_actuators(arm).measured_effort() != 0, axis=0)

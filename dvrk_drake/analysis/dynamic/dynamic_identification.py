@@ -19,6 +19,7 @@ from dvrk_drake.analysis.dynamic.columns import (
 from dvrk_drake.analysis.dynamic.effect_selection import cross_validate, select_effects
 from dvrk_drake.analysis.dynamic.estimates import (
     DynamicEstimates,
+    ParameterCovariance,
     ResidualSeries,
     base_parameter_estimates,
     parameter_covariance,
@@ -26,7 +27,13 @@ from dvrk_drake.analysis.dynamic.estimates import (
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import FOLDS, motion_floor, period_of, phase_folds
+from dvrk_drake.analysis.signals.repetition import (
+    FOLDS,
+    correlation_of,
+    motion_floor,
+    period_of,
+    phase_folds,
+)
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
@@ -152,7 +159,7 @@ def identify_dynamic(
     covariance = parameter_covariance(problem, fit, measured - predicted, settings.effort_cut_off, series)
     estimates = DynamicEstimates(problem, fit, covariance)
     floors = [_repeatability(own, motion) for own, motion in zip(tau, motions, strict=True)]
-    section = _section(problem, effects, fit, covariance.estimates, np.sum((measured - held_out) ** 2, axis=0), floors)
+    section = _section(problem, effects, fit, covariance, measured - held_out, floors)
     section.links = estimates.links()
     section.base_parameters, section.correlations = estimates.base_parameters()
     model = _model(recordings, arm, section, covariance.estimates)
@@ -246,12 +253,12 @@ def _section(
     problem: DynamicProblem,
     selected: NDArray[np.int_],
     fit: ConsistentFit,
-    covariance: NDArray[np.float64],
+    covariance: ParameterCovariance,
     held_out: NDArray[np.float64],
     floors: Sequence[NDArray[np.float64]],
 ) -> DynamicSection:
     arm, p = problem.regressor.arm, problem.num_rigid
-    sd = np.sqrt(np.diag(covariance))
+    sd, freedom = np.sqrt(np.diag(covariance.estimates)), covariance.degrees_of_freedom
     rotors = [
         RotorEstimate(name, float(fit.x[i]), float(sd[i]))
         for i, name in enumerate(arm.joint_names, start=p - arm.num_joints)
@@ -263,23 +270,28 @@ def _section(
             continue
         if value**2 * problem.effect_precision[selected[k]] > MIN_EFFECT**2:
             effects.append(
-                DriveEffect(effect.coordinate, effect.kind, effect.scale, value, standard_error=float(sd[p + k]))
+                DriveEffect(
+                    *(effect.coordinate, effect.kind, effect.scale, value),
+                    standard_error=float(sd[p + k]),
+                    degrees_of_freedom=freedom,
+                )
             )
     rows = problem.num_rows
     size = np.sqrt(problem.efforts / rows)
     repeating = [floor for floor in floors if np.all(np.isfinite(floor))]
     floor = np.sqrt(np.mean(np.square(repeating), axis=0)) if repeating else np.zeros(arm.num_joints)
+    of_held_out = np.sqrt(np.mean(held_out**2, axis=0))
     actuators = [
         ActuatorStatistics(name, *map(float, numbers))
-        for name, *numbers in zip(
-            arm.joint_names, size, np.sqrt(fit.errors / rows), np.sqrt(held_out / rows), floor, strict=True
-        )
+        for name, *numbers in zip(arm.joint_names, size, np.sqrt(fit.errors / rows), of_held_out, floor, strict=True)
     ]
     gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
     gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)
     expected = [float(g) for g in arm.gravity]
     return DynamicSection(
-        [float(g) for g in gravity], [], rotors, effects, actuators, problem.grids[0].settings, expected
+        *([float(g) for g in gravity], [], rotors, effects, actuators, problem.grids[0].settings, expected),
+        degrees_of_freedom=freedom,
+        error_correlation=correlation_of(held_out).tolist(),
     )
 
 

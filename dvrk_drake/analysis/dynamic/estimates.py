@@ -76,6 +76,9 @@ class ParameterUncertainty:
 #: Largest time lag at which effort errors are assumed to be correlated [s]. If the motion repeats, errors at lags near
 #: whole periods are also correlated.
 CORRELATION_TIME = 1.0
+#: Degrees of freedom of a variance that is estimated with a Parzen window, times the largest lag of the window, divided
+#: by the duration (Priestley, "Spectral Analysis and Time Series", 1981, table 6.2).
+PARZEN_FREEDOM = 3.71
 #: Ratio of two rates: the rate of the rows from which the covariance is computed, and twice the cut-off frequency of
 #: the low-pass filter.
 _OVERSAMPLING = 2.0
@@ -110,10 +113,12 @@ class ParameterCovariance(NamedTuple):
     Attributes:
         estimates: Covariance of the estimates.
         prior: Covariance before the recording, for the size of the deviations from the SDF that the recording shows.
+        degrees_of_freedom: Degrees of freedom of the standard errors.
     """
 
     estimates: NDArray[np.float64]
     prior: NDArray[np.float64]
+    degrees_of_freedom: float
 
 
 def parameter_covariance(
@@ -166,7 +171,12 @@ def parameter_covariance(
     factor[: problem.num_rigid] = np.sqrt(_deviation_scale(fit, problem.prior, A @ noise @ A))
     scaled = fit.prior_precision * np.outer(factor, factor)
     prior = _inverse(fit.prior_precision) * np.outer(factor, factor)
-    return ParameterCovariance(A @ (noise + scaled) @ A, prior)
+    seconds = sum(min(_duration(motion), motion.period or np.inf) for motion in series)
+    return ParameterCovariance(A @ (noise + scaled) @ A, prior, PARZEN_FREEDOM * seconds / CORRELATION_TIME)
+
+
+def _duration(motion: ResidualSeries) -> float:
+    return (motion.rows.stop - motion.rows.start) / motion.rate
 
 
 def _deviation_scale(fit: ConsistentFit, mean: NDArray[np.float64], noise: NDArray[np.float64]) -> float:
@@ -280,7 +290,7 @@ class DynamicEstimates:
     def __init__(self, problem: DynamicProblem, fit: ConsistentFit, covariance: ParameterCovariance) -> None:
         """Constructs the estimates from a fit and the covariance of `fit.x`."""
         self._problem, self._fit = problem, fit
-        self._covariance, self._prior = covariance
+        self._covariance, self._prior, _ = covariance
         self._effects = [problem.columns.effects[k] for k in fit.effects]
 
     def links(self) -> list[LinkEstimate]:
@@ -372,6 +382,6 @@ def base_parameter_estimates(
     values = B @ phi
     errors = np.sqrt(np.diag(B @ covariance[: len(phi), : len(phi)] @ B.T))
     return [
-        BaseParameterEstimate(name, float(value), float(error), bool(abs(value) > 2 * error))
+        BaseParameterEstimate.of(name, value, error, section.degrees_of_freedom)
         for name, value, error in zip(gravity.base.names, values, errors, strict=True)
     ]

@@ -189,13 +189,14 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         floor = [float(x) if np.isfinite(x) else None for x in motion_floor(tau, grid, period)]
     vd = grid.efforts_at_rows(arm.transmission.velocity(grid.vd))[grid.inner]
     covered = coverage(arm, np.ptp(grid.q, axis=0), "actuator")
+    widths = dynamics.combined_half_width(grid.channels)
     actuators = []
     for i, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, "actuator"), strict=True)):
         shares = error_shares(measured[:, i] - predicted[:, i], i, a, v[:, i], vd, t, period)
         judged = tolerance, float(covered[i]), model.joints[i].feedforward_scale > 0
         error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], *judged)
-        if np.any(measured[:, i]) and (width := _half_width(dynamics.half_width, grid.channels[i])):
-            error = replace(error, inside=float(np.mean(np.abs(measured[:, i] - predicted[:, i]) <= width)))
+        if np.any(measured[:, i]) and widths[i]:
+            error = replace(error, inside=float(np.mean(np.abs(measured[:, i] - predicted[:, i]) <= widths[i])))
         actuators.append(error)
     return DynamicValidation(
         model=model,
@@ -211,13 +212,6 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         predicted=predicted,
         grid=grid,
     )
-
-
-def _half_width(of_actuators: NDArray[np.float64], channel: NDArray[np.float64]) -> float:
-    """Returns the half width of the prediction interval of one measured effort, 0 if a half width is not known."""
-    used = channel != 0
-    # The errors of the actuators are independent.
-    return float(np.linalg.norm(channel[used] * of_actuators[used])) if np.all(of_actuators[used]) else 0.0
 
 
 def _efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:

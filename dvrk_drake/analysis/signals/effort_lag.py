@@ -20,8 +20,11 @@ ENDS = 1.0
 MAX_ROWS = 50_000
 #: Width of the smoothed sign function for Coulomb friction, as a share of the RMS velocity.
 SMOOTHING = 0.1
-#: Number of segments of the motion from which the standard errors are estimated.
+#: Number of segments of the motion from which the standard error of the delay is estimated.
 NUM_SEGMENTS = 5
+#: Assumed number of independent measurements for the standard error of the Coulomb friction, as in `ChannelFit`. The
+#: shortest motion that is checked has more independent values below `CUT_OFF`.
+NUM_INDEPENDENT = 220
 #: A delay is significant if two ratios exceed these numbers: the ratio of the residual variances without and with the
 #: delay, and the ratio of the delay to its standard error.
 MIN_GAIN, MIN_ERRORS = 1.12, 5.0
@@ -37,8 +40,7 @@ class EffortLag(NamedTuple):
         gain: Ratio of the residual variances without and with the delay [1].
         determined: True if the delay is significant, see `MIN_GAIN` and `MIN_ERRORS`.
         coulomb: Coulomb friction [N m, N], negative if the effort has the wrong sign.
-        coulomb_error: Standard error of the Coulomb friction, from `NUM_SEGMENTS` segments of the motion
-            [N m, N].
+        coulomb_error: Standard error of the Coulomb friction, see `_coulomb` [N m, N].
     """
 
     lag: NDArray[np.float64]
@@ -80,11 +82,16 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
 
 
 def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[float, float]:
-    """Returns the coefficient of the first column (Coulomb friction) and the standard error of the coefficient."""
-    segments = zip(np.array_split(columns, NUM_SEGMENTS), np.array_split(tau, NUM_SEGMENTS), strict=True)
-    estimates = [np.linalg.lstsq(A, b, rcond=None)[0][0] for A, b in segments]
-    coefficient = np.linalg.lstsq(columns, tau, rcond=None)[0][0]
-    return float(coefficient), float(np.std(estimates, ddof=1) / np.sqrt(NUM_SEGMENTS))
+    """Returns the coefficient of the first column (Coulomb friction) and the standard error of the coefficient.
+
+    The standard error is that of `NUM_INDEPENDENT` measurements with the residuals of the fit. It does not decrease
+    with the length or the repetitions of a motion, because the residuals are mainly errors of the simple model.
+    """
+    first, others = columns[:, 0], columns[:, 1:]
+    own = first - others @ np.linalg.lstsq(others, first, rcond=None)[0]
+    coefficient = float(own @ tau / (own @ own))
+    residual = tau - columns @ np.linalg.lstsq(columns, tau, rcond=None)[0]
+    return coefficient, float(np.linalg.norm(residual) / np.linalg.norm(own)) / np.sqrt(NUM_INDEPENDENT)
 
 
 def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: float) -> tuple[float, float, float]:

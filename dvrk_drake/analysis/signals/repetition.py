@@ -105,6 +105,18 @@ FOLDS = 12
 GAP = 0.1
 
 
+def correlation_of(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the matrix (n, n) of the mean products of errors (r, n), divided by their RMS values.
+
+    The elements of a channel without errors are those of the identity.
+    """
+    size = np.linalg.norm(errors, axis=0)
+    unit = errors / np.where(size > 0, size, 1.0)
+    correlation = unit.T @ unit
+    np.fill_diagonal(correlation, 1.0)
+    return np.asarray(correlation)
+
+
 def period_of(grid: MotionGrid) -> float | None:
     """Returns the period of the motion [s] in its longest segment, or None if the motion does not repeat."""
     return find_period(grid.arm.transmission.position(grid.longest_segment.q), GRID_RATE)

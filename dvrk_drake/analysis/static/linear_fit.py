@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 #: Residuals above the first number of robust standard deviations get a smaller weight (Huber). Residuals above the
 #: second number get a weight of zero.
 HUBER_LIMIT, REJECTION_LIMIT = 3.0, 6.0
+#: Largest degrees of freedom. Student's t distribution with more is the normal distribution within 1e-6.
+MAX_FREEDOM = 1e6
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,14 @@ class RobustFit:
         fit: Last weighted fit.
         sigma: Standard deviations (n,) of the errors of each joint, with a correction for the degrees of freedom.
         outliers: Mask (m, n) of the outliers, which have zero weight.
+        degrees_of_freedom: Degrees of freedom (p,) of Student's t distribution of each parameter's error, divided by
+            its standard error.
     """
 
     fit: LinearFit
     sigma: NDArray[np.float64]
     outliers: NDArray[np.bool_]
+    degrees_of_freedom: NDArray[np.float64]
 
 
 def weighted_fit(
@@ -118,10 +123,16 @@ def robust_fit(
         u = np.abs(residuals) / scale
         huber = np.where(u <= HUBER_LIMIT, 1.0, HUBER_LIMIT / np.maximum(u, HUBER_LIMIT))
         weights = usable * np.where(u <= REJECTION_LIMIT, huber, 0.0)
-        squares = (weights * residuals**2).sum(axis=0) / np.maximum(weights.sum(axis=0) - fitted, 1.0)
-        sigma = np.maximum(np.sqrt(squares), sigma_floor)
+        free = np.maximum(weights.sum(axis=0) - fitted, 1.0)
+        sigma = np.maximum(np.sqrt((weights * residuals**2).sum(axis=0) / free), sigma_floor)
     fit = weighted_fit(X, tau, weights / sigma**2, prior_precision)
-    return RobustFit(fit, sigma, usable & (weights == 0.0))
+    # Variances (p, n) of the parameters due to the errors of each joint. Their sum has the degrees of freedom of
+    # Satterthwaite, "An approximate distribution of estimates of variance components" (1946). The variance that the
+    # prior adds is known.
+    variances = np.einsum("mn,mnp->pn", weights / sigma**2, (X @ fit.covariance) ** 2)
+    squares = np.sum(variances**2 / free, axis=1)
+    freedom = np.minimum(np.diag(fit.covariance) ** 2 / np.maximum(squares, np.finfo(float).tiny), MAX_FREEDOM)
+    return RobustFit(fit, sigma, usable & (weights == 0.0), freedom)
 
 
 def blocks(count: int, number: int) -> NDArray[np.int_]:

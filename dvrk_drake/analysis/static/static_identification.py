@@ -132,13 +132,14 @@ def identify_static(
         # The weights are 1, so the covariance is multiplied by the residual variance.
         variance = np.sum(fit.residuals[measured] ** 2) / (np.sum(measured) - Y.shape[2])
         validated, sd = fit.leave_one_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
+        freedom = np.full(len(sd), float(np.sum(measured) - Y.shape[2]))
     else:
         problem = StaticProblem(arm, recording.q, tau, usable)
         progress(0.0)
         effects = select_effects(problem)
         progress(1 / (FOLDS + 1))
         robust = problem.fit(effects)
-        fit, sd = robust.fit, np.sqrt(np.diag(robust.fit.covariance))
+        fit, sd, freedom = robust.fit, np.sqrt(np.diag(robust.fit.covariance)), robust.degrees_of_freedom
         excluded = excluded + exclude_outliers(recording, arm, robust.outliers, fit.residuals)
         usable = usable & ~robust.outliers
         feedforward_scale = _feedforward_scales(problem, fit.leave_one_out_residuals, usable)
@@ -149,12 +150,18 @@ def identify_static(
     model = IdentifiedModel(
         arm=arm,
         base_parameters=[
-            BaseParameterEstimate(name, *_estimate(value, error))
-            for name, value, error in zip(gravity_model.gravity.base.names, fit.theta, sd, strict=False)
+            BaseParameterEstimate.of(name, value, error, float(own))
+            for name, value, error, own in zip(gravity_model.gravity.base.names, fit.theta, sd, freedom, strict=False)
         ],
         effects=[
-            DriveEffect(effect.coordinate, effect.kind, effect.scale, float(value), standard_error=float(error))
-            for effect, value, error in zip(effects, fit.theta[Y.shape[2] :], sd[Y.shape[2] :], strict=True)
+            DriveEffect(
+                *(effect.coordinate, effect.kind, effect.scale, float(value)),
+                standard_error=float(error),
+                degrees_of_freedom=float(own),
+            )
+            for effect, value, error, own in zip(
+                effects, *(x[Y.shape[2] :] for x in (fit.theta, sd, freedom)), strict=True
+            )
         ],
         joints=_statistics(recording, arm, fit, validated, measured, usable, feedforward_scale),
         provenance=Provenance(
@@ -346,7 +353,3 @@ def _statistics(
             )
         )
     return statistics
-
-
-def _estimate(value: float, standard_error: float) -> tuple[float, float, bool]:
-    return float(value), float(standard_error), bool(abs(value) > 2 * standard_error)

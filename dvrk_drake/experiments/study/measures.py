@@ -27,7 +27,7 @@ class Measure:
         band: Tolerance band of revolute joints [rad]. Default: that of the kind.
         band_prismatic: Tolerance band of prismatic joints [m]. Default: that of the kind, in proportion to `band`.
         time: Duration of the evaluated interval [s]. Default: that of the kind.
-        joints: Names of the evaluated joints. Default: all.
+        joints: Names of the evaluated joints. Default: all. A measure in rad or m requires joints of one type.
     """
 
     kind: str = ""
@@ -37,6 +37,9 @@ class Measure:
     time: float | None = field(default=None, metadata=within(1e-5, 3600.0, "s"))
     joints: list[str] = field(default_factory=list)
 
+    # Not a field of the file.
+    _is_prismatic = False
+
     @property
     def column(self) -> str:
         """Name of the column in the results."""
@@ -44,8 +47,9 @@ class Measure:
 
     @property
     def unit(self) -> str:
-        """Unit of the values; "" for shares and boolean measures."""
-        return KINDS[self.kind].unit
+        """Unit of the values; "" for shares and boolean measures. `check` determines the type of the joints."""
+        unit = KINDS[self.kind].unit
+        return unit.replace("rad", "m") if self._is_prismatic else unit
 
     @property
     def title(self) -> str:
@@ -85,6 +89,7 @@ class Measure:
                 f"joints of {self.column}: unknown joint {', '.join(unknown)}; joints of {scenario.mounted_arm.name}: "
                 f"{', '.join(scenario.mounted_arm.joint_names)}"
             )
+        self._check_unit(scenario)
         rest = scenario.duration - _arrival(scenario)
         if kind.time is not None and not 2 * scenario.sample_period <= self._time <= rest + 1e-9:
             raise StudyError(
@@ -94,6 +99,19 @@ class Measure:
             )
         if self.kind == "overshoot" and not scenario.targets:
             raise StudyError("overshoot requires a scenario with targets")
+
+    def _check_unit(self, scenario: Scenario) -> None:
+        """Checks that a measure in rad or m evaluates joints of one type."""
+        arm = scenario.mounted_arm
+        names = {kind: [n for n, p in zip(arm.joint_names, arm.prismatic, strict=True) if p == kind] for kind in (0, 1)}
+        evaluated = self.joints or arm.joint_names
+        types = {kind for kind, own in names.items() if set(own) & set(evaluated)}
+        self._is_prismatic = types == {1}
+        if len(types) > 1 and KINDS[self.kind].unit.startswith("rad"):
+            raise StudyError(
+                f"{self.column} is the largest value of all joints, but {arm.name} has joints in rad and in m. Give "
+                f"joints of one type: [{', '.join(names[0])}] or [{', '.join(names[1])}]"
+            )
 
     def __call__(self, scenario: Scenario, simulation: Simulation) -> float | bool:
         """Computes the measure of a run: the worst value over the evaluated joints."""
@@ -208,7 +226,7 @@ class Kind(NamedTuple):
 
     Attributes:
         compute: Function that computes the measure from a run, the bands (k,) of the joints and the time.
-        unit: Unit of the value, "" for shares and boolean measures.
+        unit: Unit of the value for revolute joints, "" for shares and boolean measures.
         band: Default tolerance bands of revolute and prismatic joints [rad], [m]; None if the kind has no band.
         time: Default duration of the evaluated interval [s]; None if the kind has no such interval.
         worst: Value for a failed run.

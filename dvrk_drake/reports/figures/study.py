@@ -65,9 +65,8 @@ def _draw_distribution(ax: Axes, measure: Measure, study: Study, rows: Mapping[i
     if measure.unit and smallest > 0:
         ax.set_xscale("log")
     quantity = measure.kind.replace("_", " ")
-    unit = {"": "", "rad": " [rad; m]", "rad/s": " [rad/s; m/s]"}.get(measure.unit, f" [{measure.unit}]")
     ax.set(
         ylim=(-3, 103),
         ylabel="cumulative share of runs [%]",
-        xlabel=f"{quantity}{unit}" if measure.unit else "effort / effort limit [1]",
+        xlabel=f"{quantity} [{measure.unit}]" if measure.unit else "effort / effort limit [1]",
     )

@@ -13,12 +13,10 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import DriveEffect, half_width
 from dvrk_drake.reports.html.labels import NO_BREAK
 from dvrk_drake.reports.html.page import Block, Cell, Table
 
-#: Ratio of half the width of a 95 % interval to the standard error of a normal distribution.
-INTERVAL = 1.96
 _UNITS = dict(zip(PARAMETER_NAMES, ("kg", *3 * ["kg m"], *6 * ["kg m²"]), strict=True))
 #: Largest absolute value that is considered a rounding error [kg, kg m, kg m^2].
 _ROUNDING = 1e-13
@@ -48,10 +46,10 @@ def parameter_tables(model: IdentifiedModel) -> list[Block]:
     ]
 
 
-def _estimate(value: float, standard_error: float) -> tuple[str, str]:
+def _estimate(value: float, standard_error: float, degrees_of_freedom: float | None) -> tuple[str, str]:
     """Returns an estimate, rounded to the digits of its 95 % interval, and this interval."""
-    half = INTERVAL * standard_error
-    return (_rounded(value, half) if half > 0 else _number(value)), interval(value, standard_error)
+    half = half_width(standard_error, degrees_of_freedom)
+    return (_rounded(value, half) if half > 0 else _number(value)), interval(value, half)
 
 
 def _number(value: float) -> str:
@@ -59,9 +57,8 @@ def _number(value: float) -> str:
     return f"{value:.4g}" if abs(value) > _ROUNDING else "0"
 
 
-def interval(value: float, standard_error: float) -> str:
-    """Returns the 95 % interval of an estimate as text."""
-    half = INTERVAL * standard_error
+def interval(value: float, half: float) -> str:
+    """Returns an interval with half of its width as text."""
     if half == 0:
         return "none"
     return f"{_rounded(value - half, half)}{NO_BREAK}.. {_rounded(value + half, half)}"
@@ -81,7 +78,7 @@ def _gravity_parameters(model: IdentifiedModel) -> Table:
     rows = [
         (
             p.name,
-            *_estimate(p.value, p.standard_error),
+            *_estimate(p.value, p.standard_error, p.degrees_of_freedom),
             _number(nominal),
             _unit(unit),
             "yes" if p.distinguishable else "no",
@@ -107,7 +104,13 @@ def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> li
     others: list[tuple[Cell, ...]] = []
     for p in section.base_parameters:
         sdf = _number(nominal[p.name]) if p.name in nominal else ""
-        row = (p.name, *_estimate(p.value, p.standard_error), sdf, _unit(p.unit), f"{p.identifiability:.2f}")
+        row = (
+            p.name,
+            *_estimate(p.value, p.standard_error, section.degrees_of_freedom),
+            sdf,
+            _unit(p.unit),
+            f"{p.identifiability:.2f}",
+        )
         (identifiable if p.identifiability >= MIN_IDENTIFIABILITY else others).append(row)
     header = ("base parameter", *_HEADER, "unit", "identifiability")
     count = f"{len(identifiable)} of {len(section.base_parameters)} base parameters of the dynamics"
@@ -148,7 +151,7 @@ def _links(section: DynamicSection, regressor: DynamicRegressor) -> Table:
         rows.append(
             (
                 link.link,
-                *_estimate(mass, error),
+                *_estimate(mass, error, section.degrees_of_freedom),
                 f"{nominal.parameters[0]:.4g}",
                 _position(com),
                 _position(of_sdf),
@@ -169,7 +172,7 @@ def _rotors(section: DynamicSection, regressor: DynamicRegressor) -> Table:
     rows = [
         (
             r.actuator,
-            *_estimate(r.value, r.standard_error),
+            *_estimate(r.value, r.standard_error, section.degrees_of_freedom),
             f"{sdf.value:.3g}",
             _unit("kg" if slides else "kg m²"),
         )
@@ -196,7 +199,7 @@ def _effects(
                 e.coordinate,
                 e.kind,
                 scale,
-                *_estimate(e.coefficient, e.standard_error),
+                *_estimate(e.coefficient, e.standard_error, e.degrees_of_freedom),
                 _unit(unit),
             )
         )
@@ -209,7 +212,7 @@ def _effects(
 
 def _all_link_parameters(section: DynamicSection, regressor: DynamicRegressor) -> Table:
     rows = [
-        (link.link, name, *_estimate(value, error), _number(sdf), _unit(_UNITS[name]))
+        (link.link, name, *_estimate(value, error, section.degrees_of_freedom), _number(sdf), _unit(_UNITS[name]))
         for link, nominal in zip(section.links, regressor.links, strict=True)
         for name, value, error, sdf in zip(
             PARAMETER_NAMES, link.parameters, link.standard_errors or 10 * [0.0], nominal.parameters, strict=True

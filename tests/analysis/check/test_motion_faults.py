@@ -7,6 +7,7 @@ import pytest
 
 from dvrk_drake.analysis.check import channel_check
 from dvrk_drake.analysis.check.channel_check import MIN_MIRROR_GAIN
+from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import check_recording, with_power
 from dvrk_drake.analysis.identification import identify
@@ -16,6 +17,7 @@ from dvrk_drake.analysis.validation import predict
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.recording import Recording
 
 ARM, PSM = load_arm("mtmr"), load_arm("psm")
@@ -217,6 +219,19 @@ def test_drops_short_segments_between_gaps():
     kept, (finding,) = with_power(cut, ARM)
     assert len(kept) == 1700 and "100 of 1800 rows are in 1 segment shorter than 3 s" in finding.what
     assert motion_grid(kept, ARM, default_settings(ARM)).inner_rows.size == 1300
+
+
+def test_gain_at_rest_does_not_grow_with_the_number_of_poses():
+    """Shifted repetitions of 80 poses have the same errors of the arm model."""
+    generator = np.random.default_rng(4)
+    poses = ARM.sample_poses(80, generator, margin=0.1)
+    gains = []
+    for copies in (1, 3):
+        q = np.tile(poses, (copies, 1)) + 1e-6 * generator.normal(size=(80 * copies, 7))
+        tau = 1.3 * holding_torques(ARM, q) + 0.01 * ARM.effort_limits * np.sin(7 * q)
+        fit = ChannelFit(Recording(q, tau), ARM)
+        gains.append(fit.gain(fit.in_actuators(np.diag(np.where(np.arange(7) == 2, -1.0, 1.0)))))
+    assert gains[1] == pytest.approx(gains[0], rel=0.02)
 
 
 @pytest.mark.parametrize("segments", [1, 4])

@@ -78,7 +78,9 @@ def test_prediction_intervals_cover_held_out_efforts(case):
 def test_limits_of_the_interval_are_printed_in_joint_coordinates(case):
     arm, _, recording, result = case
     prediction = predict(result.model, recording.in_joint_coordinates(arm))
-    errors = np.random.default_rng(0).normal(size=(20000, arm.num_joints)) * result.model.dynamic_model.half_width
+    correlation = np.array(result.model.dynamics.error_correlation)
+    errors = np.random.default_rng(0).multivariate_normal(np.zeros(arm.num_joints), correlation, 20000)
+    errors *= result.model.dynamic_model.half_width
     of_joints = np.std(arm.transmission.pull_back_effort(errors), axis=0)
     np.testing.assert_allclose(prediction.half_width, of_joints, rtol=0.03, atol=1e-6)
     assert predict(result.model, Recording(q=recording.q[:3])).half_width is None

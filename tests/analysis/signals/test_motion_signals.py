@@ -154,6 +154,17 @@ def test_friction_of_efforts_with_the_wrong_sign_is_negative():
     assert np.all(np.abs(found.coulomb) > 5 * found.coulomb_error)
 
 
+def test_significance_of_friction_does_not_grow_with_repetitions():
+    """Repetitions of a motion have the same errors of the simple model, so they are no further evidence."""
+    signals = delayed(0.0)
+    once = effort_lag(signals, np.ones(3, bool))
+    repeated = {name: np.tile(getattr(signals, name), (8, 1)) for name in ("q", "v", "vd", "tau")}
+    t = np.arange(len(repeated["q"])) / signals.rate
+    found = effort_lag(replace(signals, **repeated, t=t, row_times=t, rows=np.arange(len(t))), np.ones(3, bool))
+    # The ends of the motion are omitted once instead of eight times.
+    np.testing.assert_allclose(found.coulomb / found.coulomb_error, once.coulomb / once.coulomb_error, rtol=0.1, atol=0)
+
+
 def test_a_joint_or_an_effort_at_rest_has_no_lag():
     signals = delayed(0.01)
     tau = signals.tau.copy()

@@ -122,6 +122,20 @@ def test_bands_of_prismatic_joints_are_in_metres(measure, revolute, prismatic):
             assert measure(scenario, run) is ((factor > 1) == (measure.kind == "ran_away"))
 
 
+@pytest.mark.parametrize("kind", [name for name, kind in KINDS.items() if kind.unit.startswith("rad")])
+def test_distances_in_rad_and_m_are_not_compared(kind):
+    """The largest of them would be a number of two units."""
+    scenario = Scenario(arm="psm", duration=20.0, targets=[Target(2.0, [0.1, 0, 0.1, 0, 0, 0, 0])])
+    unit = KINDS[kind].unit
+    for joints, expected in ((["pitch", "roll"], unit), (["insertion"], unit.replace("rad", "m"))):
+        measure = Measure(kind, joints=joints)
+        measure.check(scenario)
+        assert measure.unit == expected
+    for joints in ([], ["pitch", "insertion"]):
+        with pytest.raises(StudyError, match=rf"{kind} is .* joints in rad and in m\. Give joints of .* \[insertion\]"):
+            Measure(kind, joints=joints).check(scenario)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_failed_run_has_worst_value(kind):
     scenario, simulation = stepped(0.4 * np.clip(T / 2, 0, 1))

@@ -16,7 +16,7 @@ STUDY = """
 scenario: psm
 set: [duration=1, controller.mode=gravity]
 random_poses: {count: 3, seed: 1}
-measures: [{kind: drift, time: 1}]
+measures: [{kind: drift, time: 1, joints: [pitch]}]
 """
 
 
@@ -70,12 +70,12 @@ def study_refusal(capsys, path, *options):
         ),
         (("kind: drift", "kind: drif"), 'measures[0].kind is "drif"; allowed: settling_time'),
         (
-            ("kind: drift", "kind: drift, joints: [elbow]"),
+            ("joints: [pitch]", "joints: [elbow]"),
             "measures[0].joints of drift: unknown joint elbow; joints of PSM: yaw",
         ),
         (("kind: drift", "kind: drift, name: seed"), '"seed" cannot be a column'),
         (("kind: drift", 'kind: drift, name: "a,b"'), '"a,b" cannot be a column'),
-        (("}]", "}, {kind: drift, time: 0.5}]"), "measures must have different names"),
+        (("}]", "}, {kind: drift, time: 0.5, joints: [yaw]}]"), "measures must have different names"),
         (("time: 1", "time: 2"), "measures[0].time of drift is 2 s; allowed: 0.02..1 s"),
         (("measures:", "measures: ["), "study.yaml"),
         ((STUDY, "[1, 2]"), "study.yaml"),

@@ -14,6 +14,7 @@ from dvrk_drake.analysis.verdict import Tolerance, judge, reason
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import bounding_boxes
+from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.reports.html.binned import bin_means
 from dvrk_drake.reports.html.consistency import centres_of_mass, consistency_blocks, link_table
 from dvrk_drake.reports.html.error_budget import error_budget, motion_budget, pose_budget
@@ -21,7 +22,7 @@ from dvrk_drake.reports.html.identification import identification_page
 from dvrk_drake.reports.html.joint_summary import coverage_table, verdict_table
 from dvrk_drake.reports.html.motion_plots import MAX_ROWS, MotionEfforts, efforts_over_time, extremes
 from dvrk_drake.reports.html.page import Command, Meshcat, Table, Verdict
-from dvrk_drake.reports.html.parameter_tables import INTERVAL, _estimate, interval, parameter_tables
+from dvrk_drake.reports.html.parameter_tables import _estimate, interval, parameter_tables
 from dvrk_drake.reports.html.playback import MAX_FRAMES, MAX_RATE, frame_times
 from dvrk_drake.reports.html.plot_style import axis_range
 from dvrk_drake.reports.html.pose_plots import PoseEfforts, predicted_over_measured
@@ -169,9 +170,9 @@ def test_nominal_parameters_are_those_of_the_sdf(dynamics):
 
 def test_interval_contains_the_estimate():
     for value, error in ((1.234, 0.05), (-2e-4, 3e-6), (1e3, 20.0), (5e-9, 1e-9)):
-        lower, upper = (float(text) for text in interval(value, error).split("\N{NO-BREAK SPACE}.. "))
+        lower, upper = (float(text) for text in interval(value, half_width(error, 7.0)).split("\N{NO-BREAK SPACE}.. "))
         assert lower < value < upper
-        assert (upper - lower) / 2 == pytest.approx(INTERVAL * error, rel=0.1)
+        assert (upper - lower) / 2 == pytest.approx(2.365 * error, rel=0.1)
     assert interval(1.0, 0.0) == "none"
 
 
@@ -186,7 +187,7 @@ def test_estimate_has_the_digits_of_its_interval():
         (1.23456, 0.0, "1.235"),
         (1e-15, 0.0, "0"),
     ):
-        assert _estimate(value, error)[0] == text
+        assert _estimate(value, error, None)[0] == text
 
 
 def test_table_of_verdicts_compares_with_the_effort_limit(poses, motion):
