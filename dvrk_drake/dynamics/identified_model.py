@@ -43,9 +43,8 @@ from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
 #: Format of the files that `IdentifiedModel.save` writes.
-#: Versions before 5.1 have no degrees of freedom.
 #: Versions 2 to 4 have no locked joints. In version 2, `arm` is a name or an absolute path.
-FORMAT = FileFormat("dvrk_drake identified model", 5, 1, oldest=2)
+FORMAT = FileFormat("dvrk_drake identified model", 5, oldest=2)
 #: Text between the method of an identification and the recording of the last recalibration.
 _RECALIBRATED = ", recalibrated on "
 #: Allowed range of measured positions, which may be beyond the limits of a joint.

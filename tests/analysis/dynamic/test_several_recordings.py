@@ -125,6 +125,10 @@ def test_provenance_names_all_recordings(pair):
     paths, result = pair
     model, recordings = result.model, [dvrk.read_recording(path, ARM) for path in paths]
     assert model.provenance.recording == f"{paths[0]}, {paths[1]}"
+    # The prediction intervals contain the errors of these days only, and after a recalibration those of its day.
+    days = "recordings of the model ({}). They are valid for similar motions on the same days."
+    assert days.format(f"{paths[0]}, {paths[1]}") in model.interval_scope
+    assert days.format("new.csv") in model.recalibrated(model.dynamics, "new.csv").interval_scope
     assert dvrk.validate(model, recordings[1]).of_same_recording
     assert not dvrk.validate(model, recordings[2]).of_same_recording
 

@@ -82,6 +82,10 @@ def test_sections_are_in_order(case, request):
     assert blocks(page, Meshcat)
 
 
+def test_page_states_the_days_of_the_prediction_interval(motion):
+    assert motion.model.interval_scope in repr(page_of(motion))
+
+
 def test_plotted_residual_is_measured_minus_predicted(motion):
     efforts = MotionEfforts.of(motion)
     figure, _ = efforts_over_time(efforts)
