@@ -3,9 +3,9 @@
     python benchmarks/mujoco_holding.py [--poses 20]     (requires: pip install mujoco)
 
 Each arm starts at rest at random poses and is simulated for 1 s with constant torques. MuJoCo converts mimic joints to
-equality constraints, which are soft by default. Two settings of these constraints are compared, without and with the dry
-friction of the arm's files at the joints. Gravity: largest difference between MuJoCo's gravity torque and the holding
-torque, both at the independent joints.
+equality constraints, which are soft by default. Two settings of these constraints are compared, without friction and
+with the dry friction of the arm's files. The last column is the largest difference between MuJoCo's gravity torque and
+the holding torque of the model, at the independent joints.
 """
 
 from __future__ import annotations

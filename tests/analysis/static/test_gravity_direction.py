@@ -13,6 +13,8 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.reports.answers import answer_of
 
 #: The first three joints of a PSM, because their gravity model is derived quickly.
 LOCKED = {"roll": 0.0, "wrist_pitch": 0.0, "wrist_yaw": 0.0, "jaw": 0.0}
@@ -56,7 +58,9 @@ def test_upright_arm_is_not_reported():
 @pytest.mark.slow
 def test_forgotten_tilt_is_reported_and_estimated(tmp_path, capsys):
     recording = poses(TILTED)
-    (warning,) = [w for w in dvrk.identify(recording, ARM).warnings if w.kind == "base tilt"]
+    result = dvrk.identify(recording, ARM)
+    (warning,) = [w for w in result.warnings if w.kind == "base tilt"]
+    assert " --gravity estimate --output MODEL.yaml" in answer_of(result).next_command
     tilt, low, high = map(
         float, re.search(r"([\d.]+) deg \(95 % interval ([\d.]+) to ([\d.]+) deg\)", str(warning)).groups()
     )
