@@ -71,9 +71,6 @@ def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: Model
         console.print(f"Reflected rotor inertias [kg m^2; kg if prismatic]: {rotors}", markup=False)
     for remark in bodies.left_out:
         console.print(f"Not exported: {remark}", markup=False)
-    if np.any(arm.gravity[:2]):
-        gravity = " ".join(f"{x:g}" for x in arm.gravity)
-        console.print(f"Not exported: the gravity vector of the model in the base frame, {gravity} m/s^2", markup=False)
 
 
 def _mass_table(changes: Sequence[LinkChange]) -> Table:

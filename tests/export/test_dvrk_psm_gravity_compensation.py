@@ -145,6 +145,11 @@ def test_gravity_that_mounting_pitch_cannot_express_is_refused(tmp_path, capsys,
     assert main([*command, "pitch.yaml"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert 'enter "kinematic_gc": "gc.json", "mounting_pitch": -0.785398 in the JSON file of the arm' in printed
+    # An SDF has no gravity vector of the base frame. One line states it.
+    assert main(["export", "--model", "roll.yaml", "--sdf", "roll.sdf"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Not exported: gravity (6.937, 0.000, -6.937) m/s^2 in the base frame" in printed
+    assert printed.count("m/s^2") == 1
 
 
 def test_mounting_pitch_of_the_configuration_is_checked(tmp_path, capsys, monkeypatch):
