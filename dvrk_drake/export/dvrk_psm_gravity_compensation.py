@@ -237,8 +237,15 @@ def kinematic_compensation(
         cause = "feedforward scale other than 1" if net > 0 else "negative net mass on the insertion joint"
     causes = {cause: tau_pitch - tau, **_omitted_effects(model, straight)}
     if installed is not None:
-        setting = f"mounting_pitch {installed:.6g} in {configuration}, but the model requires {pitch:.6g}"
+        setting = f"mounting_pitch is {installed:.6g} rad, but the gravity vector of the model requires {pitch:.6g} rad"
         causes[setting] = tau_file - tau_pitch
+        if np.any((wrong := np.abs(tau_file - tau_pitch).max(axis=0)) > accepted):
+            j = int(np.argmax(wrong / accepted))
+            raise ModelError(
+                f"{configuration}: {setting}. The controller's torque of {ARM_JOINTS[j]} would be wrong by up to "
+                f"{wrong[j]:.2g} {'N' if arm.prismatic[j] else 'N m'}. Correct the configuration, or identify again "
+                "with the gravity vector of this mounting (--gravity)"
+            )
     loss = make_loss(arm, straight, tau_file - tau_model, causes)
     loss.check(accepted)
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)

@@ -157,11 +157,11 @@ def test_mounting_pitch_of_the_configuration_is_checked(tmp_path, capsys, monkey
     monkeypatch.chdir(tmp_path)
     IdentifiedModel.from_arm(load_arm("psm").with_gravity([0.0, 6.9367, -6.9367])).save("psm.yaml")
     command = ["export", "--model", "psm.yaml", "--dvrk-kinematic-gc", "gc.json", "--overwrite"]
-    required = "but the model requires -0.785398"
+    required = "rad, but the gravity vector of the model requires -0.785398 rad. The controller's torque of"
     beside, other = tmp_path / "arm.json", tmp_path / "other.txt"
     for content, message in {
-        '{"kinematic_gc": "gc/gc.json" /* none */}': f"mounting_pitch 0 in arm.json, {required}",
-        '{"kinematic-gc": "gc.json", "mounting-pitch": 0.785398}': f"mounting_pitch 0.785398 in arm.json, {required}",
+        '{"kinematic_gc": "gc/gc.json" /* none */}': f"arm.json: mounting_pitch is 0 {required}",
+        '{"kinematic-gc": "gc.json", "mounting-pitch": 0.785398}': f"arm.json: mounting_pitch is 0.785398 {required}",
         '{"kinematic_gc": "gc.json", "mounting_pitch": -45}': "arm.json: mounting_pitch is -45; allowed: a number",
     }.items():
         beside.write_text(content)
