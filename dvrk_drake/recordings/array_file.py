@@ -12,6 +12,10 @@ from __future__ import annotations
 
 import hashlib
 import io
+import pickle
+import struct
+import subprocess
+import sys
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,6 +34,8 @@ from dvrk_drake.recordings.recording import Recording
 
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK\x03\x04"
+#: Type of a compressed variable in a MATLAB file of version 5 to 7.
+_COMPRESSED = 15
 _SUFFIXES = (".mat", ".npz")
 #: Recognised names of arrays, in lower case. The first names of q and tau are those of the public gravity collection.
 _NAMES = {
@@ -359,7 +365,7 @@ def _read_content(path: Path, content: bytes) -> _Content:
 
 def _read_mat(content: bytes) -> dict[str, object]:
     """Returns arrays by name, messages as lists, and the name of the class of each object."""
-    loaded = scipy.io.loadmat(io.BytesIO(content), simplify_cells=False, squeeze_me=False, struct_as_record=True)
+    loaded = scipy.io.loadmat(io.BytesIO(content), **_LOADING) if _has_checksums(content) else _load_apart(content)
     found: dict[str, object] = {}
 
     def visit(name: str, value: object) -> None:
@@ -378,6 +384,41 @@ def _read_mat(content: bytes) -> dict[str, object]:
         if not name.startswith("__"):
             visit(name, value)
     return found
+
+
+#: Options of scipy.io.loadmat.
+_LOADING: dict[str, Any] = {"simplify_cells": False, "squeeze_me": False, "struct_as_record": True}
+#: Program that reads a MATLAB file from its standard input.
+_LOADER = f"""
+import io, pickle, sys, warnings, scipy.io
+warnings.simplefilter("error", UserWarning)
+warnings.filterwarnings("ignore", 'Duplicate variable name "None"')
+content = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()), **{_LOADING})
+sys.stdout.buffer.write(pickle.dumps(content))
+"""
+
+
+def _has_checksums(content: bytes) -> bool:
+    """Returns whether all variables are compressed, with a checksum. True for a file of version 4."""
+    if content[126:128] not in (b"IM", b"MI"):
+        return True
+    order, position = "<" if content[126:128] == b"IM" else ">", 128
+    while position + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, position)
+        if kind != _COMPRESSED:
+            return False
+        position += 8 + size
+    return True
+
+
+def _load_apart(content: bytes) -> dict[str, Any]:
+    """Reads a file without checksums in another process, because damaged files can crash scipy (1.17)."""
+    run = subprocess.run([sys.executable, "-c", _LOADER], input=content, capture_output=True, check=False)
+    if run.returncode:
+        lines = run.stderr.decode(errors="replace").strip().splitlines()
+        raise ValueError(lines[-1] if lines and run.returncode > 0 else "the reader crashed")
+    loaded: dict[str, Any] = pickle.loads(run.stdout)
+    return loaded
 
 
 def _messages(value: object) -> list[JointState]:

@@ -21,7 +21,7 @@ def write_arrays(folder: Path, kind: str, arrays: dict) -> Path:
     if kind == "npz":
         np.savez(path, **{name: value for name, value in arrays.items() if not isinstance(value, dict)})
     elif kind == "v5":
-        scipy.io.savemat(path, arrays)
+        scipy.io.savemat(path, arrays, do_compression=True)
     else:
         # MATLAB writes a header of 512 bytes before the HDF5 data.
         with h5py.File(path, "w", userblock_size=512) as file:

@@ -23,7 +23,7 @@ def wpi_rows(num_rows: int = 4) -> np.ndarray:
 
 def write_mat(folder: Path, **variables: object) -> Path:
     path = folder / "poses.mat"
-    scipy.io.savemat(path, variables)
+    scipy.io.savemat(path, variables, do_compression=True)
     return path
 
 
