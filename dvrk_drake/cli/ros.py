@@ -44,6 +44,7 @@ def bridge(
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import load_driver, stop_on_signals
+    from dvrk_drake.processes.teacher import EnterKey
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
     from dvrk_drake.systems.ros.open_domain import domain_number
 
@@ -73,6 +74,7 @@ def bridge(
         stopped=stopped,
         report=lambda line: print(line, flush=True),
         ready=ready,
+        enter=EnterKey.of_terminal(),
     )
     if not is_confirmed:
         raise ControllerError("the bridge has ended, but the arm has not confirmed hold. The deadman process continues")
@@ -88,9 +90,10 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.systems.ros.deadman import Deadman
+    from dvrk_drake.systems.ros.deadman import Deadman, request_priority
     from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
+    priority = request_priority()  # the threads of DDS inherit it
     ros = open_ros_domain(domain)
     from dvrk_drake.systems.ros.crtk_client import find_arm
 
@@ -103,5 +106,5 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     stopped = stop_on_signals()
     # A closed terminal must not end this process.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    print(f"deadman of {namespace}; Ctrl-C ends it", flush=True)
+    print(f"deadman of {namespace}; Ctrl-C ends it; it has {priority}", flush=True)
     monitor.run(stopped)

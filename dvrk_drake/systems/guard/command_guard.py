@@ -38,6 +38,15 @@ _MAX_STEP = 0.01
 #: been moved.
 _MAX_GAP = 0.1
 
+#: Number of faults within a time [us] after which only a person at the arm's process allows a reset. A controller that
+#: answers each fault with a reset would otherwise have EFFORT again after `start_time`.
+_MAX_FAULTS, _FAULT_TIME = 3, 10_000_000
+
+_PERSON = (
+    f". {_MAX_FAULTS} faults within {_FAULT_TIME / 1e6:g} s: look at the arm, and press Enter in the terminal of its "
+    "process, or restart this process"
+)
+
 #: States in which a position controller regulates the arm to a target.
 _REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
 
@@ -90,11 +99,12 @@ class CommandGuard:
     median time between two calls exceeds `slow_period`. In these cases, the limits would act too late.
 
     **Watchdog hold**: If an expired command, an invalid measurement or a long period ends POSITION or EFFORT, the guard
-    holds the arm. This is called a watchdog hold. The guard then refuses POSITION and EFFORT until an operator resumes.
-    The command for a resume is the same as for the reset of a fault. `hold_reason` states the reason of the hold. A
-    watchdog hold is not a fault, and OFF is allowed. No resume is needed if the sender commanded HOLD before it stopped
-    sending, or if no POSITION or EFFORT command has acted yet. With `GuardSettings.resume_automatically`, no resume is
-    needed in any case. New commands act only after STARTING.
+    holds the arm. The same applies to a HOLD command of another sender, and this command also ends STARTING. This is
+    called a watchdog hold. The guard then refuses POSITION and EFFORT until an operator resumes. The command for a
+    resume is the same as for the reset of a fault. `hold_reason` states the reason of the hold. A watchdog hold is not
+    a fault, and OFF is allowed. No resume is needed if the sender commanded HOLD before it stopped sending, or if no
+    POSITION or EFFORT command has acted yet. With `GuardSettings.resume_automatically`, no resume is needed in any
+    case. New commands act only after STARTING.
 
     **Refused commands**: A command is refused if a number is not finite, or if the command has expired on arrival, is
     out of order or is a duplicate. It is also refused after a jump of the sender's sequence or clock, and if its mode
@@ -104,9 +114,9 @@ class CommandGuard:
 
     **Ignored messages**: A message is ignored if it is unreadable or not authentic, or if it states another arm, number
     of joints or session. A session is one run of the arm's process. Messages of a second sender are ignored while
-    commands of the first sender are accepted. Ignored messages have no effect. They are not included in the number of
-    refused commands. Without a key, only the sender_id identifies a sender, and any process on the network can copy
-    this number.
+    commands of the first sender are accepted, except HOLD in STARTING, POSITION and EFFORT. Ignored messages have no
+    effect. They are not included in the number of refused commands. Without a key, only the sender_id identifies a
+    sender, and any process on the network can copy this number.
 
     **OFF**: An arm without brakes falls when its motors are off. OFF must be listed in `modes`. A single message is not
     sufficient, because the state must be HOLD and the sender's last command must have been HOLD. In FAULT, the guard
@@ -135,7 +145,8 @@ class CommandGuard:
     - a fault that the driver reports.
 
     A fault is reset by a HOLD command in which `reset_fault` changes from false to true. If the cause persists, the
-    fault occurs again.
+    fault occurs again. After three faults within 10 s, a person at the arm's process must first allow the reset; see
+    `allow_reset`. Faults that the driver reports are not counted.
 
     **Bumpless transfer**: After STARTING, HOLD keeps the target of the position controller. After POSITION or FAULT,
     HOLD keeps this target only if the arm is near the target. Otherwise, HOLD latches the measured pose as the target.
@@ -199,6 +210,8 @@ class CommandGuard:
         )
         self._in_force = CommandInForce()
         self._powered = True
+        #: Times of the last faults [us], except those that the driver reported.
+        self._fault_times: tuple[int, ...] = ()
         #: Reason why the last measurement is invalid. Empty if it is valid.
         self._problem = ""
         self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
@@ -284,6 +297,11 @@ class CommandGuard:
         self._expire(utime)
         code = foreign_refusal(command, self.arm_name, self.num_joints, self.session_id)
         if command is not None and code == lcmt_dvrk_status.REFUSAL_NONE:
+            if self._is_hold_of_other_sender(command, utime):
+                self.counts.accepted += 1
+                self._acted = True  # also a start check needs a resume, so that it does not begin again
+                self._take_over(f"sender {command.sender_id} commanded HOLD")
+                return code
             code = self._refusal_now(command, utime)
             if code == lcmt_dvrk_status.REFUSAL_NONE:
                 self._accept(command, utime)
@@ -361,8 +379,23 @@ class CommandGuard:
             powered = self._powered
             self._hold()
             self.state, self._powered = lcmt_dvrk_status.STATE_FAULT, powered
-            self.fault_code, self.fault_text = code, text
+            # The driver reports a fault before each step until its cause has ended, so a reset cannot end it.
+            if code != lcmt_dvrk_status.FAULT_DRIVER:
+                now = self._measured.utime or 0
+                self._fault_times = (*(time for time in self._fault_times if now - time <= _FAULT_TIME), now)
+            self.fault_code, self.fault_text = code, text + (_PERSON if self.needs_person else "")
         self._powered &= has_power
+
+    @property
+    def needs_person(self) -> bool:
+        """True if resets are refused until a person at the arm's process allows them; see `allow_reset`."""
+        return self.state == lcmt_dvrk_status.STATE_FAULT and len(self._fault_times) >= _MAX_FAULTS
+
+    def allow_reset(self) -> None:
+        """Allows the reset of a fault after several faults. Call this method only for a person at the arm's process."""
+        if self.needs_person:
+            self._fault_times = ()
+            self.fault_text = self.fault_text.removesuffix(_PERSON)
 
     def block(self, reason: str) -> None:
         """Refuses POSITION and EFFORT until the driver calls this method with "". The arm holds in the meantime.
@@ -436,6 +469,15 @@ class CommandGuard:
         if acted and not self.settings.resume_automatically:
             self.hold_reason = self.hold_reason or reason
 
+    def _is_hold_of_other_sender(self, command: lcmt_dvrk_command, utime: int) -> bool:
+        """Returns whether a sender that is not in control commands HOLD, and this command is not old."""
+        return (
+            command.control_mode == lcmt_dvrk_command.HOLD
+            and self._is_starting_or_in_force()
+            and self._stream.is_other_sender(command, utime)
+            and 0 <= utime - command.status_utime <= self._expiry.expiry
+        )
+
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
         """Returns REFUSAL_* for a command of this session, given the earlier commands and the present state."""
         if self._stream.is_other_sender(command, utime):
@@ -477,7 +519,9 @@ class CommandGuard:
         elif mode == lcmt_dvrk_command.HOLD:
             # The pose that is held after a reset must be a valid and plausible measurement.
             problem = self._problem or self.limits.implausible_pose(self._q())
-            if resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
+            if self.needs_person:
+                pass
+            elif resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
                 self.fault_text = problem
             elif resets and not problem:
                 self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""

@@ -19,7 +19,7 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
-from dvrk_drake.systems.ros.deadman import DeadmanProcess
+from dvrk_drake.systems.ros.deadman import DeadmanProcess, describe_priority
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
@@ -118,6 +118,11 @@ class CrtkBridge:
         """Stores an LCM message of the command channel for the next `update`."""
         self._inbox.put(data)
         self._has_commands = True
+
+    @property
+    def client(self) -> CrtkClient:
+        """Client of the arm."""
+        return self._client
 
     @property
     def is_commanded(self) -> bool:
@@ -251,20 +256,26 @@ class CrtkBridge:
             # The arm measures its joints itself, so it can still hold its pose. After a measurement fault, the guard
             # commands efforts, which are not safe for example with the gravity compensation of the dVRK.
             if now >= self._last_sent + _REPEAT:
-                client.hold()
+                self._hold()
                 self._last_sent = now
         elif is_effort:
             self._send_jaw("servo_jf", output.effort)
             client.servo_jf(output.effort)
-            if self._clock.now() >= now + _LATE:
+            if (delay := self._clock.now() - now) >= _LATE:
                 # The process was suspended after the check above, so this effort is old.
-                client.hold()
+                self._hold()
+                self.guard.block(f"the bridge was suspended for {1e-3 * delay:.0f} ms while it published an effort")
         elif output.control_mode != lcmt_dvrk_command.OFF:
             self._send_jaw("servo_jp", output.position)
             client.servo_jp(output.position, output.velocity)
         elif self.guard.state == lcmt_dvrk_status.STATE_OFF and now >= self._last_sent + _REPEAT:
             client.state_command("disable")
             self._last_sent = now
+
+    def _hold(self) -> None:
+        """Publishes `hold`, after which the separate joint needs a new command."""
+        self._client.hold()
+        self._jaw_sent = ("", 0.0)
 
     def _send_jaw(self, name: str, values: NDArray[np.float64]) -> None:
         """Commands the separate joint, if the command has changed. Call this method before the command to the arm."""
@@ -301,6 +312,7 @@ class CrtkBridge:
         if self._deadman is not None and (reason := self._deadman.problem()):
             return reason
         if client.take_other_hold():
+            self._jaw_sent = ("", 0.0)  # `hold` also acts on the separate joint
             return "another process published hold, e.g. the deadman process"
         if self._rate_problem:
             return self._rate_problem
@@ -361,7 +373,7 @@ def connect_bridge(
     stopped: Callable[[], bool] = lambda: False,
     polled: bool = False,
 ) -> CrtkBridge:
-    """Finds an arm on ROS 2 and connects a bridge with its deadman process.
+    """Finds an arm on ROS 2 and connects a bridge with its deadman process. Call `compile_guard` before.
 
     Args:
         arm: Arm to connect.
@@ -379,12 +391,19 @@ def connect_bridge(
     Raises:
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
-    compile_guard(arm, driver)
     ros = open_ros_domain(domain)
     commands = ("servo_jp", "servo_jf", "hold")
-    client = connect_client(ros, arm, topic, commands, report=report, stopped=stopped, polled=polled)
-    deadman = DeadmanProcess(client.namespace, domain, stopped)
-    report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
+    try:
+        client = connect_client(ros, arm, topic, commands, report=report, stopped=stopped, polled=polled)
+        deadman = DeadmanProcess(client.namespace, domain, stopped)
+    except BaseException:
+        # A traceback may keep the publishers, which a second attempt would find.
+        ros.close()
+        raise
+    report(
+        f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms; it has "
+        f"{describe_priority(deadman.pid)}"
+    )
     try:
         return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)
     except BaseException:

@@ -229,11 +229,11 @@ class DeadmanProcess:
             is_confirmed: Whether the arm has confirmed `hold`. If not, the process sends `hold` until the arm confirms
                 it, also after the end of the bridge.
         """
-        assert self._process.stdin is not None
-        with contextlib.suppress(OSError):
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with contextlib.suppress(OSError), self._process.stdin:  # the process may have ended
             if is_confirmed:
                 self._process.stdin.write(b"\0")
-            self._process.stdin.close()
+        self._process.stdout.close()
         if not is_confirmed:
             return
         try:
@@ -241,6 +241,23 @@ class DeadmanProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+def request_priority() -> str:
+    """Requests real-time priority for this thread and those that it starts. Returns `describe_priority`."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    return describe_priority(0)
+
+
+def describe_priority(pid: int) -> str:
+    """Returns the real-time priority of a deadman process as a text. 0: this process."""
+    if os.sched_getscheduler(pid) in (os.SCHED_FIFO, os.SCHED_RR):
+        return f"real-time priority {os.sched_getparam(pid).sched_priority}"
+    return (
+        "no real-time priority, so a busy computer can delay it. Give the user an rtprio limit of "
+        f"{_PRIORITY}, or CAP_SYS_NICE"
+    )
 
 
 def _report(line: str) -> None:
@@ -265,8 +282,7 @@ def main(namespace: str, domain: str) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    request_priority()
     deadman = Deadman(open_ros_domain(int(domain) if domain else None), namespace, _report)
     deadman.run(lambda: bool(received), sys.stdin.fileno(), _report_connected)
     # Without the destructors of Cyclone DDS, which may wait for ever if another participant ends at the same time.

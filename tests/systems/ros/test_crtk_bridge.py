@@ -11,6 +11,9 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import MessageKey, create_key_file
+from dvrk_drake.processes.bridge import run_bridge
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.ros import crtk_bridge
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 
 HOME = "/MTML: switched off the dVRK's own gravity compensation"
@@ -365,18 +368,72 @@ def test_key_signs_statuses_and_verifies_commands(monkeypatch, tmp_path):
     assert bench.tick().status.num_accepted == 10
 
 
-def test_hold_follows_an_effort_that_was_published_late(bench, monkeypatch):
-    bench.started()
+@pytest.mark.parametrize("delay", [21, 35, 100])
+def test_late_effort_ends_in_hold_of_arm_and_jaw(monkeypatch, delay):
+    bench = CrtkBench(monkeypatch, "psm").started()
     servo_jf = bench.client.servo_jf
 
     def suspended(effort):
-        bench.now += 100_000_000
+        bench.now += delay * MS
         servo_jf(effort)
 
     monkeypatch.setattr(bench.client, "servo_jf", suspended)
     bench.clear()
     bench.run(1)
-    assert bench.names()[:2] == ["servo_jf", "hold"]
+    monkeypatch.setattr(bench.client, "servo_jf", servo_jf)
+    bench.run(400)
+    # `hold` ended the effort control of the arm and of its jaw, so efforts must not continue without an operator.
+    assert bench.status.guard_state == Status.STATE_HOLD
+    assert bench.status.fault_text == f"the bridge was suspended for {delay} ms while it published an effort"
+    assert bench.names()[:4] == ["servo_jf", "hold", "separate/servo_jp", "servo_jp"]
+    assert set(bench.names()[4:]) == {"servo_jp"}
+    bench.clear()
+    bench.reset().run(300)
+    assert bench.status.guard_state == Status.STATE_EFFORT
+    assert bench.names().count("separate/servo_jf") == 1
+
+
+def test_jaw_is_commanded_again_after_hold_of_another_process(monkeypatch):
+    bench = CrtkBench(monkeypatch, "psm").ready()
+    bench.clear()
+    bench.client.other_hold = True
+    bench.tick(2)
+    assert bench.names()[:2] == ["separate/servo_jp", "servo_jp"]
+
+
+def test_jaw_is_commanded_again_after_hold_in_a_fault(monkeypatch):
+    bench = CrtkBench(monkeypatch, "psm").started()
+    bench.q = np.add(bench.q, [0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    bench.tick(5).clear()
+    bench.blocked = "the deadman process has ended"
+    bench.tick(2)
+    assert bench.names() == ["hold"]
+    bench.blocked = ""
+    bench.clear()
+    bench.tick(2)
+    assert bench.names()[:2] == ["separate/servo_jf", "servo_jf"]
+
+
+def test_guard_is_compiled_once_before_real_time_scheduling(monkeypatch):
+    calls = []
+
+    def refuse(domain):
+        raise DvrkDrakeError("no domain")
+
+    monkeypatch.setattr(crtk_bridge, "compile_guard", lambda *_: calls.append("compile"))
+    monkeypatch.setattr(crtk_bridge, "open_ros_domain", refuse)
+    with pytest.raises(DvrkDrakeError, match="no domain"):
+        run_bridge(
+            ARMS["mtml"],
+            DvrkDriver(),
+            "memq://",
+            topic=None,
+            domain=None,
+            stopped=lambda: False,
+            report=print,
+            ready=lambda: calls.append("ready"),
+        )
+    assert calls == ["compile", "ready"]
 
 
 def test_close_publishes_hold_and_ends_the_deadman(bench):
