@@ -1,19 +1,23 @@
 """Measures the time until the guard detects a sensor fault, and the motion of the arm before and after the detection.
 
-    python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort position hold] [--processes 2]
+    python benchmarks/sensor_faults.py [--arms mtml psm] [--trials 300] [--uses effort position] [--processes 2]
+    python benchmarks/sensor_faults.py --delays 0 10 20 30 [--arms mtml mtmr psm] [--uses effort position hold]
 
-Each fault of tests/support/faulty_arm.py is simulated for each joint of an arm with all effects of its file. The joints
-move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or are at rest. A moving arm has three trials per
-fault, with different start times of the fault and two motions. The table contains the largest values over the trials.
-Its columns are:
+Each trial simulates one fault of tests/support/faulty_arm.py on one joint of an arm with all effects of its file.
+Fault, joint, time of the fault, pose and motion are drawn at random. The maximum speed of the motion is 0.1 rad/s to
+0.5 rad/s (10 mm/s to 50 mm/s), under effort or position commands, or zero in use "hold". Each motion has several
+trials. The tables contain the median and the largest value of all trials of a row, and stderr one line per trial. The
+columns are:
 
-    found       trials in which the guard detected the fault, and all trials
-    ms          largest time from the fault to its detection [ms]
-    before      largest motion of the joint from the fault to its detection [rad, dm]
-    after       largest motion of the joint after the detection [rad, dm]
-    speed       largest speed of any joint, from 50 ms after the detection on [rad/s, dm/s]
-    effort      largest effort of any joint after the detection, as a share of its limit
-    guard       message of the guard
+    found       number of trials in which the guard detected the fault within 3 s, and of all trials
+    ms          time from the fault to its detection [ms]
+    before      motion of the joint from the fault to its detection, or in 3 s without detection [rad, 0.1 m]
+    after       motion of the joint within 0.6 s after the detection [rad, 0.1 m]
+    speed       largest speed of any joint, from 50 ms after the detection on [rad/s, 0.1 m/s]
+
+With --delays, position and velocity of one joint or of all joints are delayed by these times [ms], without a change of
+their time stamps. A delayed control loop oscillates. The table states whether the guard reported a fault within 2 s,
+the speed in 0.2 s before it, and the largest speed after it, in 3 s and in the last 0.5 s of them.
 """
 
 from __future__ import annotations
@@ -21,91 +25,176 @@ from __future__ import annotations
 import multiprocessing
 import sys
 from argparse import ArgumentParser
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
-from faulty_arm import FAULTS, PERIOD, FaultyArm
+from faulty_arm import FAULTS, PERIOD, FaultyArm, wave
 
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 
-#: Start time of the fault [s], at which all joints move, and seed of the motion and the noise.
-TRIALS = ((2.6, 0), (3.2, 1), (3.8, 0))
+#: First and last time of a fault [s], and the number of faults per motion.
+BEGIN, END, PER_MOTION = 2.0, 4.5, 15
+#: Time for which a trial is simulated after the detection [s].
+AFTER = 0.6
+#: Largest holding effort at the center of a motion, as a share of the effort limits.
+HOLDING_SHARE = 0.6
+#: Simulated times [s] of a delay: before the delay begins, until a fault, and after the fault.
+DELAY_BEGIN, DELAY_PATIENCE, DELAY_AFTER = 0.3, 2.0, 3.0
+
+#: States in which commands act.
+ACTING = (lcmt_dvrk_status.STATE_POSITION, lcmt_dvrk_status.STATE_EFFORT)
+
+FORK = multiprocessing.get_context("fork")
 
 
-class Trial:
-    """Simulated arm at the start of a fault."""
+def random_motion(arm, generator):
+    """Returns a random trajectory inside the limits of the arm."""
+    model = IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs)
+    while True:
+        center = arm.sample_poses(1, generator, margin=0.1)[0]
+        seed, reach = int(generator.integers(2**31)), generator.uniform(0.05, 0.35)
+        path = wave(arm, END + 4.0, generator.uniform(0.1, 0.5), seed, reach, center)
+        poses = path.vector_values(np.linspace(0.0, END + 4.0, 100)).T
+        share = np.abs(model.holding_torque(center[None])[0]) / arm.effort_limits
+        if not any(map(arm.limit_violations, poses)) and share.max() < HOLDING_SHARE:
+            return path
 
-    def __init__(self, name, use, begin, seed):
-        self.begin, self.arm = begin, FaultyArm(name, use, seed=seed)
-        while self.arm.ticks * PERIOD < begin:
-            self.arm.step()
 
-    def outcome(self, task):
-        """Returns the outcome of a task (fault, joint). Call this in a forked process, since it changes the arm."""
-        return self.arm.fail(*task, self.begin)
+def in_fork(function: Callable[[], object]) -> object:
+    """Returns the result of a function that runs in a forked process, so that it does not change this process."""
+    receiver, sender = FORK.Pipe(duplex=False)
+    process = FORK.Process(target=lambda: sender.send(function()))
+    process.start()
+    sender.close()  # if the process fails, recv raises EOFError
+    result = receiver.recv()
+    process.join()
+    return result
 
 
-def print_table(title, arm, tasks, trials):
-    """Prints the largest values of each fault and joint, and a summary; trials[k][i] is the outcome of tasks[i]."""
-    print(f"\n{title}: largest values of {len(trials)} trials. Motion before and after the detection [rad, dm], speed")
-    print("[rad/s, dm/s] and effort as a share of the limit after the detection.")
-    print(
-        f"{'fault':18} {'joint':16} {'found':>5} {'ms':>5} {'before':>7} {'after':>6} {'speed':>6} {'effort':>6}  guard"
-    )
-    for (fault, joint), outcomes in zip(tasks, zip(*trials, strict=True), strict=True):
-        scale = 10.0 if arm.prismatic[joint] else 1.0
-        found = [o for o in outcomes if np.isfinite(o.detected)]
-        worst = max(found, key=lambda o: o.detected, default=outcomes[0])
-        milliseconds = f"{1e3 * worst.detected:.0f}" if found else "-"
-        before, after = (scale * max(getattr(o, name) for o in outcomes) for name in ("before", "after"))
-        speed, effort = (max(getattr(o, name) for o in outcomes) for name in ("speed", "effort"))
+def motion_trials(task) -> list[tuple[str, int, object]]:
+    """Simulates one random motion; returns (fault, joint, Outcome) of each of its trials."""
+    name, use, seed, faults = task
+    generator, arm = np.random.default_rng(seed), load_arm(name)
+    noise = int(generator.integers(2**31))
+    simulated = FaultyArm(name, use, path=None if use == "hold" else random_motion(arm, generator), seed=noise)
+    trials = []
+    for begin in np.sort(generator.uniform(BEGIN, END, PER_MOTION)):
+        while simulated.ticks * PERIOD < begin:
+            simulated.step()
+        if use != "hold" and simulated.guard.state not in ACTING:
+            print(f"{name}, {use}, seed {seed}: no command acts: {simulated.guard.fault_text}", flush=True)
+            break
+        fault, joint = str(generator.choice(faults)), int(generator.integers(arm.num_joints))
+        outcome = in_fork(lambda f=fault, j=joint: simulated.fail(f, j, simulated.ticks * PERIOD, AFTER))
+        trials.append((fault, joint, outcome))
         print(
-            f"{fault:18} {arm.joint_names[joint]:16} {len(found):3}/{len(outcomes)} {milliseconds:>5} {before:7.3f} "
-            f"{after:6.2f} {speed:6.2f} {effort:6.2f}  {worst.text}"
+            f"{name}, {use}, seed {seed}, {begin:.3f} s, {fault}, joint {joint + 1}: {outcome}",
+            file=sys.stderr,
+            flush=True,
         )
-    flat = [(10.0 if arm.prismatic[joint] else 1.0, o) for t in trials for (_, joint), o in zip(tasks, t, strict=True)]
-    found = [(scale, o) for scale, o in flat if np.isfinite(o.detected)]
-    median = 1e3 * np.median([o.detected for _, o in found])
-    print(
-        f"{len(found)} of {len(flat)} faults detected, median time {median:.0f} ms. Of the detected faults, "
-        f"{sum(scale * o.before <= 0.05 for scale, o in found)} had before <= 0.05, "
-        f"{sum(o.speed <= 0.5 for _, o in found)} had speed <= 0.5, "
-        f"and {sum(o.effort <= 0.4 for _, o in found)} had effort <= 0.4. Of the undetected faults, "
-        f"{sum(scale * o.before > 0.05 for scale, o in flat if np.isinf(o.detected))} had before > 0.05.",
-        flush=True,
+    return trials
+
+
+def summary(arm, trials) -> str:
+    """Returns the cells of a row: found, and the median and the largest value of each quantity."""
+    found = [(joint, o) for _, joint, o in trials if np.isfinite(o.detected)]
+    scale = arm.per_joint(1.0, 10.0)
+    columns = (
+        ([1e3 * o.detected for _, o in found], "{:.0f}"),
+        ([scale[joint] * o.before for _, joint, o in trials], "{:.2f}"),
+        ([scale[joint] * o.after for joint, o in found], "{:.2f}"),
+        ([o.speed for _, o in found], "{:.1f}"),
     )
+    cells = [f"{len(found)}/{len(trials)}"]
+    for values, form in columns:
+        cells += [form.format(x) for x in (np.median(values), max(values))] if values else ["-", "-"]
+    return " | ".join(cells)
 
 
-def main():
-    """Prints one table per arm and use."""
+def print_tables(name, trials_by_use) -> None:
+    """Prints one row per use and group of joints, one row per fault, and the slowest detections."""
+    arm = load_arm(name)
+    every = [trial for trials in trials_by_use.values() for trial in trials]
+    heading = "| found | ms: median | max | before: median | max | after: median | max | speed: median | max |"
+    print(f"\n{name}: {len(every)} random trials\n\n| use, joints {heading}\n|---|---|---|---|---|---|---|---|---|---|")
+    for use, trials in trials_by_use.items():
+        for group, joints in (("1 to 3", range(3)), (f"4 to {arm.num_joints}", range(3, arm.num_joints))):
+            print(f"| {use}, {group} | {summary(arm, [t for t in trials if t[1] in joints])} |")
+    print(f"\n| fault {heading}\n|---|---|---|---|---|---|---|---|---|---|")
+    for fault in FAULTS:
+        if rows := [t for t in every if t[0] == fault]:
+            print(f"| {fault} | {summary(arm, rows)} |")
+    print("\nslowest detections and undetected faults:")
+    for fault, joint, o in sorted(every, key=lambda t: -t[2].detected)[:12]:
+        print(f"{fault:18} {arm.joint_names[joint]:16} {1e3 * o.detected:6.0f} ms  before {o.before:.2f}  {o.text}")
+    sys.stdout.flush()
+
+
+def delay_trial(task) -> str:
+    """Simulates one delay; returns the line of the table."""
+    name, use, milliseconds, joint = task
+    simulated = FaultyArm(name, use)
+    arm = simulated.arm
+    scale, speeds = arm.per_joint(1.0, 0.1), []
+
+    def run(seconds, until_fault=False) -> Iterator[float]:
+        end = simulated.ticks + round(seconds / PERIOD)
+        while simulated.ticks < end:
+            if until_fault and simulated.guard.state == lcmt_dvrk_status.STATE_FAULT:
+                return
+            simulated.step()
+            yield float(np.max(np.abs(simulated.state()[1]) / scale))
+
+    list(run(DELAY_BEGIN))
+    simulated.sensors.delays[slice(None) if joint is None else joint] = milliseconds
+    speeds = list(run(DELAY_PATIENCE, until_fault=True))
+    fault, before = simulated.guard.fault_text or "no fault", max(speeds[-200:], default=0.0)
+    after = list(run(DELAY_AFTER))
+    where = "all joints" if joint is None else arm.joint_names[joint]
+    speed = f"{before:.2f} | {max(after):.2f} | {max(after[-500:]):.3f}"
+    return f"| {name} | {use} | {where} | {milliseconds} | {speed} | {fault} |"
+
+
+def main() -> None:
+    """Prints the tables."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--arms", nargs="+", default=["mtml", "psm"], help="names of the arms; default: %(default)s")
-    parser.add_argument("--uses", nargs="+", default=["effort", "position", "hold"], help="uses to simulate")
+    parser.add_argument("--uses", nargs="+", default=["effort", "position"], help="uses to simulate")
     parser.add_argument("--faults", nargs="+", default=list(FAULTS), help="sensor faults to simulate")
+    parser.add_argument("--trials", type=int, default=300, help="number of trials per arm; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random sample; default: %(default)s")
+    parser.add_argument("--delays", type=int, nargs="+", help="delays of positions and velocities [ms]")
+    parser.add_argument("--all-joints", action="store_true", help="with --delays: delay only all joints together")
     parser.add_argument("--processes", type=int, default=2, help="number of parallel processes; default: %(default)s")
-    arguments = parser.parse_args()
-    for name in arguments.arms:
-        for use in arguments.uses:
-            arm = load_arm(name)
-            tasks = [(fault, joint) for fault in arguments.faults for joint in range(arm.num_joints)]
-            outcomes = []
-            for begin, seed in TRIALS[:1] if use == "hold" else TRIALS:
-                TRIAL_HISTORY.append(Trial(name, use, begin, seed))
-                with multiprocessing.get_context("fork").Pool(arguments.processes, maxtasksperchild=1) as pool:
-                    outcomes.append(pool.map(last_outcome, tasks, chunksize=1))
-            print_table(f"{name}, {use}", arm, tasks, outcomes)
-
-
-#: Trials so far. A forked process uses the last one.
-TRIAL_HISTORY = []
-
-
-def last_outcome(task):
-    """Returns the outcome of a task in the last trial."""
-    return TRIAL_HISTORY[-1].outcome(task)
+    options = parser.parse_args()
+    if options.delays:
+        print("Largest speed of any joint [rad/s, 0.1 m/s] before and after the fault, and 2.5 s after the fault\n")
+        print("| arm | use | delayed | delay [ms] | before | after | 2.5 s after | fault |")
+        print("|---|---|---|---|---|---|---|---|")
+        for name in options.arms:
+            joints = [None] if options.all_joints else [None, *range(load_arm(name).num_joints)]
+            tasks = [(name, use, d, j) for use in options.uses for d in options.delays for j in joints]
+            with multiprocessing.get_context("spawn").Pool(options.processes) as pool:
+                for line in pool.imap(delay_trial, tasks):
+                    print(line, flush=True)
+        return
+    for name in options.arms:
+        motions = -(-options.trials // (PER_MOTION * len(options.uses)))
+        trials = {}
+        for k, use in enumerate(options.uses):
+            tasks = [(name, use, (options.seed, k, motion), options.faults) for motion in range(motions)]
+            # A thread waits for each process. The processes of a Pool could not fork.
+            with ThreadPoolExecutor(options.processes) as pool:
+                results = pool.map(lambda task: in_fork(lambda: motion_trials(task)), tasks)
+                trials[use] = [trial for result in results for trial in result]
+        print_tables(name, trials)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, app, whole_number
-from dvrk_drake.cli.support import check_ros_options, interrupt_ends_process, mounted, print_warning, quiet_drake
+from dvrk_drake.cli.support import (
+    check_ros_options,
+    interrupt_ends_process,
+    mounted,
+    print_warning,
+    quiet_drake,
+    warn_of_weaker_settings,
+)
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm as LoadedArm
@@ -92,6 +99,7 @@ def arm(
         return
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
+    warn_of_weaker_settings(configuration.guard)
     start = start_pose(simulated_arm, pose, simulated_effects)
     url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
     print(f"starting the simulated {simulated_arm.name}", flush=True)

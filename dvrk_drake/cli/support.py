@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.lcm_messages import MessageKey
+    from dvrk_drake.systems.guard.settings import GuardSettings
 
 
 def import_interruptibly() -> None:
@@ -244,6 +245,12 @@ def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
 def print_warning(text: str) -> None:
     """Prints a warning on standard error."""
     print(f"dvrk-drake: warning: {text}", file=sys.stderr, flush=True)
+
+
+def warn_of_weaker_settings(guard: GuardSettings) -> None:
+    """Prints a line if settings of a command guard protect the arm less than their defaults."""
+    if weaker := guard.weaker_than_default():
+        print_warning(f"the guard protects the arm less than with its default settings: {weaker}")
 
 
 def write_json(path: str, content: object) -> None:

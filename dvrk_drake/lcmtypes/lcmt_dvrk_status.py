@@ -13,11 +13,11 @@ import struct
 
 class lcmt_dvrk_status(object):
 
-    __slots__ = ["utime", "sequence", "session_id", "arm_name", "guard_state", "accepted_modes", "gravity_compensation", "fault_code", "fault_text", "command_sender_id", "command_sequence", "command_utime", "num_accepted", "num_lost", "num_refused", "num_ignored", "num_expired", "refusal_code", "ignored_code", "num_joints", "position", "velocity", "effort_measured", "position_commanded", "effort_commanded", "joint_flags", "num_grippers", "gripper_position", "mac_size", "mac"]
+    __slots__ = ["utime", "sequence", "session_id", "arm_name", "guard_state", "accepted_modes", "gravity_compensation", "fault_code", "fault_text", "weaker_settings", "command_sender_id", "command_sequence", "command_utime", "num_accepted", "num_lost", "num_refused", "num_ignored", "num_expired", "refusal_code", "ignored_code", "num_joints", "position", "velocity", "effort_measured", "position_commanded", "effort_commanded", "joint_flags", "num_grippers", "gripper_position", "mac_size", "mac"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "string", "int8_t", "int8_t", "boolean", "int8_t", "string", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int8_t", "int8_t", "int32_t", "double", "double", "double", "double", "double", "int8_t", "int8_t", "double", "int8_t", "byte"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "string", "int8_t", "int8_t", "boolean", "int8_t", "string", "string", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int8_t", "int8_t", "int32_t", "double", "double", "double", "double", "double", "int8_t", "int8_t", "double", "int8_t", "byte"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], None, ["num_grippers"], None, ["mac_size"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], None, ["num_grippers"], None, ["mac_size"]]
 
     STATE_OFF = 0
     """ guard_state: motor power is off """
@@ -31,9 +31,9 @@ class lcmt_dvrk_status(object):
     """ effort commands act """
     STATE_FAULT = 5
     """
-    as HOLD, until a command with reset_fault. After a measurement fault, joints with FLAG_IMPLAUSIBLE get the gravity
-    effort of their last valid pose, and the guard regulates the positions of the other joints with efforts. If the
-    motor power was off, it stays off
+    until a command with reset_fault. After a fault of the measurements or of the motion, joints with FLAG_IMPLAUSIBLE
+    get the gravity effort of their last valid pose, and the guard regulates the other joints with efforts. After other
+    faults, as HOLD. If the motor power was off, it stays off
     """
     FAULT_NONE = 0
     """ fault_code: no fault. All faults are latched until a command with reset_fault """
@@ -50,7 +50,7 @@ class lcmt_dvrk_status(object):
     FAULT_IMPLAUSIBLE = 7
     """ a measurement is not plausible: it jumps, does not change, or contradicts another measurement """
     FAULT_OSCILLATION = 8
-    """ the commanded efforts oscillate """
+    """ the efforts oscillate, as commanded or between the command and the limits """
     FAULT_NOT_FINITE = 9
     """ the guard computed a number that is not finite """
     REFUSAL_NONE = 0
@@ -172,6 +172,12 @@ class lcmt_dvrk_status(object):
         """
         description of the fault with its numbers, or, during a watchdog hold without a fault, the cause of the hold;
         otherwise empty
+        LCM Type: string
+        """
+
+        self.weaker_settings = ""
+        """
+        guard settings that protect the arm less than their defaults, with both values; otherwise empty
         LCM Type: string
         """
 
@@ -321,6 +327,10 @@ class lcmt_dvrk_status(object):
         buf.write(struct.pack('>I', len(__fault_text_encoded)+1))
         buf.write(__fault_text_encoded)
         buf.write(b"\0")
+        __weaker_settings_encoded = self.weaker_settings.encode('utf-8')
+        buf.write(struct.pack('>I', len(__weaker_settings_encoded)+1))
+        buf.write(__weaker_settings_encoded)
+        buf.write(b"\0")
         buf.write(struct.pack(">qqqqqqqqbbi", self.command_sender_id, self.command_sequence, self.command_utime, self.num_accepted, self.num_lost, self.num_refused, self.num_ignored, self.num_expired, self.refusal_code, self.ignored_code, self.num_joints))
         buf.write(struct.pack('>%dd' % self.num_joints, *self.position[:self.num_joints]))
         buf.write(struct.pack('>%dd' % self.num_joints, *self.velocity[:self.num_joints]))
@@ -354,6 +364,8 @@ class lcmt_dvrk_status(object):
         self.fault_code = struct.unpack(">b", buf.read(1))[0]
         __fault_text_len = struct.unpack('>I', buf.read(4))[0]
         self.fault_text = buf.read(__fault_text_len)[:-1].decode('utf-8', 'replace')
+        __weaker_settings_len = struct.unpack('>I', buf.read(4))[0]
+        self.weaker_settings = buf.read(__weaker_settings_len)[:-1].decode('utf-8', 'replace')
         self.command_sender_id, self.command_sequence, self.command_utime, self.num_accepted, self.num_lost, self.num_refused, self.num_ignored, self.num_expired, self.refusal_code, self.ignored_code, self.num_joints = struct.unpack(">qqqqqqqqbbi", buf.read(70))
         self.position = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
         self.velocity = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
@@ -370,7 +382,7 @@ class lcmt_dvrk_status(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_dvrk_status in parents: return 0
-        tmphash = (0x7a968dbc874eb4cc) & 0xffffffffffffffff
+        tmphash = (0x18f99c826c507848) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, MultibodyForces, SpatialInertia
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, MultibodyForces, SpatialInertia
 from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
@@ -141,6 +141,15 @@ def set_arm_positions(
     q_plant = plant.GetPositions(context)
     q_plant[tree_selector(plant, arm, instance)] = arm.linkage.position(q)
     plant.SetPositions(context, q_plant)
+
+
+def link_positions(arm: Arm, q: ArrayLike) -> dict[str, NDArray[np.float64]]:
+    """Returns the position (3,) [m] of each link origin in the world frame, at the pose q (n,) [rad, m]."""
+    plant = shared_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, q)
+    bodies = map(plant.get_body, map(BodyIndex, range(plant.num_bodies())))
+    return {body.name(): body.EvalPoseInWorld(context).translation() for body in bodies}
 
 
 def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:

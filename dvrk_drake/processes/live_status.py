@@ -74,8 +74,8 @@ class LiveStatus:
     Attributes:
         state: State of the guard.
         pace: Rate of the commands, their round-trip time, and the number of lost statuses.
-        problem: Reasons why commands were refused, ignored or expired since the previous live status, or "" if there
-            are none.
+        problem: Reasons why commands were refused, ignored or expired since the previous live status, and settings of
+            the guard that are weaker than their defaults; or "" if there are none.
     """
 
     state: str
@@ -118,6 +118,8 @@ class LiveStatusMaker:
             problem.append(f"the arm ignores messages: {describe_refusal(status.ignored_code)}")
         if status.num_expired > self._before.num_expired:
             problem.append("the guard holds the arm because the last command expired")
+        if status.weaker_settings:
+            problem.append(f"guard settings weaker than the defaults: {status.weaker_settings}")
         self._before, self._last_time, self._answered = status, time, 0
         pace = f"{rate:.0f} Hz, {trip}, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))

@@ -33,18 +33,27 @@ FAULTS = {
     "velocity zero": lambda q, v, effort, q0, t, scale: (q, 0.0, effort),
     "velocity offset": lambda q, v, effort, q0, t, scale: (q, v + scale, effort),
     "effort zero": lambda q, v, effort, q0, t, scale: (q, v, 0.0),
+    "effort not finite": lambda q, v, effort, q0, t, scale: (q, v, np.nan),
     "not finite": lambda q, v, effort, q0, t, scale: (np.nan, v, effort),
 }
 
 
 class FaultySensors(LeafSystem):
-    """Sensors that forward the state (2n) and effort (n). The measurement of one joint fails from a given time on."""
+    """Sensors that forward the state (2n) and effort (n). The measurement of one joint fails from a given time on.
+
+    Attributes:
+        fault, joint, begin: Fault of `FAULTS`, joint, and time of its begin [s].
+        delays: Additional delays (n,) of position and velocity, in periods. Their largest value is MAX_DELAY.
+    """
+
+    MAX_DELAY = 100
 
     def __init__(self, arm):
         super().__init__()
         n = arm.num_joints
         self.fault, self.joint, self.begin, self._q = None, 0, np.inf, None
         self._scale = arm.per_joint(1.0, 0.1)
+        self.delays, self._states = np.zeros(n, int), np.full((self.MAX_DELAY + 1, 2 * n), np.nan)
         state, effort = self.DeclareVectorInputPort("state", 2 * n), self.DeclareVectorInputPort("effort", n)
         self.DeclareVectorOutputPort("state_measured", 2 * n, lambda c, out: out.SetFromVector(self.measure(c)[0]))
         self.DeclareVectorOutputPort("effort_measured", n, lambda c, out: out.SetFromVector(self.measure(c)[1]))
@@ -53,6 +62,11 @@ class FaultySensors(LeafSystem):
     def measure(self, context):
         state, effort = (np.array(port.Eval(context)) for port in self._ports)
         t, j, n = context.get_time(), self.joint, len(effort)
+        tick = round(t / PERIOD)
+        self._states[tick % len(self._states)] = state
+        if self.delays.any():
+            rows = (tick - np.minimum(self.delays, tick)) % len(self._states)
+            state = self._states[np.tile(rows, 2), np.arange(2 * n)]
         if t >= self.begin:
             self._q = state[j] if self._q is None else self._q
             state[j], state[n + j], effort[j] = FAULTS[self.fault](
@@ -61,8 +75,10 @@ class FaultySensors(LeafSystem):
         return state, effort
 
 
-def wave(arm, seconds, speed, seed=0, reach=0.35):
-    """Returns a smooth trajectory of the positions (n), which starts at rest in the middle of the joint ranges.
+def wave(arm, seconds, speed, seed=0, reach=0.35, center=None):
+    """Returns a smooth trajectory of the positions (n), which starts at rest at `center`.
+
+    None: the center is in the middle of the joint ranges.
 
     The amplitude is `reach` times half of the range, or less if the speed would exceed `speed` [rad/s] (`speed` / 10
     [m/s] for prismatic joints). Each joint has its own frequency.
@@ -73,6 +89,7 @@ def wave(arm, seconds, speed, seed=0, reach=0.35):
         row = np.array([limit.coefficients.get(name, 0.0) for name in arm.joint_names])
         middle = middle + row / (row @ row) * (0.5 * (limit.lower + limit.upper) - row @ middle)
         half = np.where(row != 0, np.minimum(half, 0.5 * (limit.upper - limit.lower)), half)
+    middle = middle if center is None else center
     omega = np.random.default_rng(seed).uniform(1.0, 2.5, arm.num_joints)
     amplitude = np.minimum(reach * half, speed * arm.per_joint(1.0, 0.1) / omega)
     fade = np.clip((times - _AT_REST) / 1.5, 0.0, 1.0)
@@ -89,7 +106,7 @@ class Outcome:
         text: Fault text of the guard.
         before, after: Largest displacement of the joint before and after the detection of the fault [rad, m].
         speed: Largest speed of any joint at least 50 ms after detection, divided by 1 rad/s or 0.1 m/s.
-        effort: Largest effort of any joint after detection, as a fraction of its limit.
+        effort: Largest effort of any joint at least 50 ms after detection, as a fraction of its limit.
     """
 
     detected: float
@@ -186,7 +203,7 @@ class FaultyArm:
         port = self.driver.GetOutputPort("effort_commanded")
         return np.array(port.Eval(self.driver.GetMyContextFromRoot(self.context)))
 
-    def fail(self, fault, joint, at, seconds=1.5, patience=1.5):
+    def fail(self, fault, joint, at, seconds=1.5, patience=3.0):
         """Runs until `at` [s], makes the measurement of a joint fail, and returns the Outcome."""
         while self.ticks * PERIOD < at:
             self.step()
@@ -205,7 +222,7 @@ class FaultyArm:
             self.step()
             q, v = self.state()
             after = max(after, abs(q[joint] - found))
-            effort = max(effort, np.max(np.abs(self.effort()) / self.arm.effort_limits))
             if k >= 50:
+                effort = max(effort, np.max(np.abs(self.effort()) / self.arm.effort_limits))
                 speed = max(speed, np.max(np.abs(v) / scale))
         return Outcome(detected, self.guard.fault_text, before, after, speed, effort)

@@ -15,6 +15,8 @@ LIMIT = ARM.effort_limits
 SESSION = 77
 Q = np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5])  # inside all limits
 MS = 1000
+#: Damping of the position controller per inertia [1/s], as in the arm files.
+DAMPING = 150.0
 #: Accepted modes for tests that switch the arm off. By default a guard refuses OFF.
 WITH_OFF = (Command.POSITION, Command.EFFORT, Command.OFF)
 
@@ -41,10 +43,17 @@ class Heavy(Weightless):
         return 0.2 * LIMIT * np.cos(q)
 
 
+class Inert(Heavy):
+    """Model with gravity and constant inertias, for the damping in the safe state."""
+
+    def mass_matrix(self, q):
+        return np.diag(np.array(ARM.gains.kd) / DAMPING)
+
+
 class Unchecked(Plausibility):
     """Plausibility check that accepts all measurements, because the test sets the state of the arm."""
 
-    def check(self, dt, q, v, effort, commanded):
+    def check(self, dt, q, v, effort, commanded, invalid_effort=None):
         self.gravity, self._poses = self.model.gravity_effort(q), (q, q)
         return ""
 

@@ -93,7 +93,7 @@ def jumped(seconds):
 BAD = [
     (changed(position=POSE[:6]), "/MTML/measured_js has 6 positions, 7 velocities and 7 efforts; required: 7 each"),
     (changed(position=[*POSE, 0.0]), "/MTML/measured_js has 8 positions, 7 velocities and 7 efforts; required: 7 each"),
-    (changed(effort=[float("nan")] * 7), "/MTML/measured_js: a position, velocity or effort is not finite"),
+    (changed(velocity=[float("nan")] * 7), "/MTML/measured_js: a position or velocity is not finite"),
     (changed(name=["x", *NAMES[1:]]), "MTML also needs outer_yaw"),
     (changed(name=[], position=[], velocity=[], effort=[]), "/MTML/measured_js has the joints none; MTML also needs"),
     (jumped(3600), "/MTML/measured_js: the time stamp changed by 3600."),

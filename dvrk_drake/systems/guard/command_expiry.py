@@ -80,11 +80,13 @@ class CommandExpiry:
             age: Age of the measurement from which the command was computed, by the arm's clock [us].
             wall_utime: Wall-clock time of that measurement [us]; see `wall_time`.
         """
-        clock = "the arm's clock"
-        if self.wall is not None and (by_wall := self.wall.now() - wall_utime) > age:
-            age, clock = by_wall, "the wall clock"
-        if age <= self.expiry:
+        larger = self.age(age, wall_utime)
+        if larger <= self.expiry:
             return ""
-        return (
-            f"the last command expired: it is {1e-3 * age:.1f} ms old by {clock}; {1e-3 * self.expiry:g} ms are allowed"
-        )
+        clock = "the wall clock" if larger > age else "the arm's clock"
+        allowed = f"{1e-3 * self.expiry:g} ms are allowed"
+        return f"the last command expired: it is {1e-3 * larger:.1f} ms old by {clock}; {allowed}"
+
+    def age(self, age: int, wall_utime: int) -> int:
+        """Returns the age of a command by the clock that gives the larger age [us]; see `fault` for the arguments."""
+        return age if self.wall is None else max(age, self.wall.now() - wall_utime)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm_files import unsafe_difference
 from dvrk_drake.models.lcm_messages import describe_refusal
 from dvrk_drake.systems.guard.command_expiry import CommandExpiry
 from dvrk_drake.systems.guard.command_stream import (
@@ -22,10 +23,10 @@ from dvrk_drake.systems.guard.command_stream import (
     foreign_refusal,
 )
 from dvrk_drake.systems.guard.follower import Follower, GuardOutput
-from dvrk_drake.systems.guard.limits import GuardLimits, Vector
+from dvrk_drake.systems.guard.limits import ArmModel, GuardLimits, Vector
 from dvrk_drake.systems.guard.measurement import Measurement
-from dvrk_drake.systems.guard.monitors import OscillationMonitor, PeriodMonitor
-from dvrk_drake.systems.guard.plausibility import ArmModel, Plausibility
+from dvrk_drake.systems.guard.monitors import AgeMonitor, OscillationMonitor, PeriodMonitor
+from dvrk_drake.systems.guard.plausibility import Plausibility
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:
@@ -50,6 +51,15 @@ _PERSON = (
 #: States in which a position controller regulates the arm to a target.
 _REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
 
+#: Faults after which the guard regulates the arm with the reduced gains of the safe state. The loop of the arm's own
+#: position controller may be the cause of these faults, e.g. if the measurements are late.
+_SAFE_STATE_FAULTS = (
+    lcmt_dvrk_status.FAULT_POSITION_LIMIT,
+    lcmt_dvrk_status.FAULT_FOLLOWING,
+    lcmt_dvrk_status.FAULT_IMPLAUSIBLE,
+    lcmt_dvrk_status.FAULT_OSCILLATION,
+)
+
 #: State in which the commands of each mode act.
 _ACTIVE = {
     lcmt_dvrk_command.POSITION: lcmt_dvrk_status.STATE_POSITION,
@@ -71,9 +81,10 @@ class CommandGuard:
     - STARTING: The arm behaves as in HOLD. The POSITION or EFFORT commands of a sender are monitored but do not act
       yet.
     - POSITION, EFFORT: The last accepted command, called the command in force, acts inside the limits of `GuardLimits`.
-    - FAULT: The arm behaves as in HOLD. After a measurement fault, the guard regulates only joints with a valid
-      position. All other joints get the gravity effort at their last valid position. If the motors had no power before
-      the fault, the arm behaves as in OFF.
+    - FAULT: After a fault of the measurements or of the motion, the guard regulates the joints with a valid position.
+      It uses reduced gains and efforts (`Follower.hold_valid_joints`), because a delay of the measurements may be the
+      cause. All other joints get the gravity effort at their last valid position. After other faults, the arm behaves
+      as in HOLD. If the motors had no power before the fault, the arm behaves as in OFF.
 
     Transitions are written as "state --command or event--> next state"::
 
@@ -87,13 +98,17 @@ class CommandGuard:
     **Expiry**: A command contains the time of the measurement from which it was computed (`status_utime`). The command
     expires when this measurement is older than the setting `expiry`. The time of arrival does not matter. A second
     command with the same `status_utime` therefore does not expire later. When the command in force expires, the guard
-    holds the arm. See `CommandExpiry`.
+    holds the arm. See `CommandExpiry`. The guard also holds the arm if the commands are too old when they arrive, since
+    this delay can make a control loop unstable. See `AgeMonitor`.
 
     **Measurements**: The guard checks that each measurement is finite, recent and plausible (`Plausibility`). A
     measurement that is not finite or too old ends STARTING, POSITION and EFFORT. While the arm holds, up to
     `bad_samples` such measurements in a row are tolerated. A longer sequence of such measurements is a fault. The first
     measurement is not compared with an earlier one. The same applies to the first measurement after a gap in the
     measurements, after OFF and after a reset. The pose of such a measurement must not be far outside the limits.
+
+    An effort that is not finite has the same consequences. However, the positions remain valid and the arm is
+    regulated, because regulation does not need the measured efforts.
 
     **Period**: The guard refuses POSITION and EFFORT commands if `step` was not called for `longest_period`, or if the
     median time between two calls exceeds `slow_period`. In these cases, the limits would act too late.
@@ -139,7 +154,7 @@ class CommandGuard:
     - measurements that are not plausible, not finite or too old,
     - a pose that exceeds a position limit by more than half of the setting `margin` while efforts act,
     - a joint that does not follow its target or is pushed away from the target,
-    - commanded efforts that oscillate,
+    - efforts that oscillate, either as commanded or between the command and the limits,
     - an arm clock that goes backwards or stands still,
     - an output that is not finite,
     - a fault that the driver reports.
@@ -184,14 +199,19 @@ class CommandGuard:
                 clock. Copies of the guard share this function.
 
         Raises:
-            StationError: The session is 0, a mode is unknown, or the settings or the arm's gains are out of range.
+            StationError: The session is 0, a mode is unknown, a setting is out of range, or the arm differs dangerously
+                from the arm of this package with the same name (`unsafe_difference`).
         """
         if unknown := set(modes or ()) - {*_ACTIVE, lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD}:
             raise StationError(f"modes must be POSITION, EFFORT or OFF; got {sorted(unknown)}")
         if session_id == 0:
             raise StationError("session_id must not be 0, because 0 is the default value in a command")
+        if difference := unsafe_difference(arm):
+            raise StationError(f"{arm.source}: {difference}")
         self.settings = settings or GuardSettings()
         self.settings.check()
+        #: Settings that protect the arm less than their defaults, for the status.
+        self.weaker_settings = self.settings.weaker_than_default()
         self.limits = GuardLimits(arm, self.settings)
         arm.refuse_locked_joints("a command guard")
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
@@ -214,11 +234,12 @@ class CommandGuard:
         self._fault_times: tuple[int, ...] = ()
         #: Reason why the last measurement is invalid. Empty if it is valid.
         self._problem = ""
-        self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
+        self._measured = Measurement(arm.joint_names, round(1e6 * self.settings.measurement_age))
         self._plausibility = Plausibility(arm, model, self.settings.plausibility, self.limits.speed)
         self._period, self._oscillation = PeriodMonitor(self.settings), OscillationMonitor(self.settings, arm)
-        self._follower = Follower(self.limits)
-        self._acted = False
+        self._ages = AgeMonitor(self.settings)
+        self._follower = Follower(self.limits, self.limits.safe_gains(arm, model))
+        self._acted = self._is_in_safe_state = False
         self.output = self._output(0.0)
         self._commanded = self.output.effort
 
@@ -236,6 +257,7 @@ class CommandGuard:
             "_plausibility",
             "_period",
             "_oscillation",
+            "_ages",
         ):
             part = getattr(self, name)
             duplicate = object.__new__(type(part))
@@ -349,17 +371,18 @@ class CommandGuard:
         self._watch_period(dt)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.position_limit_fault(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
-        if self.state in _REGULATED and (deviation := self._follower.following_fault(self._q())):
+        if self._is_regulated_by_arm() and (deviation := self._follower.following_fault(self._q())):
             self.report_fault(deviation, lcmt_dvrk_status.FAULT_FOLLOWING)
         self.output = self._output(min(max(dt, 0.0), _MAX_STEP))
         if not self.output.is_finite():
             self.report_fault("the guard's output is not finite", lcmt_dvrk_status.FAULT_NOT_FINITE)
             self._follower.latch(self._q(), np.zeros(self.num_joints))
+            self._is_in_safe_state = False
             self.output = self._follower.hold(0.0)
         elif self.state == lcmt_dvrk_status.STATE_EFFORT:
-            joint = self._oscillation.add(self.output.effort, min(max(dt, 0.0), _MAX_STEP))
-            if joint is not None:
-                text = f"{self.limits.names[joint]}: the commanded effort oscillates"
+            self._commanded = self.output.effort.copy()
+            text = self._oscillation.add(self._follower.effort, self._commanded, min(max(dt, 0.0), _MAX_STEP))
+            if text:
                 self.report_fault(text, lcmt_dvrk_status.FAULT_OSCILLATION)
                 self.output = self._output(0.0)
         self._commanded = self.output.effort.copy()
@@ -375,6 +398,8 @@ class CommandGuard:
             has_power: False if the motors cannot hold the arm. The output is then the same as in OFF. After a reset,
                 the arm holds the measured pose, not the pose before the fault.
         """
+        if code in _SAFE_STATE_FAULTS:
+            self._begin_safe_state()
         if self.state != lcmt_dvrk_status.STATE_FAULT:
             powered = self._powered
             self._hold()
@@ -415,13 +440,17 @@ class CommandGuard:
         implausible_pose = self.limits.implausible_pose if is_first_in_series else None
         self._problem = problem = measured.store(measured_utime, q, v, effort, implausible_pose)
         if problem:
-            if first or measured.num_invalid > self.settings.plausibility.bad_samples:
+            no_pose = measured.q is None
+            if no_pose or measured.num_invalid > self.settings.plausibility.bad_samples:
                 # Without any measurement there is no pose to hold.
-                self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not first)
-                plausibility.reject_all()
+                self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not no_pose)
+                if not measured.is_pose_valid:
+                    self._begin_safe_state()
+                    plausibility.reject_all()
             elif self._is_starting_or_in_force():
                 self._take_over(problem)
-            return
+            if not measured.is_pose_valid:
+                return
         if first:
             self._follower.latch(self._q(), np.zeros(self.num_joints))  # the arm is assumed to be at rest
         elif measured.dt == 0:
@@ -429,7 +458,9 @@ class CommandGuard:
         if is_first_in_series:
             plausibility.forget()
         commanded = self._commanded if self.state == lcmt_dvrk_status.STATE_EFFORT else None
-        fault = plausibility.check(measured.dt, self._q(), measured.v, measured.effort, commanded)
+        fault = plausibility.check(
+            measured.dt, self._q(), measured.v, measured.effort, commanded, measured.invalid_effort
+        )
         if fault:
             self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
         if not self._powered:
@@ -441,6 +472,21 @@ class CommandGuard:
             dt, self._last_wall_step = 1e-6 * (now - self._last_wall_step) if self._last_wall_step else 0.0, now
         if self._period.add(dt) and self._is_starting_or_in_force():
             self._take_over(self._period.fault)
+
+    def _begin_safe_state(self) -> None:
+        """Starts the regulation with reduced gains in FAULT, from the present effort."""
+        if not self._is_in_safe_state:
+            self._is_in_safe_state = True
+            acts = self.output.control_mode == lcmt_dvrk_command.EFFORT
+            self._follower.begin_safe_state(self._commanded if acts else self._measured.effort)
+
+    def _is_regulated_by_arm(self) -> bool:
+        """Returns whether the arm's own position controller regulates the arm to the follower's target."""
+        if self.state == lcmt_dvrk_status.STATE_FAULT:
+            # After a fault of the driver, another process may move the arm.
+            is_held = self._powered and not self._is_in_safe_state
+            return is_held and self.fault_code != lcmt_dvrk_status.FAULT_DRIVER
+        return self.state in _REGULATED
 
     def _is_starting_or_in_force(self) -> bool:
         return self.state in (lcmt_dvrk_status.STATE_STARTING, *_ACTIVE.values())
@@ -525,16 +571,19 @@ class CommandGuard:
                 self.fault_text = problem
             elif resets and not problem:
                 self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
-                self.hold_reason = ""
+                self.hold_reason, self._is_in_safe_state = "", False
                 if self._plausibility.invalid.any() or not self._follower.is_near(self._q()):
                     self._follower.latch(self._q(), self._measured.v)
                 self._plausibility.restart()
             if self.fault_code == lcmt_dvrk_status.FAULT_NONE:
                 self._hold()
+        elif reason := self._ages.add(self._expiry.age(utime - command.status_utime, in_force.wall_utime)):
+            self._take_over(reason)
         elif self.state == _ACTIVE[mode]:
             return
         elif not continues:
             self._hold()
+            self._ages.restart()
             self.state, in_force.accepted_since = lcmt_dvrk_status.STATE_STARTING, utime
         elif utime - in_force.accepted_since >= 1e6 * self.settings.start_time:
             self._act(mode)
@@ -563,11 +612,11 @@ class CommandGuard:
         q = self._q()
         if not self._powered:
             return follower.off(q)
-        if self.state == lcmt_dvrk_status.STATE_FAULT and self._plausibility.invalid.any():
+        if self.state == lcmt_dvrk_status.STATE_FAULT and self._is_in_safe_state:
             valid = ~self._plausibility.invalid
             gravity = self._plausibility.model.gravity_effort(np.where(valid, q, self._plausibility.last_valid))
-            v = np.zeros(self.num_joints) if self._measured.num_invalid else self._measured.v
-            return follower.hold_valid_joints(q, v, valid, gravity)
+            v = self._measured.v if self._measured.is_pose_valid else np.zeros(self.num_joints)
+            return follower.hold_valid_joints(q, v, valid, gravity, dt)
         if self.state == lcmt_dvrk_status.STATE_POSITION:
             return follower.follow_position(in_force.position, in_force.velocity, dt)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and self._measured.utime is not None:

@@ -41,12 +41,19 @@ class Follower:
 
     Attributes:
         target: Target (n,) [rad, m] of the position controller in HOLD and POSITION.
+        effort: Effort (n,) [N m, N] that follows the commands, without soft walls and speed limit.
     """
 
-    def __init__(self, limits: GuardLimits) -> None:
-        """Creates a follower at rest. No array is changed in place, so copies of the follower may share arrays."""
+    def __init__(self, limits: GuardLimits, safe_gains: tuple[Vector, Vector]) -> None:
+        """Creates a follower at rest. No array is changed in place, so copies of the follower may share arrays.
+
+        Args:
+            limits: Limits of the arm.
+            safe_gains: Stiffness (n,) and damping (n,) of the safe state, see `GuardLimits.safe_gains`.
+        """
+        self._stiffness, self._damping = safe_gains
         self._limits, self._zero = limits, np.zeros(len(limits.effort_limits))
-        self.target = self._filtered_target = self._effort = self._start_wall_effort = self._zero
+        self.target = self._filtered_target = self.effort = self._start_wall_effort = self._velocity = self._zero
 
     def off(self, q: Vector) -> GuardOutput:
         """Returns the output without motor power, at the measured pose q (n,) [rad, m]."""
@@ -67,8 +74,15 @@ class Follower:
         self._filter_target(dt)
         return self._output(lcmt_dvrk_command.HOLD, self.target)
 
-    def hold_valid_joints(self, q: Vector, v: Vector, valid: Mask, gravity: Vector) -> GuardOutput:
-        """Returns the output that holds the joints with a valid position. All other joints get only the gravity effort.
+    def begin_safe_state(self, effort: Vector) -> None:
+        """Starts the safe state from the present `effort` (n,) [N m, N]."""
+        self.effort = clip(effort, -self._limits.effort_limits, self._limits.effort_limits)
+
+    def hold_valid_joints(self, q: Vector, v: Vector, valid: Mask, gravity: Vector, dt: float) -> GuardOutput:
+        """Returns the output of the safe state. It is damped also if the measurement is late.
+
+        Joints with a valid position are regulated with the gains of `GuardLimits.safe_gains`. All other joints get only
+        the gravity effort.
 
         Args:
             q: Measured positions (n,) [rad, m].
@@ -76,15 +90,17 @@ class Follower:
             valid: Mask (n,) of joints with a valid position.
             gravity: Gravity effort (n,) [N m, N] of the model at q, in which the last valid position replaces each
                 invalid position.
+            dt: Time since the previous output [s].
         """
         limits = self._limits
         largest, least = limits.fault_effort, limits.fault_effort / 3
         upper = np.minimum(np.maximum(largest, gravity + least), limits.effort_limits)
         lower = np.maximum(np.minimum(-largest, gravity - least), -limits.effort_limits)
-        effort = gravity + np.where(valid, limits.kp * (self.target - q) - limits.kd * v, 0.0)
-        effort = clip(effort, lower, upper)
+        feedback = self._stiffness * (self.target - q) - self._damping * v
+        effort = clip(gravity + np.where(valid, feedback, 0.0), lower, upper)
+        self.effort = limits.limit_effort_rate(effort, self.effort, dt)
         flags = np.where(valid, 0, lcmt_dvrk_status.FLAG_IMPLAUSIBLE).astype(np.int8)
-        return self._output(lcmt_dvrk_command.EFFORT, q, effort=effort, flags=flags)
+        return self._output(lcmt_dvrk_command.EFFORT, q, effort=self.effort.copy(), flags=flags)
 
     def is_near(self, q: Vector) -> bool:
         """Returns whether q is near the target. The tolerance is that of the start check for position commands."""
@@ -92,7 +108,7 @@ class Follower:
 
     def begin_position(self) -> None:
         """Starts following position commands from the present target."""
-        self._filtered_target = self.target
+        self._filtered_target, self._velocity = self.target, self._zero
 
     def follow_position(self, position: Vector, velocity: Vector, dt: float) -> GuardOutput:
         """Returns the next output for a position command.
@@ -104,7 +120,8 @@ class Follower:
         """
         self.target, flags = self._limits.limit_position(position, self.target, dt)
         self._filter_target(dt)
-        velocity = self._limits.limit_velocity(velocity, self.target, flags)
+        self._velocity = self._limits.follow_velocity(velocity, self._velocity, flags, dt)
+        velocity = self._limits.limit_velocity(self._velocity, self.target)
         return self._output(lcmt_dvrk_command.POSITION, self.target, velocity=velocity, flags=flags)
 
     def _filter_target(self, dt: float) -> None:
@@ -134,7 +151,7 @@ class Follower:
     def begin_effort(self, effort: Vector, q: Vector) -> None:
         """Starts following effort commands from the measured `effort` (n,) [N m, N] at the pose q (n,) [rad, m]."""
         limit = self._limits.command_limits
-        self._effort = clip(effort, -limit, limit)
+        self.effort = clip(effort, -limit, limit)
         # Effort of the walls at the start for zero velocity. `follow_effort` subtracts a decreasing fraction of this
         # effort.
         self._start_wall_effort = self._limits.wall_effort(q, self._zero)[0]
@@ -149,9 +166,9 @@ class Follower:
             dt: Time since the previous output [s].
             start_share: Elapsed fraction (0 to 1) of the time in which the effort of the walls increases.
         """
-        self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
+        self.effort, flags = self._limits.follow_effort(effort, self.effort, dt)
         withheld = None if start_share == 1.0 else (1.0 - start_share) * self._start_wall_effort
-        applied, walls = self._limits.restrain_effort(self._effort, q, v, withheld)
+        applied, walls = self._limits.restrain_effort(self.effort, q, v, withheld)
         return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, flags=flags | walls)
 
     def _output(

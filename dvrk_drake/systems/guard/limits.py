@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,17 @@ Mask = NDArray[np.bool_]
 #: Tolerance of the check of coupled limits for rounding errors [rad, m].
 _ROUNDING = 1e-12
 
+#: Largest delay [s] of the loop in the safe state: 30 ms of a measurement, 5 ms of a velocity filter with a cut-off of
+#: 30 Hz, and five periods for sensors, messages and motors.
+SAFE_DELAY = 0.04
+
+#: Gains of the safe state at the delay T: damping per inertia, times T, and stiffness per damping, times T. For the
+#: arms of this package, the loop has a phase margin of at least 30 degrees at the delay T, and is stable at 2 T.
+_SAFE_DAMPING, _SAFE_STIFFNESS = 0.6, 0.12
+
+#: Number of random poses for the largest ratio of damping to inertia.
+_INERTIA_POSES = 50
+
 _CLAMPED, _RATE_LIMITED = np.int8(lcmt_dvrk_status.FLAG_EFFORT_CLAMPED), np.int8(lcmt_dvrk_status.FLAG_RATE_LIMITED)
 
 
@@ -32,6 +43,16 @@ def clip(x: Vector, lower: ArrayLike, upper: ArrayLike) -> Vector:
 def is_any(mask: Mask) -> bool:
     """Returns whether any element of the mask (n,) is true. For small arrays, mask.any() is slower."""
     return True in mask.tolist()
+
+
+class ArmModel(Protocol):
+    """Protocol of the arm model that the guard uses, such as `dvrk_drake.dynamics.identified_model.ControlModel`."""
+
+    def gravity_effort(self, q: Vector) -> Vector:
+        """Returns the effort (n,) [N m, N] that compensates gravity at the pose q (n,) [rad, m]."""
+
+    def mass_matrix(self, q: Vector) -> NDArray[np.float64]:
+        """Returns the mass matrix (n, n) at the pose q (n,)."""
 
 
 class GuardLimits:
@@ -81,6 +102,8 @@ class GuardLimits:
         self.following_error = settings.following_error * width[:n]
         self.following_time = settings.following_time
         self._effort_rate = self.effort_limits / settings.effort_rise_time
+        kd = np.array(arm.gains.kd)
+        self._acceleration = np.divide(self._effort_rate, kd, out=np.full(n, np.inf), where=kd > 0)
         walls = SoftWalls.of(arm)
         self._wall_effort, self._wall_look_ahead = walls.effort, walls.look_ahead
         self.wall_width = np.maximum(self.margin, walls.width)
@@ -93,6 +116,23 @@ class GuardLimits:
         self._free = 0.5 * width - self.wall_width
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
+
+    def safe_gains(self, arm: Arm, model: ArmModel) -> tuple[Vector, Vector]:
+        """Returns the stiffness (n,) and damping (n,) of the safe state, which are stable up to the delay `SAFE_DELAY`.
+
+        The damping is D = c Kd with the gains Kd of the arm, and the stiffness is k D. For each eigenvalue m of
+        M(q)^-1 D, the loop M a = -D (v + k e) with a delay T of v and e has a mode a = -m (v + k e). It is stable for
+        all m from 0 to `_SAFE_DAMPING` / T, so c follows from the largest eigenvalue over the poses of the arm. The
+        gains are zero if a mass matrix is singular or not finite.
+        """
+        poses = arm.sample_poses(_INERTIA_POSES, np.random.default_rng(0))
+        kd = np.diag(self.kd)
+        try:
+            ratio = max(np.abs(np.linalg.eigvals(np.linalg.solve(model.mass_matrix(q), kd))).max() for q in poses)
+        except np.linalg.LinAlgError:
+            ratio = np.inf
+        damping = min(_SAFE_DAMPING / (SAFE_DELAY * ratio), 1.0) * self.kd
+        return _SAFE_STIFFNESS / SAFE_DELAY * damping, damping
 
     def position_limit_fault(self, q: Vector) -> str:
         """Returns a description of the limit that q (n,) exceeds most.
@@ -167,11 +207,15 @@ class GuardLimits:
             Effort (n,) [N m, N] and joint flags (n,).
         """
         clamped = clip(command, -self.command_limits, self.command_limits)
-        step = self._effort_rate * dt
-        effort = clip(clamped, last - step, last + step)
+        effort = self.limit_effort_rate(clamped, last, dt)
         if not is_any(effort != command):
             return effort, np.zeros(len(effort), np.int8)
         return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
+
+    def limit_effort_rate(self, effort: Vector, last: Vector, dt: float) -> Vector:
+        """Returns `effort` (n,) [N m, N] with a limited change from `last` (n,) during `dt` [s]."""
+        step = self._effort_rate * dt
+        return clip(effort, last - step, last + step)
 
     def wall_effort(self, q: Vector, v: Vector) -> tuple[Vector, Flags]:
         """Returns the effort of the walls (n,) [N m, N] at q and v (n,), and the joint flags (n,)."""
@@ -224,9 +268,21 @@ class GuardLimits:
         inside, limited = self._inside(target, last)
         return inside, flags | limited
 
-    def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
-        """Returns the limited feedforward velocity (n,) at `target` (n,). It is zero for joints with `flags`."""
+    def follow_velocity(self, command: Vector, last: Vector, flags: Flags, dt: float) -> Vector:
+        """Limits a feedforward velocity and its rate, so that the effort of Kd times it is limited in rate.
+
+        Args:
+            command: Commanded velocity (n,) [rad/s, m/s].
+            last: Previous velocity (n,) [rad/s, m/s].
+            flags: Joint flags (n,) of the target. Joints with flags slow down to zero.
+            dt: Time since the previous velocity [s].
+        """
         velocity = np.where(flags == 0, clip(command, -self.speed, self.speed), 0.0)
+        step = self._acceleration * dt
+        return clip(velocity, last - step, last + step)
+
+    def limit_velocity(self, velocity: Vector, target: Vector) -> Vector:
+        """Returns a feedforward velocity (n,) that is reduced near the position limits, at `target` (n,)."""
         lead = self._look_ahead * velocity
         ahead, _ = self._inside(target + lead, target)
         cut = ahead != target + lead

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.command_stream import is_finite
-from dvrk_drake.systems.guard.limits import Vector
+from dvrk_drake.systems.guard.limits import Mask, Vector
 
 #: Largest number of steps without an advance of the arm's clock. While this clock stands still, commands do not expire
 #: by it. Several steps are allowed, because Drake updates the guard twice at time zero.
@@ -22,30 +23,36 @@ class Measurement:
     """Last measurement of an arm with n joints. All times in us are on the arm's clock.
 
     Attributes:
-        num_joints: Number of joints n.
+        joint_names: Names of the n joints.
         max_age: Largest age of a valid measurement [us].
         utime: Time of the last step [us], or None before the first step.
         q: Last valid positions (n,) [rad, m], or None before the first valid measurement.
         v: Velocities (n,) [rad/s, m/s] of the last valid measurement.
-        effort: Applied motor efforts (n,) [N m, N] of the last valid measurement.
+        effort: Last valid motor effort (n,) [N m, N] of each joint.
+        invalid_effort: Mask (n,) of the joints whose effort in the last measurement is not finite.
+        is_pose_valid: Whether the last measurement has a valid pose. Its efforts may nevertheless be invalid.
         dt: Time between the last two valid measurements [s]; 0 for a repeated measurement, inf for the first
             measurement.
         num_invalid: Number of consecutive invalid measurements up to now.
     """
 
-    num_joints: int
+    joint_names: tuple[str, ...]
     max_age: int
     utime: int | None = None
     q: Vector | None = None
     v: Vector = field(init=False)
     effort: Vector = field(init=False)
+    invalid_effort: Mask = field(init=False)
+    is_pose_valid: bool = False
     dt: float = math.inf
     num_invalid: int = 0
     _measured_utime: int | None = None
     _steps_at_one_time: int = 0
+    _effort_problem: str = ""
 
     def __post_init__(self) -> None:
-        self.v = self.effort = np.zeros(self.num_joints)
+        self.v = self.effort = np.zeros(len(self.joint_names))
+        self.invalid_effort = self._none = np.zeros(len(self.joint_names), bool)
 
     def advance(self, utime: int) -> tuple[float, str]:
         """Advances to `utime` [us]. Returns the elapsed time [s] and the description of a clock fault, or ""."""
@@ -69,7 +76,7 @@ class Measurement:
         effort: ArrayLike,
         implausible_pose: Callable[[Vector], str] | None = None,
     ) -> str:
-        """Stores a measurement if it is valid.
+        """Stores a measurement if its pose is valid. An effort that is not finite is replaced by the last valid effort.
 
         Args:
             measured_utime: Time of the measurement [us].
@@ -85,30 +92,29 @@ class Measurement:
         """
         assert self.utime is not None
         age, dt = self.utime - measured_utime, self.time_since(measured_utime)
-        if not 0 <= age <= self.max_age:
-            self.num_invalid += 1
-            return f"the measurement is {1e-6 * age:.3f} s old; allowed: 0 to {1e-6 * self.max_age:g} s"
-        if dt == 0:
+        is_recent = 0 <= age <= self.max_age
+        if dt == 0 and is_recent:
             self.dt = 0.0
-            return ""
+            return self._effort_problem
+        self.num_invalid += 1
+        self.is_pose_valid = False
+        if not is_recent:
+            return f"the measurement is {1e-6 * age:.3f} s old; allowed: 0 to {1e-6 * self.max_age:g} s"
         if dt < 0:
-            self.num_invalid += 1
             return f"the measurement is {-dt:.6f} s older than the previous one"
         q, v, effort = (np.array(numbers, float) for numbers in (q, v, effort))
-        self.num_invalid += 1
-        if not (
-            q.shape == v.shape == effort.shape == (self.num_joints,)
-            and is_finite([*q.tolist(), *v.tolist(), *effort.tolist()])
-        ):
-            return f"the measured positions, velocities or efforts are not {self.num_joints} finite numbers each"
+        n = len(self.joint_names)
+        if not (q.shape == v.shape == effort.shape == (n,) and is_finite([*q.tolist(), *v.tolist()])):
+            return f"the measurement is not {n} finite positions and velocities, and {n} efforts"
         if implausible_pose is not None and (problem := implausible_pose(q)):
             return problem
-        self.dt, self.q, self.v, self.effort, self._measured_utime, self.num_invalid = (
-            dt,
-            q,
-            v,
-            effort,
-            measured_utime,
-            0,
-        )
-        return ""
+        self.dt, self.q, self.v, self._measured_utime, self.is_pose_valid = dt, q, v, measured_utime, True
+        if is_finite(effort.tolist()):
+            self.effort, self.invalid_effort, self.num_invalid, self._effort_problem = effort, self._none, 0, ""
+            return ""
+        # Negated comparison, so that NaN counts as invalid.
+        self.invalid_effort = ~(np.abs(effort) < IMPLAUSIBLE / n)
+        self.effort = np.where(self.invalid_effort, self.effort, effort)
+        names = ", ".join(self.joint_names[j] for j in np.flatnonzero(self.invalid_effort))
+        self._effort_problem = f"{names}: the measured effort is not a finite number"
+        return self._effort_problem

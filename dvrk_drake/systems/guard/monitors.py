@@ -16,12 +16,34 @@ if TYPE_CHECKING:
 #: Number of periods whose median is checked.
 _PERIODS = 100
 
+#: Number of commands whose median age is checked.
+_AGES = 20
+
 #: Time constant [s] of the low-pass filter whose output is subtracted from the effort. Changes of the effort below
 #: about 1 Hz therefore do not count as oscillations.
 _MEAN_TIME = 0.2
 
 
-class PeriodMonitor:
+class _MedianMonitor:
+    """Monitor of the median of the last values."""
+
+    def __init__(self, limit: float, count: int) -> None:
+        """Creates a monitor without any value, which compares the median of `count` values with `limit`."""
+        self._limit, self._count = limit, count
+        self.restart()
+
+    def restart(self) -> None:
+        """Discards all values."""
+        # One bit per value, set for a value above the limit. An int is fast to copy, shift and count.
+        self._large = 0
+
+    def _exceeds(self, value: float) -> bool:
+        """Adds a value. Returns whether more than half of the last values exceed the limit."""
+        self._large = (self._large << 1 | (value > self._limit)) & ((1 << self._count) - 1)
+        return self._large.bit_count() > self._count // 2
+
+
+class PeriodMonitor(_MedianMonitor):
     """Monitor of the time between two steps of the guard. It checks the last period and the median of 100 periods.
 
     Attributes:
@@ -30,22 +52,42 @@ class PeriodMonitor:
 
     def __init__(self, settings: GuardSettings) -> None:
         """Creates a monitor without any period."""
-        self._slow_period, self._longest_period = settings.slow_period, settings.longest_period
-        # One bit per period, set for a slow period. An int is fast to copy, shift and count.
-        self._slow = 0
+        super().__init__(settings.slow_period, _PERIODS)
+        self._longest_period = settings.longest_period
         self.fault = ""
 
     def add(self, period: float) -> str:
         """Adds one period [s]. Returns the description of a fault, or "" without a fault."""
-        self._slow = (self._slow << 1 | (period > self._slow_period)) & ((1 << _PERIODS) - 1)
+        is_slow = self._exceeds(period)
         self.fault = ""
         if period > self._longest_period:
             self.fault = (
                 f"the guard was not stepped for {1e3 * period:.0f} ms; {1e3 * self._longest_period:g} ms are allowed"
             )
-        elif self._slow.bit_count() > _PERIODS // 2:
-            self.fault = f"the median period of the guard is above the allowed {1e3 * self._slow_period:g} ms"
+        elif is_slow:
+            self.fault = f"the median period of the guard is above the allowed {1e3 * self._limit:g} ms"
         return self.fault
+
+
+class AgeMonitor(_MedianMonitor):
+    """Monitor of the ages of commands at their arrival, e.g. during a flood of messages. It checks their median.
+
+    A command that answers an old measurement closes a control loop with a delay. The loop may be unstable although the
+    command has not expired.
+    """
+
+    def __init__(self, settings: GuardSettings) -> None:
+        """Creates a monitor without any command."""
+        super().__init__(1e6 * settings.command_age, _AGES)
+
+    def add(self, age: int) -> str:
+        """Adds the age of a command at its arrival [us]. Returns the description of a fault, or "" without a fault."""
+        if not self._exceeds(age):
+            return ""
+        return (
+            f"commands arrive too late: the median age of the last {_AGES} is above the allowed "
+            f"{1e-3 * self._limit:g} ms"
+        )
 
 
 class OscillationMonitor:
@@ -53,40 +95,52 @@ class OscillationMonitor:
 
     The alternating part of an effort is x = tau - filter(tau), with a first-order low-pass filter. A reversal is a
     change of x from above h to below -h, or from below -h to above h. The threshold h is the fraction `oscillation` of
-    the effort limit.
+    the effort limit. The monitor counts the reversals of the commands, and those of the output, which includes soft
+    walls and the speed limit.
     """
 
     def __init__(self, settings: GuardSettings, arm: Arm) -> None:
         """Creates a monitor for the joints of `arm`."""
         self._scale, self._time = 1.0 / (settings.oscillation * arm.effort_limits), settings.oscillation_time
-        self._allowed = settings.oscillation_reversals
+        self._allowed, self._names = settings.oscillation_reversals, arm.joint_names
         self._mean: Vector | None = None
 
     def restart(self) -> None:
         """Resets the counts and filters."""
         self._mean = None
 
-    def add(self, effort: Vector, dt: float) -> int | None:
-        """Adds an effort (n,) [N m, N] that is commanded for `dt` [s].
+    def add(self, command: Vector, output: Vector, dt: float) -> str:
+        """Adds efforts that act for `dt` [s].
+
+        Args:
+            command: Commanded efforts (n,) [N m, N], limited in size and rate.
+            output: The same efforts with the efforts of the soft walls and the speed limit.
+            dt: Time for which the efforts act [s].
 
         Returns:
-            Index of an oscillating joint, or None if no joint oscillates.
+            Description of the oscillation, or "" if no joint oscillates.
         """
-        scaled = self._scale * effort
+        scaled = np.concatenate((self._scale * command, self._scale * output))
         if self._mean is None:
             self._mean = scaled
             self._side = self._reversals = np.zeros_like(scaled)
             self._since = 0.0
-            return None
+            return ""
         alternating = scaled - self._mean
         self._mean = self._mean + dt / _MEAN_TIME * alternating
         self._since += dt
         large = np.abs(alternating) >= 1.0
         if not is_any(large):
-            return None
+            return ""
         side = np.where(large, np.sign(alternating), self._side)
         self._reversals = math.exp(-self._since / self._time) * self._reversals + (side * self._side < 0)
         self._since = 0.0
         self._side = side
         worst = int(self._reversals.argmax())
-        return worst if self._reversals[worst] > self._allowed else None
+        if not self._reversals[worst] > self._allowed:
+            return ""
+        joint = worst % len(self._names)
+        name = self._names[joint]
+        if self._reversals[joint] > 0.5 * self._allowed:
+            return f"{name}: the commanded effort oscillates"
+        return f"{name}: the joint moves to and fro between the command and a soft wall or the speed limit"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.systems.guard.limits import Mask, Vector, is_any
+from dvrk_drake.systems.guard.limits import ArmModel, Mask, Vector, is_any
 from dvrk_drake.systems.guard.settings import PlausibilitySettings
 
 if TYPE_CHECKING:
@@ -23,16 +23,6 @@ _POWER_ON = 0.25
 
 #: Number of encoder counts that are added to each position tolerance.
 _COUNTS = 3.0
-
-
-class ArmModel(Protocol):
-    """Protocol of the arm model that the guard uses, such as `dvrk_drake.dynamics.identified_model.ControlModel`."""
-
-    def gravity_effort(self, q: Vector) -> Vector:
-        """Returns the effort (n,) [N m, N] that compensates gravity at the pose q (n,) [rad, m]."""
-
-    def mass_matrix(self, q: Vector) -> NDArray[np.float64]:
-        """Returns the mass matrix (n, n) at the pose q (n,)."""
 
 
 @dataclass(slots=True)
@@ -69,10 +59,12 @@ class Check(Protocol):
     Attributes:
         text: Description of the error that this check detects.
         about_position: True if the position of a joint with this error is invalid.
+        uses_effort: True if the check requires the measured effort.
     """
 
     text: str
     about_position: bool
+    uses_effort: bool
 
     def begin(self, sample: Sample) -> Any:
         """Returns the initial state, given the first sample."""
@@ -84,7 +76,7 @@ class Check(Protocol):
 class PositionJump:
     """Check for impossible position steps: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
 
-    text, about_position = "the position jumps", True
+    text, about_position, uses_effort = "the position jumps", True, False
 
     def __init__(self, settings: PlausibilitySettings, tolerance: Vector, speed_limit: Vector) -> None:
         """Creates the check with tolerances (n,) [rad, m] and speed limits (n,) [rad/s, m/s] of the joints."""
@@ -111,7 +103,7 @@ class VelocityConsistency:
     - r is the allowed error of a velocity that is estimated from the time between two encoder counts.
     """
 
-    text, about_position = "position and velocity disagree", True
+    text, about_position, uses_effort = "position and velocity disagree", True, False
 
     def __init__(self, settings: PlausibilitySettings, tolerance: Vector, counts: Vector) -> None:
         """Creates the check with tolerances (n,) and encoder counts (n,) of the joints [rad, m]."""
@@ -137,7 +129,7 @@ class FrozenPosition:
     turns the encoder by at least one count, even if the joint presses against a stop or is held by a hand.
     """
 
-    text, about_position = "the position does not change although the effort does", True
+    text, about_position, uses_effort = "the position does not change although the effort does", True, True
 
     def __init__(self, settings: PlausibilitySettings, effort_limits: Vector, counts: Vector) -> None:
         """Creates the check with effort limits (n,) [N m, N] and encoder counts (n,) [rad, m] of the joints."""
@@ -171,7 +163,7 @@ class Response:
     omitted, because they are small at the allowed speeds.
     """
 
-    text, about_position = "the motion does not follow from the effort", True
+    text, about_position, uses_effort = "the motion does not follow from the effort", True, True
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm, model: ArmModel) -> None:
         """Creates the check for the joints of `arm` with the model of that arm."""
@@ -202,7 +194,7 @@ class Response:
 class SilentEffort:
     """Check that measured efforts follow commanded efforts. It detects sensors that read zero, and unpowered motors."""
 
-    text, about_position = "the measured effort does not follow the commanded effort", False
+    text, about_position, uses_effort = "the measured effort does not follow the commanded effort", False, True
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm) -> None:
         """Creates the check for the joints of `arm`."""
@@ -282,7 +274,15 @@ class Plausibility:
         """Discards the previous samples, so that the next sample is not compared with them."""
         self._before: tuple[Vector, Vector] | None = None
 
-    def check(self, dt: float, q: Vector, v: Vector, effort: Vector, commanded: Vector | None) -> str:
+    def check(
+        self,
+        dt: float,
+        q: Vector,
+        v: Vector,
+        effort: Vector,
+        commanded: Vector | None,
+        invalid_effort: Mask | None = None,
+    ) -> str:
         """Checks one measurement. All arrays must be finite, and the caller must not change them afterwards.
 
         Args:
@@ -292,6 +292,8 @@ class Plausibility:
             effort: Measured efforts (n,) [N m, N].
             commanded: Effort (n,) [N m, N] that the guard commanded in the previous step, or None if it commanded no
                 effort.
+            invalid_effort: Mask (n,) of joints without a valid effort, whose efforts are not checked. None: all efforts
+                are valid.
 
         Returns:
             Description of the detected error, or "" if the measurement is plausible.
@@ -310,7 +312,8 @@ class Plausibility:
             self._states = [state for state, _ in results]
             if any(is_any(joints) for _, joints in results):
                 for check, (_, joints) in zip(self._checks, results, strict=True):
-                    self._report(check, joints)
+                    ignored = invalid_effort if check.uses_effort else None
+                    self._report(check, joints if ignored is None else joints & ~ignored)
             self._pose_age += dt
             if self._pose_age > self._detection_time:
                 self._poses, self._pose_age = (self._poses[1], q), 0.0

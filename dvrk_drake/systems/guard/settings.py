@@ -3,10 +3,29 @@
 This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.schema_fault import number_fault, within
+
+#: Settings that protect an arm less if they are smaller. All other settings protect it less if they are larger.
+_WEAKER_IF_SMALLER = frozenset(
+    {
+        "start_time",
+        "margin",
+        "margin_fraction",
+        "effort_rise_time",
+        "traverse_time",
+        "oscillation_time",
+        "frozen_speed",
+        "response_memory",
+        "detection_time",
+    }
+)
+#: Largest accepted `expiry` [s] with `resume_automatically`: `traverse_time`, in which a joint crosses its range at the
+#: speed limit. With a larger value, an old command could move a joint to its limit again and again without an operator.
+_MAX_EXPIRY_WITHOUT_OPERATOR = 0.5
 
 
 @dataclass
@@ -73,6 +92,7 @@ class GuardSettings:
     Attributes:
         expiry: Age at which a command expires [s]. The age of a command is the age of the measurement from which it was
             computed. Another sender is accepted after the same time without an accepted command.
+        command_age: Largest allowed median of the ages of the last 20 commands at their arrival [s].
         measurement_age: Largest age of a valid measurement [s].
         start_time: Duration of the start check [s]. Commands act only if all commands were accepted during this time.
         clock_tolerance: Allowed difference between the times that elapse on the sender's clock and on the arm's clock
@@ -109,6 +129,7 @@ class GuardSettings:
     """
 
     expiry: float = field(default=0.05, metadata=within(0.002, 1.0, "s"))
+    command_age: float = field(default=0.015, metadata=within(0.002, 1.0, "s"))
     measurement_age: float = field(default=0.02, metadata=within(0.001, 0.1, "s"))
     start_time: float = field(default=0.25, metadata=within(0.05, 10.0, "s"))
     clock_tolerance: float = field(default=0.05, metadata=within(0.001, 1.0, "s"))
@@ -145,3 +166,22 @@ class GuardSettings:
             )
         if fault := number_fault(self):
             raise StationError(f"guard settings: {fault}")
+        if self.resume_automatically and self.expiry > _MAX_EXPIRY_WITHOUT_OPERATOR:
+            raise StationError(
+                f"guard settings: expiry is {self.expiry:g}; allowed with resume_automatically: up to "
+                f"{_MAX_EXPIRY_WITHOUT_OPERATOR:g} s"
+            )
+
+    def weaker_than_default(self) -> str:
+        """Returns the settings that protect the arm less than their default values, with both values, or ""."""
+        return ", ".join([*_weaker(self, GuardSettings()), *_weaker(self.plausibility, PlausibilitySettings())])
+
+
+def _weaker(settings: object, default: object) -> Iterator[str]:
+    for entry in fields(default):  # type: ignore[arg-type]
+        value, usual = getattr(settings, entry.name), getattr(default, entry.name)
+        if isinstance(usual, bool):
+            if value:
+                yield f"{entry.name} is true (default: false)"
+        elif isinstance(usual, int | float) and (value < usual if entry.name in _WEAKER_IF_SMALLER else value > usual):
+            yield f"{entry.name} is {value:g} (default: {usual:g})"

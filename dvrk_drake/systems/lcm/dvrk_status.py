@@ -106,6 +106,7 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
     status.session_id = guard.session_id
     status.guard_state, status.accepted_modes = guard.state, guard.accepted_modes
     status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.blocked_reason
+    status.weaker_settings = guard.weaker_settings
     status.command_sender_id = guard.sender_id
     status.command_sequence, status.command_utime = guard.last_command.sequence, guard.last_command.utime
     counts = guard.counts

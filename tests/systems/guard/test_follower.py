@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, N, Q
+from guard_bench import ARM, LIMIT, Inert, N, Q
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -11,12 +11,13 @@ from dvrk_drake.systems.guard.limits import GuardLimits
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 LIMITS = GuardLimits(ARM, GuardSettings(following_time=0.1))
+SAFE_GAINS = STIFFNESS, DAMPING = LIMITS.safe_gains(ARM, Inert())
 E, STILL = np.eye(N), np.zeros(N)
 RANGE = ARM.position_upper - ARM.position_lower
 
 
 def at(q=Q):
-    follower = Follower(LIMITS)
+    follower = Follower(LIMITS, SAFE_GAINS)
     follower.target = q.copy()
     return follower
 
@@ -33,7 +34,7 @@ def test_off_and_hold_output_zero_velocity_and_effort():
     np.testing.assert_array_equal(follower.hold(1e-3).position, Q)
     np.testing.assert_array_equal(follower.hold(1e-3).velocity, STILL)
     np.testing.assert_array_equal(follower.hold(1e-3).effort, STILL)
-    assert np.all(Follower(LIMITS).hold(1e-3).position == 0.0)
+    assert np.all(Follower(LIMITS, SAFE_GAINS).hold(1e-3).position == 0.0)
 
 
 @pytest.mark.parametrize("joint", range(N))
@@ -152,13 +153,13 @@ def test_fault_holds_valid_joints_with_bounded_effort(side):
     bound, valid = LIMITS.fault_effort, np.ones(N, bool)
     for gravity, most in ((STILL, bound), (0.5 * LIMIT, 0.5 * LIMIT + bound / 3), (0.95 * LIMIT, LIMIT)):
         for away, expected in ((9.0, side * most), (-9.0, -side * bound)):
-            output = at().hold_valid_joints(Q - side * away, STILL, valid, side * gravity)
+            output = at().hold_valid_joints(Q - side * 10 * away, STILL, valid, side * gravity, 1.0)
             np.testing.assert_allclose(output.effort, expected, atol=1e-12)
     assert output.control_mode == Command.EFFORT
     # Below the bounds, the efforts follow from the gains of the arm.
-    gravity, v = 0.02 * side * LIMIT, side * 0.01 * LIMITS.fault_effort / LIMITS.kd
-    q = Q - 0.02 * side * LIMITS.fault_effort / LIMITS.kp
-    output = at().hold_valid_joints(q, v, valid, gravity)
+    gravity, v = 0.02 * side * LIMIT, side * 0.01 * LIMITS.fault_effort / DAMPING
+    q = Q - 0.02 * side * LIMITS.fault_effort / STIFFNESS
+    output = at().hold_valid_joints(q, v, valid, gravity, 1.0)
     np.testing.assert_allclose(output.effort, gravity + 0.01 * side * LIMITS.fault_effort, atol=1e-12)
     np.testing.assert_array_equal(output.joint_flags, 0)
     np.testing.assert_array_equal(output.position, q)
@@ -166,9 +167,19 @@ def test_fault_holds_valid_joints_with_bounded_effort(side):
 
 def test_fault_gives_invalid_joints_gravity_effort():
     valid = np.arange(N) != 3
-    output = at().hold_valid_joints(Q - 9.0, STILL + 9.0, valid, 0.1 * LIMIT)
+    output = at().hold_valid_joints(Q - 9.0, STILL + 9.0, valid, 0.1 * LIMIT, 1.0)
     assert output.effort[3] == pytest.approx(0.1 * LIMIT[3])
     np.testing.assert_array_equal(output.joint_flags, np.where(valid, 0, Status.FLAG_IMPLAUSIBLE))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_safe_state_starts_from_present_effort_at_limited_rate(side):
+    follower, step = at(), LIMIT * 1e-3 / GuardSettings().effort_rise_time
+    follower.begin_safe_state(9.0 * side * LIMIT)
+    for k in (1, 2):
+        output = follower.hold_valid_joints(Q, STILL, np.ones(N, bool), STILL, 1e-3)
+        np.testing.assert_allclose(output.effort, side * (LIMIT - k * step), atol=1e-12)
+        output.effort[:] = 9.0
 
 
 # Efforts
@@ -189,7 +200,7 @@ def test_efforts_start_at_measured_ones_at_limited_rate():
 
 
 def test_effort_start_is_clamped_to_effort_fraction():
-    follower = Follower(GuardLimits(ARM, GuardSettings(effort_fraction=0.2)))
+    follower = Follower(GuardLimits(ARM, GuardSettings(effort_fraction=0.2)), SAFE_GAINS)
     follower.begin_effort(0.25 * LIMIT, Q)
     np.testing.assert_allclose(follower.follow_effort(LIMIT, Q, STILL, 1e-3, 0.0).effort, 0.2 * LIMIT, atol=1e-12)
     follower.begin_effort(-0.25 * LIMIT, Q)

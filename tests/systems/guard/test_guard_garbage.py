@@ -77,7 +77,7 @@ def test_fuzzed_commands_keep_output_limited(seed):
         assert np.all(np.abs(output.velocity) <= limits.speed)
         expected = {
             Status.STATE_OFF: {Command.OFF},
-            Status.STATE_FAULT: {Command.OFF, Command.HOLD},
+            Status.STATE_FAULT: {Command.OFF, Command.HOLD, Command.EFFORT},
             Status.STATE_POSITION: {Command.POSITION},
             Status.STATE_EFFORT: {Command.EFFORT},
         }

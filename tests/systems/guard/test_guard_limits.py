@@ -84,7 +84,7 @@ def test_feedforward_velocity_passes_with_unlimited_position():
     bench = Bench().started(Command.POSITION)
     output = bench.run(Command.POSITION, 1, velocity=[0.01] * N)
     np.testing.assert_array_equal(output.velocity, np.full(N, 0.01))
-    output = bench.run(Command.POSITION, 1, velocity=[100.0] * N)
+    output = bench.run(Command.POSITION, 400, velocity=[100.0] * N)  # the change of the velocity is limited
     # Shoulder and elbow together would reach the coupled limit, see test_guard_attacks.py.
     free = [0, 3, 4, 5, 6]
     np.testing.assert_array_equal(output.velocity[free], bench.guard.limits.speed[free])

@@ -1,15 +1,20 @@
 """Unit tests of measurements, command streams and settings at the edges of the accepted ranges."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from guard_bench import Bench, N
 
+from dvrk_drake.cli.support import warn_of_weaker_settings
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.processes.live_status import LiveStatusMaker
 from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, content_refusal, is_finite
 from dvrk_drake.systems.guard.measurement import Measurement
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
+from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
 # Measurements
 
@@ -19,7 +24,7 @@ MS, NOW = 1000, 10**9
 
 def measurement():
     """Returns a valid measurement of three joints that is 25 ms old."""
-    measured = Measurement(3, 20_000)
+    measured = Measurement(("a", "b", "c"), 20_000)
     measured.advance(NOW - 25 * MS)
     assert measured.store(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
     assert measured.dt == np.inf
@@ -28,7 +33,7 @@ def measurement():
 
 
 def test_clock_returns_elapsed_time():
-    measured = Measurement(3, 20_000)
+    measured = Measurement(("a", "b", "c"), 20_000)
     assert measured.utime is None and measured.q is None
     assert measured.advance(5_000_000) == (0.0, "")
     assert measured.advance(5_002_500) == (pytest.approx(2.5e-3), "")
@@ -39,7 +44,7 @@ def test_clock_returns_elapsed_time():
 
 
 def test_stopped_clock_is_reported():
-    measured = Measurement(3, 20_000)
+    measured = Measurement(("a", "b", "c"), 20_000)
     for k in range(25):
         assert (measured.advance(1000)[1] == "the arm's clock stands still") == (k >= 10)
     for k in range(12):  # after an advance of the clock, the count restarts
@@ -57,19 +62,39 @@ def test_measurement_age_is_checked(age, good):
     assert good or "allowed: 0 to 0.02 s" in problem
 
 
-@pytest.mark.parametrize("which", range(3))
-@pytest.mark.parametrize("bad", [np.zeros(2), np.zeros(4), np.zeros((1, 3)), [0, np.nan, 0], [1e6, 0, 0], [0, 0, -1e6]])
+BAD_SIZES = [np.zeros(2), np.zeros(4), np.zeros((1, 3))]
+BAD_NUMBERS = [[0, np.nan, 0], [1e6, 0, 0], [0, 0, -1e6]]
+
+
+@pytest.mark.parametrize(("which", "bad"), [*product(range(3), BAD_SIZES), *product(range(2), BAD_NUMBERS)], ids=str)
 def test_measurement_size_and_numbers_are_checked(which, bad):
     measured = measurement()
     vectors = [GOOD, GOOD, GOOD]
     vectors[which] = bad
     for count in (1, 2):
-        text = "the measured positions, velocities or efforts are not 3 finite numbers each"
+        text = "the measurement is not 3 finite positions and velocities, and 3 efforts"
         assert measured.store(NOW, *vectors) == text
-        assert measured.num_invalid == count
+        assert (measured.num_invalid, measured.is_pose_valid) == (count, False)
     np.testing.assert_array_equal(measured.q, GOOD)
     assert measured.store(NOW, GOOD, GOOD, GOOD) == ""
     assert measured.num_invalid == 0
+
+
+@pytest.mark.parametrize(("bad", "joint"), [(np.nan, 0), (-np.inf, 1), (1e6, 2)])
+def test_invalid_effort_is_replaced_by_last_valid_one(bad, joint):
+    measured, effort = measurement(), GOOD + 3.0
+    effort[joint] = bad
+    text = f"{'abc'[joint]}: the measured effort is not a finite number"
+    # A repeated measurement does not end the problem.
+    for q in (GOOD + 1, GOOD + 9):
+        assert measured.store(NOW, q, GOOD + 2, effort) == text
+    assert (measured.num_invalid, measured.is_pose_valid) == (1, True)
+    np.testing.assert_array_equal(measured.q, GOOD + 1)
+    np.testing.assert_array_equal(measured.invalid_effort, np.arange(3) == joint)
+    np.testing.assert_array_equal(measured.effort, np.where(np.arange(3) == joint, GOOD, GOOD + 3))
+    measured.advance(NOW + MS)
+    assert measured.store(NOW + MS, GOOD, GOOD, GOOD) == ""
+    assert measured.num_invalid == 0 and not measured.invalid_effort.any()
 
 
 def test_interval_is_between_valid_measurements():
@@ -264,6 +289,7 @@ def test_reset_requires_hold(mode, reset):
 #: Defaults and bounds of all settings. A change of one of them is a decision about safety, which this test shows.
 SETTINGS = {
     "expiry": (0.002, 0.05, 1.0),
+    "command_age": (0.002, 0.015, 1.0),
     "measurement_age": (0.001, 0.02, 0.1),
     "start_time": (0.05, 0.25, 10.0),
     "clock_tolerance": (0.001, 0.05, 1.0),
@@ -341,3 +367,51 @@ def test_resume_requires_operator_by_default(value):
     assert GuardSettings().resume_automatically is False
     with pytest.raises(StationError, match="guard settings: resume_automatically must be true or false; got"):
         GuardSettings(resume_automatically=value)
+
+
+def test_settings_weaker_than_defaults_are_named():
+    assert GuardSettings().weaker_than_default() == ""
+    stronger = {name: low if name not in WEAKER_IF_SMALLER else high for name, (low, _, high) in SETTINGS.items()}
+    checks = {n: low if n not in WEAKER_IF_SMALLER else high for n, (low, _, high) in PLAUSIBILITY_SETTINGS.items()}
+    assert GuardSettings(**stronger, plausibility=PlausibilitySettings(**checks)).weaker_than_default() == ""
+    for name, (low, default, high) in SETTINGS.items():
+        value = low if name in WEAKER_IF_SMALLER else high
+        text = f"{name} is {value:g} (default: {default:g})" if value != default else ""
+        assert GuardSettings(**{name: value}).weaker_than_default() == text
+    for name, (low, default, high) in PLAUSIBILITY_SETTINGS.items():
+        value = low if name in WEAKER_IF_SMALLER else high
+        settings = GuardSettings(resume_automatically=True, plausibility=PlausibilitySettings(**{name: value}))
+        both = f"resume_automatically is true (default: false), {name} is {value:g} (default: {default:g})"
+        assert settings.weaker_than_default() == both
+
+
+WEAKER_IF_SMALLER = [
+    "start_time",
+    "margin",
+    "margin_fraction",
+    "effort_rise_time",
+    "traverse_time",
+    "oscillation_time",
+    "frozen_speed",
+    "response_memory",
+    "detection_time",
+]
+
+
+def test_late_commands_do_not_act_again_without_an_operator():
+    GuardSettings(expiry=0.5, resume_automatically=True)
+    with pytest.raises(StationError, match=r"expiry is 0\.51; allowed with resume_automatically: up to 0\.5 s"):
+        GuardSettings(expiry=0.51, resume_automatically=True)
+
+
+def test_weaker_settings_are_in_the_status_and_printed(capsys):
+    settings = GuardSettings(expiry=0.1)
+    status = Status()
+    fill_in_guard(status, Bench(settings=settings).guard)
+    assert status.weaker_settings == "expiry is 0.1 (default: 0.05)"
+    live = LiveStatusMaker(5, status).make(status, 1.0, 0)
+    assert live.problem == "guard settings weaker than the defaults: expiry is 0.1 (default: 0.05)"
+    for weaker in (settings, GuardSettings()):
+        warn_of_weaker_settings(weaker)
+    text = "the guard protects the arm less than with its default settings: expiry is 0.1 (default: 0.05)"
+    assert capsys.readouterr().err == f"dvrk-drake: warning: {text}\n"

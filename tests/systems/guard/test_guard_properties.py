@@ -63,7 +63,9 @@ def configurations(draw):
     arm = draw(st.sampled_from(ARMS))
     model = draw(st.sampled_from([*[Weightless()] * 6, *(Broken(x) for x in (np.nan, np.inf, 1e300, 10.0))]))
     plausibility = PlausibilitySettings(**draw(PLAUSIBILITY_SETTINGS))
-    chosen = GuardSettings(**draw(GUARD_SETTINGS), plausibility=plausibility, resume_automatically=draw(st.booleans()))
+    numbers = draw(GUARD_SETTINGS)
+    resumes = numbers.get("expiry", 0.0) <= 0.5 and draw(st.booleans())
+    chosen = GuardSettings(**numbers, plausibility=plausibility, resume_automatically=resumes)
     return arm, CommandGuard(arm, SESSION, model, chosen)
 
 

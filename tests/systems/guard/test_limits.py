@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, N, Q
 
+from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import CoupledLimit
-from dvrk_drake.systems.guard.limits import GuardLimits
+from dvrk_drake.systems.guard.follower import Follower
+from dvrk_drake.systems.guard.limits import SAFE_DELAY, GuardLimits
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 A, LOWER, UPPER = ARM.limit_matrix()
@@ -321,24 +324,36 @@ def test_conflicting_coupled_limits_stop_target():
 @pytest.mark.parametrize("joint", [0, 3, 4, 5, 6])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_feedforward_velocity_stops_at_limit(joint, side):
-    none = np.zeros(N, np.int8)
-    fast = side * 99.0 * E[joint]
-    np.testing.assert_allclose(LIMITS.limit_velocity(fast, Q, none), side * LIMITS.speed * E[joint], atol=1e-12)
-    slow = side * 0.5 * LIMITS.speed * E[joint]
-    np.testing.assert_array_equal(LIMITS.limit_velocity(slow, Q, none), slow)
+    fast, slow = side * LIMITS.speed * E[joint], side * 0.5 * LIMITS.speed * E[joint]
+    for velocity in (fast, slow):
+        np.testing.assert_array_equal(LIMITS.limit_velocity(velocity, Q), velocity)
     bound = (UPPER if side > 0 else LOWER)[joint]
     lead = KD[joint] / KP[joint] * LIMITS.speed[joint]
     for share in (0.5, 0.25, 0.0):
         target = Q + (bound - side * share * lead - Q[joint]) * E[joint]
-        velocity = LIMITS.limit_velocity(fast, target, none)
+        velocity = LIMITS.limit_velocity(fast, target)
         np.testing.assert_allclose(velocity, share * side * LIMITS.speed * E[joint], atol=1e-9)
-        np.testing.assert_array_equal(LIMITS.limit_velocity(-slow, target, none), -slow)  # inward
+        np.testing.assert_array_equal(LIMITS.limit_velocity(-slow, target), -slow)  # inward
 
 
 def test_no_feedforward_velocity_with_limited_position():
     flags = np.array([0, 1, 2, 4, 8, 16, 0], np.int8)
     velocity = 0.1 * LIMITS.speed
-    np.testing.assert_array_equal(LIMITS.limit_velocity(velocity, Q, flags), np.where(flags == 0, velocity, 0.0))
+    followed = LIMITS.follow_velocity(velocity, velocity, flags, 1.0)
+    np.testing.assert_array_equal(followed, np.where(flags == 0, velocity, 0.0))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_feedforward_velocity_is_limited_in_size_and_rate(side):
+    """Kd times the velocity is an effort, and changes at most as fast as a commanded effort."""
+    none, step = np.zeros(N, np.int8), LIMIT / KD * 1e-3 / GuardSettings().effort_rise_time
+    velocity = -side * LIMITS.speed
+    for _ in range(3):
+        last, velocity = velocity, LIMITS.follow_velocity(side * 99.0 * np.ones(N), velocity, none, 1e-3)
+        np.testing.assert_allclose(side * (velocity - last), np.minimum(step, LIMITS.speed - side * last), atol=1e-12)
+    np.testing.assert_array_equal(
+        LIMITS.follow_velocity(side * 99.0 * np.ones(N), velocity, none, 99.0), side * LIMITS.speed
+    )
 
 
 @pytest.mark.parametrize("joint", range(N))
@@ -361,3 +376,54 @@ def test_dry_friction_comes_from_arm_file():
     # The elbow's actuator turns with the shoulder as well, and the platform's with the elbow, by 0.6697.
     assert friction[1] == pytest.approx(0.039 + 0.028 + 0.064 + 0.026, abs=1e-12)
     assert friction[2] == pytest.approx(0.064 + 0.026 + 0.045 + 0.6697 * (0.019 + 0.013), abs=1e-12)
+
+
+# Gains of the safe state
+
+
+@pytest.fixture(scope="module", params=["mtml", pytest.param("mtmr", marks=pytest.mark.slow), "psm"])
+def safe_arm(request):
+    """Returns an arm, its model, its limits, and the stiffness and damping of its safe state."""
+    arm = load_arm(request.param)
+    model, limits = ControlModel(IdentifiedModel.from_arm(arm)), GuardLimits(arm, GuardSettings())
+    return arm, model, limits, limits.safe_gains(arm, model)
+
+
+@pytest.mark.parametrize(("delay", "least"), [(0.0, 30.0), (SAFE_DELAY, 30.0), (2 * SAFE_DELAY, 0.0)])
+def test_safe_gains_have_phase_margin_at_every_pose(safe_arm, delay, least):
+    """The loop is L = m (s + k) / s^2 exp(-s T) for each eigenvalue m of M^-1 D."""
+    arm, model, _, (stiffness, damping) = safe_arm
+    k = stiffness / damping
+    np.testing.assert_allclose(k, k[0], rtol=1e-12, atol=0)
+    poses = arm.sample_poses(100, np.random.default_rng(1))
+    m = np.array([np.linalg.eigvals(np.linalg.solve(model.mass_matrix(q), np.diag(damping))).real for q in poses])
+    assert m.min() > 0
+    crossover = np.sqrt(0.5 * (m**2 + m * np.sqrt(m**2 + 4 * k[0] ** 2)))
+    margin = np.degrees(np.arctan2(crossover, k[0]) - crossover * delay)
+    assert margin.min() > least
+    # With the gains of the position controller, the loop is unstable at the largest delay.
+    assert (m * np.array(arm.gains.kd)[0] / damping[0]).max() * SAFE_DELAY > 0.5 * np.pi
+
+
+@pytest.mark.parametrize("delay", [*(pytest.param(ms, marks=pytest.mark.slow) for ms in (0, 10, 20)), 30])
+@pytest.mark.parametrize("joint", range(7))
+def test_safe_state_stops_every_joint_with_late_measurements(safe_arm, joint, delay):
+    """A joint comes to rest, with the mass matrix of the arm, without friction.
+
+    The measurement is late by the delay, and by 7 ms for filters and messages.
+    """
+    arm, model, limits, gains = safe_arm
+    q0 = 0.5 * (arm.position_lower + arm.position_upper)
+    M = model.mass_matrix(q0)
+    acceleration = np.linalg.inv(M)
+    follower, ones, zero = Follower(limits, gains), np.ones(7, bool), np.zeros(7)
+    follower.latch(q0, zero)
+    q, v = q0.copy(), 0.1 * limits.speed * np.eye(7)[joint]
+    history = [(q, v)] * (delay + 7)
+    energy = 0.5 * v @ M @ v
+    for _ in range(3500):
+        history.append((q, v))
+        effort = follower.hold_valid_joints(*history[-delay - 7], ones, zero, 1e-3).effort
+        v = v + 1e-3 * acceleration @ effort
+        q = q + 1e-3 * v
+    assert 0.5 * (v @ M @ v + (q - q0) @ (gains[0] * (q - q0))) < 0.05 * energy  # the slowest pole is at 0.6 1/s

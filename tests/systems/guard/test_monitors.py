@@ -87,9 +87,9 @@ def test_period_is_measured_by_wall_clock():
 def reversals(monitor, wave, seconds=6.0):
     """Returns the time and joint of the detected oscillation of the effort wave(t) (n,), or (None, None)."""
     for k in range(round(1e3 * seconds)):
-        joint = monitor.add(wave(1e-3 * k), 1e-3)
-        if joint is not None:
-            return 1e-3 * k, joint
+        effort = wave(1e-3 * k)
+        if text := monitor.add(effort, effort, 1e-3):
+            return 1e-3 * k, ARM.joint_names.index(text.partition(":")[0])
     return None, None
 
 
@@ -123,8 +123,9 @@ def test_reversals_decay_and_restart_resets_them(half_period, restart, found):
     for k in range(20):
         if k % restart == 0:
             monitor.restart()
-        joints += [monitor.add((-1.0) ** k * LIMIT, 1e-3) for _ in range(round(1e3 * half_period))]
-    assert any(joint is not None for joint in joints) == found
+        effort = (-1.0) ** k * LIMIT
+        joints += [monitor.add(effort, effort, 1e-3) for _ in range(round(1e3 * half_period))]
+    assert any(joints) == found
 
 
 def test_guard_accepts_slow_sign_changes():
@@ -145,6 +146,63 @@ def test_guard_holds_on_oscillating_commands():
         if bench.guard.state == Status.STATE_FAULT:
             break
     assert k < 500
-    assert (bench.guard.fault_code, bench.output.control_mode) == (Status.FAULT_OSCILLATION, Command.HOLD)
+    assert (bench.guard.fault_code, bench.output.control_mode) == (Status.FAULT_OSCILLATION, Command.EFFORT)
     assert bench.guard.fault_text == "elbow_pitch: the commanded effort oscillates"
     np.testing.assert_array_equal(bench.output.position, Q)
+
+
+def test_constant_full_effort_is_no_oscillating_command():
+    """The joint moves between the command and the wall. The command itself is constant."""
+    bench, joint = Bench().started(), 5
+    upper = ARM.position_upper[joint]
+    for k in range(3000):
+        bench.send(Command.EFFORT, effort=list(bench.effort * (np.arange(N) != joint) + LIMIT * np.eye(N)[joint]))
+        bench.q[joint] = upper - 0.05 * (1 + np.sin(2 * np.pi * 5 * 1e-3 * k))
+        bench.tick()
+        if bench.guard.state == Status.STATE_FAULT:
+            break
+    assert bench.guard.fault_code == Status.FAULT_OSCILLATION
+    text = "wrist_yaw: the joint moves to and fro between the command and a soft wall or the speed limit"
+    assert bench.guard.fault_text == text
+
+
+LATE = "commands arrive too late: the median age of the last 20 is above the allowed 15 ms"
+
+
+@pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
+@pytest.mark.parametrize(("age", "late"), [(15, False), (16, True), (49, True)])
+def test_late_commands_lead_to_hold(mode, age, late):
+    """A flood of messages delays commands. They have not expired, but the control loop is unstable."""
+    bench = Bench().started(mode)
+    state = bench.guard.state
+    for k in range(40):
+        assert bench.send(mode, status_utime=bench.utime - age * MS) in (Status.REFUSAL_NONE, Status.REFUSAL_RESUME)
+        bench.tick()
+        held = late and k >= 10
+        assert (bench.guard.state, bench.guard.hold_reason) == ((Status.STATE_HOLD, LATE) if held else (state, ""))
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    assert bench.started(mode).guard.hold_reason == ""
+
+
+def test_few_late_commands_act():
+    bench = Bench().started()
+    for k in range(400):
+        assert bench.send(status_utime=bench.utime - 40 * MS * (k % 20 < 10)) == Status.REFUSAL_NONE
+        bench.tick()
+    assert bench.guard.state == Status.STATE_EFFORT
+
+
+def test_age_by_the_wall_clock_counts():
+    wall = [10**9]
+    bench = Bench(wall_clock=lambda: wall[0])
+    for k in range(300):
+        wall[0] += MS
+        command = bench.command()
+        if k > 270:
+            wall[0] += 16 * MS
+        if bench.guard.receive(command, bench.utime) != Status.REFUSAL_NONE:
+            break
+        bench.tick()
+        wall[0] += 0
+    assert bench.guard.hold_reason == LATE

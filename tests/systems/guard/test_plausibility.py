@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, Bench, Heavy, N, Q, Weightless
+from guard_bench import ARM, LIMIT, Bench, Heavy, Inert, N, Q, Weightless
 
 from dvrk_drake.analysis.signals.true_time import true_time
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
@@ -302,7 +302,7 @@ def test_prismatic_joints_use_a_tenth_of_the_tolerance():
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
 @pytest.mark.parametrize("joint", JOINTS)
 def test_invalid_joint_gets_gravity_effort_others_are_held(mode, joint):
-    bench = Bench(model=Heavy(), checks=True).at_rest()
+    bench = Bench(model=Inert(), checks=True).at_rest()
     bench.run(mode, 300)
     bench.q = Q + unit(joint, 0.3)
     output = bench.tick()
@@ -315,13 +315,14 @@ def test_invalid_joint_gets_gravity_effort_others_are_held(mode, joint):
     gravity = Heavy().gravity_effort(Q)
     np.testing.assert_allclose(output.effort, gravity, rtol=0, atol=1e-12)
     # All other joints are regulated within 0.3 of their effort limits. The faulty joint has no feedback.
-    kp, others = np.array(ARM.gains.kp), np.arange(N) != joint
+    stiffness, _ = bench.guard.limits.safe_gains(ARM, Inert())
+    others = np.arange(N) != joint
     for away in (1e-3, -1e-3, 9e-3):
         bench.q = Q + unit(joint, 0.3) + away
         effort = bench.tick().effort
         assert effort[joint] == pytest.approx(gravity[joint], abs=1e-12)
         moved = Heavy().gravity_effort(np.where(others, bench.q, Q))
-        expected = np.clip(moved - kp * away, -0.3 * LIMIT, 0.3 * LIMIT)
+        expected = np.clip(moved - stiffness * away, -0.3 * LIMIT, 0.3 * LIMIT)
         np.testing.assert_allclose(effort[others], expected[others], rtol=0, atol=1e-9)
 
 

@@ -286,7 +286,7 @@ def test_jaw_is_commanded_again_after_a_change_of_the_mode(monkeypatch):
 
 def test_implausible_joints_lead_to_few_hold_messages(bench):
     bench.started()
-    bench.problem = "/MTML/measured_js: a position, velocity or effort is not finite"
+    bench.problem = "/MTML/measured_js: a position or velocity is not finite"
     bench.run(30).clear()
     bench.run(1000)
     assert bench.status.guard_state == Status.STATE_FAULT
@@ -318,7 +318,7 @@ def test_jump_of_the_stamp_ends_efforts_with_one_line(bench):
     bench.run(2)
     assert bench.lines.count("/MTML/measured_js: the time stamp changed by 3600.001 s since the previous message") == 1
     assert bench.status.guard_state == Status.STATE_HOLD
-    assert bench.status.fault_text == "the measured positions, velocities or efforts are not 7 finite numbers each"
+    assert bench.status.fault_text == "the measurement is not 7 finite positions and velocities, and 7 efforts"
     bench.tick(150)
     bench.reset()
     assert allows_efforts(bench)

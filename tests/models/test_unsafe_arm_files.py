@@ -1,0 +1,108 @@
+"""Comparison of arm files with the arm of this package that has the same name."""
+
+import pytest
+
+from dvrk_drake.errors import StationError
+from dvrk_drake.models.arm_files import known_arms, load_arm, unsafe_difference
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, local_path
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+
+KNOWN = load_arm("mtml")
+ARM = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text()
+MECHANISM = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
+SDF = local_path("package://dvrk_drake/sdf/mtm.sdf")
+
+
+def mtml(folder, *, arm=(), mechanism=(), sdf=(), name="MTML"):
+    """Returns an MTML whose files contain replacements (old, new) of texts."""
+    texts = {"arm": ARM, "mechanism": MECHANISM, "sdf": SDF.read_text()}
+    for key, replacements in (("arm", arm), ("mechanism", mechanism), ("sdf", sdf)):
+        for old, new in replacements:
+            assert old in texts[key]
+            texts[key] = texts[key].replace(old, new, 1)
+    arm_text = texts["arm"].replace("mechanism: mtm", "mechanism: mechanism.yaml")
+    arm_text = arm_text.replace("name: MTML", f"name: {name}")
+    arm_text = arm_text.replace("package://dvrk_drake/sdf/mtm.sdf", str(folder / "mtm.sdf"))
+    (folder / "arm.yaml").write_text(arm_text)
+    (folder / "mechanism.yaml").write_text(texts["mechanism"].replace("package://dvrk_drake/sdf/mtm.sdf", "mtm.sdf"))
+    (folder / "mtm.sdf").write_text(texts["sdf"])
+    return load_arm(folder / "arm.yaml")
+
+
+HINT = "as for the arm MTML of dvrk_drake; correct the file, or give the arm another name"
+KP, KD = "kp: [60.0, 90.0, 40.0,", "kd: [8.0, 12.0,"
+YAW = "wrist_yaw: [-0.785398, 0.785398]"
+PLATFORM = "the coefficient of joint elbow_pitch in the transmission of wrist_platform is {}; allowed: 0.6697 +- 0.25, "
+ELBOW = "  elbow_pitch: {{shoulder_pitch: {}, elbow_pitch: 1.0}}\n"
+PARALLELOGRAM = MECHANISM[MECHANISM.index("coupled_limits:") : MECHANISM.index("console_gravity")]
+#: Name: (changed texts of the mechanism file or the arm file, message).
+DANGERS = {
+    "gain": ([(KP, "kp: [600.0, 90.0, 40.0,")], "gain kp of outer_yaw is 600; allowed: 15..240, "),
+    "no damping": ([(KD, "kd: [8.0, 0.0,")], "gain kd of shoulder_pitch is 0; allowed: 3..48, "),
+    "integral gain": ([("ki: [70.0,", "ki: [7000.0,")], "gain ki of outer_yaw is 7000; allowed: 0..280, "),
+    "inverted": ([("{elbow_pitch: 0.6697,", "{elbow_pitch: -0.6697,")], PLATFORM.format(-0.6697)),
+    "large coupling": (
+        [(ELBOW.format(1.0), ELBOW.format(1000.0))],
+        "the coefficient of joint shoulder_pitch in the transmission of elbow_pitch is 1000; allowed: 1 +- 0.25, ",
+    ),
+    "deleted coupling": (
+        [("  wrist_platform: {elbow_pitch: 0.6697, wrist_platform: 1.0}\n", "")],
+        PLATFORM.format(0),
+    ),
+    "wide limits": (
+        [(YAW, "wrist_yaw: [-7.85398, 7.85398]")],
+        "the position limits of wrist_yaw are -7.854..7.854; allowed: inside -1.178..1.178, ",
+    ),
+    "deleted coupled limit": (
+        [(PARALLELOGRAM, "")],
+        "the coupled limit parallelogram is missing; allowed: inside -0.5825..0.9325, ",
+    ),
+}
+
+
+@pytest.mark.parametrize("danger", DANGERS)
+def test_dangerous_arm_file_is_refused_by_the_guard(danger, tmp_path):
+    changes, message = DANGERS[danger]
+    message += HINT
+    changes = {"arm" if danger == "wide limits" else "mechanism": changes}
+    arm = mtml(tmp_path, **changes)
+    assert unsafe_difference(arm) == message
+    with pytest.raises(StationError) as error:
+        CommandGuard(arm, 1, None)
+    assert str(error.value) == f"{arm.source}: {message}"
+    assert unsafe_difference(mtml(tmp_path, **changes, name="OURS")) == ""
+
+
+def test_large_effort_limit_is_refused(tmp_path):
+    changes = [("<effort>1.86083</effort>", "<effort>1860.83</effort>")]
+    message = f"the effort limit of outer_yaw is 1860.83; allowed: up to 2.79124, {HINT}"
+    assert unsafe_difference(mtml(tmp_path, sdf=changes)) == message
+
+
+def test_displaced_link_is_refused(tmp_path):
+    text = SDF.read_text()
+    begin = text.index('<link name="wrist_yaw_link"')
+    start, end = text.index("<pose", begin), text.index("</pose>", begin)
+    head, _, numbers = text[start:end].partition(">")
+    x, *others = numbers.split()
+    moved = f"{head}>{float(x) - 2.79} {' '.join(others)}"
+    message = unsafe_difference(mtml(tmp_path, sdf=[(text[begin:end], text[begin:start] + moved)]))
+    assert "is displaced by 2.79 m at the pose in the middle of the position limits; allowed: up to 0.02 m" in message
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"mechanism": [(KP, "kp: [200.0, 90.0, 40.0,"), ("ki: [70.0,", "ki: [0.0,")]},
+        {"arm": [(YAW, "wrist_yaw: [-1.0, 1.1]")]},
+        {"mechanism": [("{elbow_pitch: 0.6697,", "{elbow_pitch: 0.70,"), ("upper: 0.68", "upper: 0.8")]},
+    ],
+)
+def test_usual_differences_are_accepted(changes, tmp_path):
+    assert unsafe_difference(mtml(tmp_path, **changes)) == ""
+
+
+@pytest.mark.parametrize("name", known_arms())
+def test_arms_of_the_package_are_accepted(name):
+    assert unsafe_difference(load_arm(name)) == ""
