@@ -251,20 +251,26 @@ class CrtkBridge:
             # The arm measures its joints itself, so it can still hold its pose. After a measurement fault, the guard
             # commands efforts, which are not safe for example with the gravity compensation of the dVRK.
             if now >= self._last_sent + _REPEAT:
-                client.hold()
+                self._hold()
                 self._last_sent = now
         elif is_effort:
             self._send_jaw("servo_jf", output.effort)
             client.servo_jf(output.effort)
-            if self._clock.now() >= now + _LATE:
+            if (delay := self._clock.now() - now) >= _LATE:
                 # The process was suspended after the check above, so this effort is old.
-                client.hold()
+                self._hold()
+                self.guard.block(f"the bridge was suspended for {1e-3 * delay:.0f} ms while it published an effort")
         elif output.control_mode != lcmt_dvrk_command.OFF:
             self._send_jaw("servo_jp", output.position)
             client.servo_jp(output.position, output.velocity)
         elif self.guard.state == lcmt_dvrk_status.STATE_OFF and now >= self._last_sent + _REPEAT:
             client.state_command("disable")
             self._last_sent = now
+
+    def _hold(self) -> None:
+        """Publishes `hold`, after which the separate joint needs a new command."""
+        self._client.hold()
+        self._jaw_sent = ("", 0.0)
 
     def _send_jaw(self, name: str, values: NDArray[np.float64]) -> None:
         """Commands the separate joint, if the command has changed. Call this method before the command to the arm."""
@@ -301,6 +307,7 @@ class CrtkBridge:
         if self._deadman is not None and (reason := self._deadman.problem()):
             return reason
         if client.take_other_hold():
+            self._jaw_sent = ("", 0.0)  # `hold` also acts on the separate joint
             return "another process published hold, e.g. the deadman process"
         if self._rate_problem:
             return self._rate_problem

@@ -365,18 +365,50 @@ def test_key_signs_statuses_and_verifies_commands(monkeypatch, tmp_path):
     assert bench.tick().status.num_accepted == 10
 
 
-def test_hold_follows_an_effort_that_was_published_late(bench, monkeypatch):
-    bench.started()
+@pytest.mark.parametrize("delay", [21, 35, 100])
+def test_late_effort_ends_in_hold_of_arm_and_jaw(monkeypatch, delay):
+    bench = CrtkBench(monkeypatch, "psm").started()
     servo_jf = bench.client.servo_jf
 
     def suspended(effort):
-        bench.now += 100_000_000
+        bench.now += delay * MS
         servo_jf(effort)
 
     monkeypatch.setattr(bench.client, "servo_jf", suspended)
     bench.clear()
     bench.run(1)
-    assert bench.names()[:2] == ["servo_jf", "hold"]
+    monkeypatch.setattr(bench.client, "servo_jf", servo_jf)
+    bench.run(400)
+    # `hold` ended the effort control of the arm and of its jaw, so efforts must not continue without an operator.
+    assert bench.status.guard_state == Status.STATE_HOLD
+    assert bench.status.fault_text == f"the bridge was suspended for {delay} ms while it published an effort"
+    assert bench.names()[:4] == ["servo_jf", "hold", "separate/servo_jp", "servo_jp"]
+    assert set(bench.names()[4:]) == {"servo_jp"}
+    bench.clear()
+    bench.reset().run(300)
+    assert bench.status.guard_state == Status.STATE_EFFORT
+    assert bench.names().count("separate/servo_jf") == 1
+
+
+def test_jaw_is_commanded_again_after_hold_of_another_process(monkeypatch):
+    bench = CrtkBench(monkeypatch, "psm").ready()
+    bench.clear()
+    bench.client.other_hold = True
+    bench.tick(2)
+    assert bench.names()[:2] == ["separate/servo_jp", "servo_jp"]
+
+
+def test_jaw_is_commanded_again_after_hold_in_a_fault(monkeypatch):
+    bench = CrtkBench(monkeypatch, "psm").started()
+    bench.q = np.add(bench.q, [0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    bench.tick(5).clear()
+    bench.blocked = "the deadman process has ended"
+    bench.tick(2)
+    assert bench.names() == ["hold"]
+    bench.blocked = ""
+    bench.clear()
+    bench.tick(2)
+    assert bench.names()[:2] == ["separate/servo_jf", "servo_jf"]
 
 
 def test_close_publishes_hold_and_ends_the_deadman(bench):
