@@ -90,7 +90,7 @@ class CommandGuard:
     median time between two calls exceeds `slow_period`. In these cases, the limits would act too late.
 
     **Watchdog hold**: If an expired command, an invalid measurement or a long period ends POSITION or EFFORT, the guard
-    holds the arm. This is called a watchdog hold. The guard then refuses POSITION and EFFORT until an operator resumes.
+    holds the arm. The same applies to a HOLD command of another sender, and this command also ends STARTING. This is called a watchdog hold. The guard then refuses POSITION and EFFORT until an operator resumes.
     The command for a resume is the same as for the reset of a fault. `hold_reason` states the reason of the hold. A
     watchdog hold is not a fault, and OFF is allowed. No resume is needed if the sender commanded HOLD before it stopped
     sending, or if no POSITION or EFFORT command has acted yet. With `GuardSettings.resume_automatically`, no resume is
@@ -104,7 +104,7 @@ class CommandGuard:
 
     **Ignored messages**: A message is ignored if it is unreadable or not authentic, or if it states another arm, number
     of joints or session. A session is one run of the arm's process. Messages of a second sender are ignored while
-    commands of the first sender are accepted. Ignored messages have no effect. They are not included in the number of
+    commands of the first sender are accepted, except HOLD in STARTING, POSITION and EFFORT. Ignored messages have no effect. They are not included in the number of
     refused commands. Without a key, only the sender_id identifies a sender, and any process on the network can copy
     this number.
 
@@ -284,6 +284,11 @@ class CommandGuard:
         self._expire(utime)
         code = foreign_refusal(command, self.arm_name, self.num_joints, self.session_id)
         if command is not None and code == lcmt_dvrk_status.REFUSAL_NONE:
+            if self._is_hold_of_other_sender(command, utime):
+                self.counts.accepted += 1
+                self._acted = True  # also a start check needs a resume, so that it does not begin again
+                self._take_over(f"sender {command.sender_id} commanded HOLD")
+                return code
             code = self._refusal_now(command, utime)
             if code == lcmt_dvrk_status.REFUSAL_NONE:
                 self._accept(command, utime)
@@ -435,6 +440,15 @@ class CommandGuard:
         self._hold()
         if acted and not self.settings.resume_automatically:
             self.hold_reason = self.hold_reason or reason
+
+    def _is_hold_of_other_sender(self, command: lcmt_dvrk_command, utime: int) -> bool:
+        """Returns whether a sender that is not in control commands HOLD, and this command is not old."""
+        return (
+            command.control_mode == lcmt_dvrk_command.HOLD
+            and self._is_starting_or_in_force()
+            and self._stream.is_other_sender(command, utime)
+            and 0 <= utime - command.status_utime <= self._expiry.expiry
+        )
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
         """Returns REFUSAL_* for a command of this session, given the earlier commands and the present state."""

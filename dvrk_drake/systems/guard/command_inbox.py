@@ -34,7 +34,8 @@ class CommandInbox:
 
     Commands of the sender in control (see `CommandStream`) are kept in a separate list, so a flood from other senders
     does not displace these commands. If this list is full, the command with the lowest sequence is dropped. A flood of
-    copies of earlier commands therefore does not displace new commands.
+    copies of earlier commands therefore does not displace new commands. Of other senders, HOLD is kept before other
+    commands.
     """
 
     def __init__(self, guard: CommandGuard, key: MessageKey | None = None, capacity: int = _CAPACITY) -> None:
@@ -50,7 +51,8 @@ class CommandInbox:
         self._fingerprint = lcmt_dvrk_command()._get_packed_fingerprint()
         self._session = struct.pack(">q", guard.session_id)
         self._name = struct.pack(">I", len(name)) + name
-        bare = _NAME + len(self._name) + struct.calcsize(f">bbi{3 * guard.num_joints}db")
+        self._mode = _NAME + len(self._name)  # offset of control_mode [bytes]
+        bare = self._mode + struct.calcsize(f">bbi{3 * guard.num_joints}db")
         self._lengths = (bare, bare + MAC_SIZE)
         self._verify: Callable[[bytes], bool] | None = key.verify if key else None
         self._capacity = capacity
@@ -70,7 +72,8 @@ class CommandInbox:
             if messages is self._own:
                 messages.remove(min(messages, key=_sequence))
             else:
-                messages.pop()
+                others = (k for k, each in enumerate(messages) if each[self._mode] != lcmt_dvrk_command.HOLD)
+                messages.pop(max(others, default=-1))
             code = lcmt_dvrk_status.REFUSAL_FLOOD
         self._ignored += 1
         self._code = code

@@ -173,6 +173,17 @@ def test_replayed_authentic_commands_do_not_act():
     assert other.guard.ignored_code == Status.REFUSAL_WRONG_SESSION
 
 
+@pytest.mark.parametrize("key", [None, KEY])
+def test_hold_of_another_sender_acts_in_a_flood(key):
+    bench = Networked(key).acting()
+    flood = [stranger(bench, sender_id=1000 + k) for k in range(FLOOD)]
+    hold = stranger(bench, sender_id=6, control_mode=Command.HOLD)
+    assert bench.round([*flood, hold, *flood]).control_mode == (Command.HOLD if key is None else Command.EFFORT)
+    signed = bench.good(control_mode=Command.HOLD, sender_id=6)
+    bench.sequence -= 1
+    assert bench.round([*flood, signed, *flood]).control_mode == Command.HOLD
+
+
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT, Command.OFF])
 def test_key_rejects_unknown_sender(mode):
     bench = Networked(KEY, modes=(Command.POSITION, Command.EFFORT, Command.OFF))

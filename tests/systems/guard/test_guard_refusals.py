@@ -47,7 +47,7 @@ def test_invalid_commands_are_refused_and_lead_to_hold(fields, code):
         ({"sender_id": 0}, Status.REFUSAL_NO_SENDER),
         ({"session_id": SESSION + 1}, Status.REFUSAL_WRONG_SESSION),
         ({"sender_id": 6}, Status.REFUSAL_OTHER_SENDER),
-        ({"sender_id": 6, "control_mode": Command.HOLD}, Status.REFUSAL_OTHER_SENDER),
+        ({"sender_id": 6, "control_mode": Command.HOLD, "status_utime": 0}, Status.REFUSAL_OTHER_SENDER),
         ({"sender_id": 6, "effort": [np.nan] * 7}, Status.REFUSAL_OTHER_SENDER),
         ({"sender_id": 6, "control_mode": Command.OFF}, Status.REFUSAL_OTHER_SENDER),
         (None, Status.REFUSAL_UNREADABLE),

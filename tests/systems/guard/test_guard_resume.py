@@ -33,7 +33,17 @@ def call(bench):
     bench.guard._take_over("the period is 20 ms")
 
 
-TAKEOVERS = [(expire, EXPIRED), (jump, EXPIRED), (call, "the period is 20 ms")]
+def hold_by_another_sender(bench):
+    assert bench.send(Command.HOLD, sender=8) == Status.REFUSAL_NONE
+
+
+OTHER_HOLD = "sender 8 commanded HOLD"
+TAKEOVERS = [
+    (expire, EXPIRED),
+    (jump, EXPIRED),
+    (call, "the period is 20 ms"),
+    (hold_by_another_sender, OTHER_HOLD),
+]
 
 
 def waits(bench, reason):
@@ -75,6 +85,41 @@ def test_arm_holds_until_operator_resumes(mode, take_over, reason, operator):
     assert bench.guard.state == Status.STATE_STARTING
     bench.run(mode, 1, sender=operator)
     assert bench.output.control_mode == mode
+
+
+@MODES
+def test_hold_of_another_sender_ends_control_and_start_check(mode):
+    """HOLD is the safe direction, so it needs neither the sender in control nor its sequence."""
+    for start in (100, 260):
+        bench = Bench()
+        bench.run(mode, start)
+        ignored, accepted = bench.guard.counts.ignored, bench.guard.counts.accepted
+        hold = bench.command(Command.HOLD, sender=8, sequence=-7, utime=0, effort=[np.nan] * N)
+        assert bench.guard.receive(hold, bench.utime) == Status.REFUSAL_NONE
+        assert (bench.guard.counts.ignored, bench.guard.counts.accepted) == (ignored, accepted + 1)
+        assert bench.tick().control_mode == Command.HOLD
+        assert bench.send(mode) == Status.REFUSAL_RESUME
+        assert waits(bench, OTHER_HOLD)
+
+
+def test_old_hold_of_another_sender_is_ignored():
+    bench = Bench().started()
+    for status_utime in (bench.utime - 51 * MS, bench.utime + 1, 0):
+        code = bench.send(Command.HOLD, sender=8, status_utime=status_utime)
+        assert (code, bench.guard.state) == (Status.REFUSAL_OTHER_SENDER, Status.STATE_EFFORT)
+
+
+def test_hold_of_another_sender_neither_supplies_power_nor_resets():
+    bench = Bench(modes=WITH_OFF)
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.OFF, 1)
+    assert bench.send(Command.HOLD, sender=8) == Status.REFUSAL_OTHER_SENDER
+    assert bench.guard.state == Status.STATE_OFF
+    bench = Bench().started()
+    bench.guard.report_fault("fault")
+    for reset in (False, True):
+        assert bench.send(Command.HOLD, sender=8, reset_fault=reset) == Status.REFUSAL_OTHER_SENDER
+    assert bench.guard.state == Status.STATE_FAULT
 
 
 def test_constant_reset_flag_does_not_resume():
