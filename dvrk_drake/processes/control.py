@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -256,7 +257,7 @@ def control(
     report: Callable[[LiveStatus], None],
     on_status: StatusHandler = lambda status, time: None,
 ) -> None:
-    """Sends a command for every status until `stopped` returns true, then commands HOLD.
+    """Sends a command for every status until `stopped` returns true or an error occurs, then commands HOLD.
 
     Args:
         link: Channels of the arm.
@@ -273,31 +274,37 @@ def control(
     first = link.next_status(_SILENCE)
     live, next_report, acted, before = LiveStatusMaker(controller.sender_id, first), _REPORT_PERIOD, 0.0, first
     answers = AnswerTimes()
-    while not stopped():
-        status = link.next_status(_SILENCE)
-        now = link.now() - start
-        answers.add(now)
-        _check(status, link.arm.name, answers.lateness)
-        link.send(controller.answer(status, now, on_status(status, now)))
-        live.answer(status, now)
-        if controller.acting:
-            acted, before = now, status
-        elif now > acted + _TIMEOUT:
-            reason = takeover_reason(status, before, answers)
-            raise ControllerError(f"{link.arm.name} applied no command for {_TIMEOUT:g} s: {reason}")
-        if now >= next_report:
-            report(live.make(status, now, link.lost))
-            next_report = now + _REPORT_PERIOD
+    try:
+        while not stopped():
+            status = link.next_status(_SILENCE)
+            now = link.now() - start
+            answers.add(now)
+            _check(status, link.arm.name, answers.lateness)
+            link.send(controller.answer(status, now, on_status(status, now)))
+            live.answer(status, now)
+            if controller.acting:
+                acted, before = now, status
+            elif now > acted + _TIMEOUT:
+                reason = takeover_reason(status, before, answers)
+                raise ControllerError(f"{link.arm.name} applied no command for {_TIMEOUT:g} s: {reason}")
+            if now >= next_report:
+                report(live.make(status, now, link.lost))
+                next_report = now + _REPORT_PERIOD
+    except BaseException:
+        # The last efforts would act until they expire. The first error is the one that matters.
+        with contextlib.suppress(Exception):
+            _release(link, controller, start)
+        raise
     _release(link, controller, start)
 
 
 def _release(link: ArmLink, controller: ArmController, start: float) -> None:
-    """Commands HOLD until a status confirms the state HOLD or OFF."""
+    """Commands HOLD until a status shows that the controller is not in control."""
     end = link.now() + _RELEASE
     while link.now() < end:
         status = link.next_status(_SILENCE)
-        _check(status, link.arm.name)
-        if status.guard_state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_OFF):
+        if status.command_sender_id != controller.sender_id:
+            _check(status, link.arm.name)
             return
         command = controller.answer(status, link.now() - start)
         command.control_mode = lcmt_dvrk_command.HOLD

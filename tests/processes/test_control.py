@@ -6,16 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, SESSION, N, Q, Weightless
+from sticky_arm import Disk
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ControllerError
+from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models import files
 from dvrk_drake.models.lcm_messages import MessageKey, describe_refusal, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.control import ArmLink, control, first_status, reset_fault
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
+from dvrk_drake.processes.teacher import Teacher
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
@@ -96,6 +99,61 @@ def test_lasting_fault_is_an_error():
 def pause_controller(link, seconds):
     """Advances the clock as if the controller was stopped for `seconds`."""
     link.utime += round(1e6 * seconds)
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("callback", ["on_status", "report", "stopped", "answer"])
+def test_error_of_a_callback_releases_the_arm(controller, monkeypatch, callback, error):
+    link = GuardedArm()
+
+    def fail(*_):
+        if link.guard.state == Status.STATE_EFFORT:
+            raise error
+
+    answer, callbacks = controller.answer, dict.fromkeys(("stopped", "report", "on_status"), lambda *_: None)
+    if callback == "answer":
+        monkeypatch.setattr(controller, "answer", lambda *a: (len(a) > 2 and fail(), answer(*a))[1])
+    else:
+        callbacks[callback] = fail
+    with pytest.raises(type(error)) as raised:
+        control(link, controller, *callbacks.values())
+    assert raised.value is error
+    # The arm holds at once, and no operator must resume.
+    assert (link.guard.state, link.guard.hold_reason) == (Status.STATE_HOLD, "")
+    assert link.commands[-1].control_mode == Command.HOLD and link.commands[-2].control_mode == Command.EFFORT
+
+
+def test_full_disk_while_teaching_releases_the_arm(controller, monkeypatch, tmp_path):
+    link, full = GuardedArm(), OSError(28, "No space left on device")
+    monkeypatch.setattr(ArmController, "ramped", True)
+    monkeypatch.setattr(files.os, "fsync", lambda *_: (_ for _ in ()).throw(full))
+    teacher = Teacher(
+        controller,
+        tmp_path / "p.yaml",
+        at_rest=False,
+        requested=lambda: link.guard.state == Status.STATE_EFFORT,
+        report=print,
+        writer=Disk(),
+    )
+    with pytest.raises(DvrkDrakeError, match="No space left on device"):
+        control(link, controller, lambda: False, lambda status: None, teacher.update)
+    assert link.guard.state == Status.STATE_HOLD
+    assert link.commands[-1].control_mode == Command.HOLD
+
+
+def test_failing_second_controller_does_not_disturb_the_first(controller, monkeypatch):
+    monkeypatch.setattr("dvrk_drake.processes.control._TIMEOUT", 0.5)
+    link = GuardedArm()
+    other = ArmController(ARM, IdentifiedModel.from_arm(ARM), "hold", 1e-3)
+
+    def first_controller():
+        if link.status.session_id:
+            link.send(other.answer(link.status, link.now()))
+
+    link.before_step = first_controller
+    with pytest.raises(ControllerError, match="applied no command for 0.5 s"):
+        control(link, controller, lambda: False, lambda status: None)
+    assert (link.guard.state, link.guard.sender_id) == (Status.STATE_EFFORT, other.sender_id)
 
 
 LOOK = r"Look at the arm, then start again with --reset"
