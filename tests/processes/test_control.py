@@ -151,7 +151,7 @@ def test_failing_second_controller_does_not_disturb_the_first(controller, monkey
             link.send(other.answer(link.status, link.now()))
 
     link.before_step = first_controller
-    with pytest.raises(ControllerError, match="applied no command for 0.5 s"):
+    with pytest.raises(ControllerError, match=r"applied no command for 0\.5 s"):
         control(link, controller, lambda: False, lambda status: None)
     assert (link.guard.state, link.guard.sender_id) == (Status.STATE_EFFORT, other.sender_id)
 

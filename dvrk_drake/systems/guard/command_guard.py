@@ -90,11 +90,12 @@ class CommandGuard:
     median time between two calls exceeds `slow_period`. In these cases, the limits would act too late.
 
     **Watchdog hold**: If an expired command, an invalid measurement or a long period ends POSITION or EFFORT, the guard
-    holds the arm. The same applies to a HOLD command of another sender, and this command also ends STARTING. This is called a watchdog hold. The guard then refuses POSITION and EFFORT until an operator resumes.
-    The command for a resume is the same as for the reset of a fault. `hold_reason` states the reason of the hold. A
-    watchdog hold is not a fault, and OFF is allowed. No resume is needed if the sender commanded HOLD before it stopped
-    sending, or if no POSITION or EFFORT command has acted yet. With `GuardSettings.resume_automatically`, no resume is
-    needed in any case. New commands act only after STARTING.
+    holds the arm. The same applies to a HOLD command of another sender, and this command also ends STARTING. This is
+    called a watchdog hold. The guard then refuses POSITION and EFFORT until an operator resumes. The command for a
+    resume is the same as for the reset of a fault. `hold_reason` states the reason of the hold. A watchdog hold is not
+    a fault, and OFF is allowed. No resume is needed if the sender commanded HOLD before it stopped sending, or if no
+    POSITION or EFFORT command has acted yet. With `GuardSettings.resume_automatically`, no resume is needed in any
+    case. New commands act only after STARTING.
 
     **Refused commands**: A command is refused if a number is not finite, or if the command has expired on arrival, is
     out of order or is a duplicate. It is also refused after a jump of the sender's sequence or clock, and if its mode
@@ -104,9 +105,9 @@ class CommandGuard:
 
     **Ignored messages**: A message is ignored if it is unreadable or not authentic, or if it states another arm, number
     of joints or session. A session is one run of the arm's process. Messages of a second sender are ignored while
-    commands of the first sender are accepted, except HOLD in STARTING, POSITION and EFFORT. Ignored messages have no effect. They are not included in the number of
-    refused commands. Without a key, only the sender_id identifies a sender, and any process on the network can copy
-    this number.
+    commands of the first sender are accepted, except HOLD in STARTING, POSITION and EFFORT. Ignored messages have no
+    effect. They are not included in the number of refused commands. Without a key, only the sender_id identifies a
+    sender, and any process on the network can copy this number.
 
     **OFF**: An arm without brakes falls when its motors are off. OFF must be listed in `modes`. A single message is not
     sufficient, because the state must be HOLD and the sender's last command must have been HOLD. In FAULT, the guard
