@@ -24,7 +24,6 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
-from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
@@ -34,6 +33,7 @@ from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.workers import await_results
 
 #: Maximum joint speed between poses [rad/s], [m/s].
 TRAVEL_SPEED = 1.7, 0.2

@@ -15,7 +15,6 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.experiments.scenario import load_scenario
-from dvrk_drake.experiments.study.study import local_executor
 from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response, band, published_gains, step_size
 from dvrk_drake.experiments.tuning.model_based import (
     GAIN_MARGIN,
@@ -50,6 +49,7 @@ from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffec
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.reports.figures.tuning import plot_steps
 from dvrk_drake.reports.tuning import print_tuning
+from dvrk_drake.workers import local_executor
 
 #: The second-order approximation of the lags is valid only far below 1 / (9 ms).
 FAR_BELOW = 15.0

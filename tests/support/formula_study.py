@@ -1,4 +1,4 @@
-"""Command line in which a formula replaces the simulation, also in spawned workers, which import this module.
+"""Command line in which a formula replaces the simulation, also in spawned workers.
 
 python tests/support/formula_study.py study STUDY.yaml --output RESULTS.csv --workers 2
 """
@@ -46,12 +46,21 @@ def dask_setup(_worker):
     study_module.simulate = simulate
 
 
-if __name__ in ("__main__", "__mp_main__"):  # the command, and its workers
+_run_case = study_module.run_case
+
+
+def run_case(scenario, measures):
+    """Runs a case with the formula. A worker imports this module when it receives this function."""
     study_module.simulate = simulate
+    return _run_case(scenario, measures)
+
 
 if __name__ == "__main__":
+    import formula_study  # workers do not import the main script
+
     from dvrk_drake.cli import main
 
+    study_module.run_case = formula_study.run_case
     # A shell without job control starts background processes with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(main(sys.argv[1:]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -29,6 +28,7 @@ from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
+from dvrk_drake.workers import local_executor
 
 #: Number of times per harmonic at which the information is computed.
 INFORMATION_TIMES = 8
@@ -248,10 +248,6 @@ class _Problem:
         return motion, information.expected_error(states_at(values, found), self.period), random_error
 
 
-def _ignore_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _solve(problem: _Problem) -> tuple[PeriodicMotion, float, float]:
     return problem.solve()
 
@@ -262,10 +258,8 @@ def _in_parallel(
     if len(problems) == 1:
         yield problems[0].solve()
         return
-    # The end of the block terminates the workers, also after Ctrl-C, which only this process handles.
-    processes = min(len(problems), multiprocessing.cpu_count())
-    with multiprocessing.get_context("spawn").Pool(processes, _ignore_interrupts) as pool:
-        yield from pool.imap(_solve, problems)
+    with local_executor(min(len(problems), multiprocessing.cpu_count())) as executor:
+        yield from executor.map(_solve, problems)
 
 
 def _coefficients(motion: PeriodicMotion, basis: FourierBasis) -> NDArray[np.float64]:

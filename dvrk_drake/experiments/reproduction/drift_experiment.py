@@ -17,7 +17,6 @@ from pydrake.trajectories import PiecewisePolynomial
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.simulation import samples
-from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
@@ -25,6 +24,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
+from dvrk_drake.workers import await_results
 
 #: Sample period [s].
 SAMPLE_PERIOD = 0.02

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import os
 import re
-import signal
-import sys
-import sysconfig
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from contextlib import contextmanager
-from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,11 +18,11 @@ from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Case, Study, versions
 from dvrk_drake.experiments.study.table import ParquetStudyTable, Row, StudyTable
+from dvrk_drake.workers import local_executor
 
 if TYPE_CHECKING:
     from distributed import Client
 
-Result = TypeVar("Result")
 #: Function called with the number of finished cases and the number of all cases.
 Progress = Callable[[int, int], None]
 
@@ -108,8 +101,6 @@ def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
 
 #: Maximum number of process pools. A pool is replaced if a worker was killed, e.g. for lack of memory.
 MAX_POOLS = 3
-#: Faster memory allocator, from the package libtcmalloc-minimal4 (Debian, Ubuntu) or gperftools-libs (Fedora).
-TCMALLOC = "libtcmalloc_minimal.so.4"
 #: Timeout of the connection to a scheduler, and of waiting for its first worker [s].
 TIMEOUT = 10
 
@@ -128,54 +119,6 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
             if not isinstance(error.__cause__, BrokenExecutor) or pool == MAX_POOLS - 1:
                 raise
     raise AssertionError("unreachable")
-
-
-@contextmanager
-def local_executor(workers: int | None = None) -> Iterator[Executor]:
-    """Provides worker processes on this computer, by default one per core.
-
-    The workers end at the end of the `with` block. After an error, they end immediately. They also end if this process
-    is killed. The workers are spawned, so a script that uses this function needs `if __name__ == "__main__":`.
-    """
-    # Workers read these variables at their start. More BLAS threads per worker would compete for the cores.
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
-    os.environ.update(_allocator_environment())
-    others = set(multiprocessing.active_children())
-    executor = _SpawningExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent)
-    try:
-        yield executor
-    except BaseException:
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()
-        raise
-    finally:
-        executor.shutdown(cancel_futures=True)
-
-
-def await_results(futures: Sequence[Future[Result]], progress: Callable[[float], object]) -> list[Result]:
-    """Returns the results of all futures in order, or raises the first error; reports the finished share."""
-    for done, future in enumerate(as_completed(futures), start=1):
-        future.result()
-        progress(done / len(futures))
-    return [future.result() for future in futures]
-
-
-def _allocator_environment() -> dict[str, str]:
-    """Returns environment variables that select a faster memory allocator for new processes.
-
-    The dict is empty if the user has already selected an allocator, or on systems other than Linux. Drake's solver
-    allocates thousands of small blocks per step. tcmalloc or a larger cache of glibc makes the allocations faster.
-    """
-    if sys.platform != "linux" or {"LD_PRELOAD", "GLIBC_TUNABLES"} & set(os.environ):
-        return {}
-    if any((folder / TCMALLOC).exists() for folder in _library_folders()):
-        return {"LD_PRELOAD": TCMALLOC}
-    return {"GLIBC_TUNABLES": "glibc.malloc.tcache_count=2000"}
-
-
-def _library_folders() -> list[Path]:
-    return [Path("/usr/lib", sysconfig.get_config_var("MULTIARCH") or ""), Path("/usr/lib64")]
 
 
 @contextmanager
@@ -225,25 +168,3 @@ def _check_workers(client: Client) -> None:
                 f"{worker}: the worker has {worker_versions}, this computer has {versions()}. Install the same "
                 "versions."
             )
-
-
-class _SpawningExecutor(ProcessPoolExecutor):
-    """Process pool whose workers ignore Ctrl-C. Only the parent process ends them, so they print no tracebacks."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit the signal mask
-        try:
-            return super().submit(fn, *args, **kwargs)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.experiments.study.study import await_results, local_executor
 from dvrk_drake.experiments.tuning.bench import (
     NOMINAL,
     Bench,
@@ -30,6 +29,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.files import Reportable
+from dvrk_drake.workers import await_results, local_executor
 
 #: Duration of a step test, and of its final part in which the joints should be at rest [s].
 DURATION, REST_TIME = 2.0, 0.4

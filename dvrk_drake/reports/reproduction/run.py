@@ -8,7 +8,6 @@ from pathlib import Path
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.experiments.reproduction.published import PaperRecordings
 from dvrk_drake.experiments.reproduction.session import ReproductionSession, SampleSizes
-from dvrk_drake.experiments.study.study import local_executor
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.reports.html.provenance import Provenance
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
@@ -17,6 +16,7 @@ from dvrk_drake.reports.reproduction.page import Section, write_page
 from dvrk_drake.reports.reproduction.step_response import reproduce_figure_7
 from dvrk_drake.reports.reproduction.torque_errors import reproduce_figure_4
 from dvrk_drake.reports.reproduction.transparency import reproduce_transparency
+from dvrk_drake.workers import local_executor
 
 _MAKERS: dict[str, Callable[[ReproductionSession], Section]] = {
     "table1": lambda session: reproduce_table_1(),
