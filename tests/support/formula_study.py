@@ -60,7 +60,8 @@ if __name__ == "__main__":
 
     from dvrk_drake.cli import main
 
-    study_module.run_case = formula_study.run_case
+    if "--workers" in sys.argv:  # Dask workers call `dask_setup`
+        study_module.run_case = formula_study.run_case
     # A shell without job control starts background processes with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(main(sys.argv[1:]))
