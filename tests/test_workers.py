@@ -20,7 +20,9 @@ def run_script(folder, text):
     """Runs a script as a process of its own."""
     path = folder / "script.py"
     path.write_text(textwrap.dedent(text))
-    return subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=TIMEOUT, cwd=folder)
+    return subprocess.run(
+        [sys.executable, path], check=False, capture_output=True, text=True, timeout=TIMEOUT, cwd=folder
+    )
 
 
 def test_plain_script_uses_workers_and_runs_once(tmp_path):

@@ -167,12 +167,7 @@ def _friction_compensator(
         )
     arm = load_arm(controlled.arm)
     model = IdentifiedModel.load(controlled.model, arm)
-    error = holding_error(model)
-    if ratio and not error.any():
-        raise ControllerError(
-            f"--friction-ratio requires a --model identified from static poses; {controlled.model} has no error bound "
-            "at rest, so the arm could creep"
-        )
+    error = holding_error(model) if ratio else None
     friction = Friction.of_model(IdentifiedModel.load(friction_model or controlled.model, arm))
     compensator = FrictionCompensator(
         friction,

@@ -226,7 +226,17 @@ def _largest_ratios(
 def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
     """Returns the assumed error (n,) of the model's gravity torque [N m, N].
 
-    The assumed error is `HOLDING_ERROR_FACTOR` times the leave-one-out RMS error. The assumed error is zero for a model
-    that was not identified from static poses.
+    The assumed error is `HOLDING_ERROR_FACTOR` times the leave-one-out RMS error of the static poses.
+
+    Raises:
+        ControllerError: The model has no such error for a joint, e.g. because it was identified from a motion alone. If
+            friction was compensated, the arm could creep.
     """
-    return HOLDING_ERROR_FACTOR * np.array([joint.rms_leave_one_out_included for joint in model.joints])
+    error = HOLDING_ERROR_FACTOR * np.array([joint.rms_leave_one_out_included for joint in model.joints])
+    if unknown := [joint.name for joint, e in zip(model.joints, error, strict=True) if not e > 0]:
+        which = "at rest" if len(unknown) == len(error) else f"at rest for {', '.join(unknown)}"
+        raise ControllerError(
+            f"friction compensation requires a model identified from static poses; this model has no error bound "
+            f"{which}, so the arm could creep"
+        )
+    return error

@@ -287,6 +287,15 @@ def phases(scenario: Scenario) -> Callable[[float], str]:
     return phase
 
 
+def simulated_holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
+    """Returns the assumed error (n,) of the model's gravity torque, which is zero for a nominal model.
+
+    Raises:
+        ControllerError: See `holding_error`.
+    """
+    return np.zeros(model.arm.num_joints) if model.provenance.method == "nominal" else holding_error(model)
+
+
 def _friction(scenario: Scenario) -> FrictionCompensator | None:
     controller = scenario.controller
     if not (controller.friction_ratio or controller.hysteresis_ratio):
@@ -295,7 +304,7 @@ def _friction(scenario: Scenario) -> FrictionCompensator | None:
         Friction.of_arm(scenario.mounted_arm),
         ratio=controller.friction_ratio,
         hysteresis_ratio=controller.hysteresis_ratio,
-        holding_error=holding_error(scenario.model),
+        holding_error=simulated_holding_error(scenario.model),
         period=scenario.time_step,
     )
 

@@ -12,11 +12,11 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
-from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
+from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame, handle_frame
 from dvrk_drake.errors import ScenarioError
-from dvrk_drake.experiments.simulation import advance, samples
+from dvrk_drake.experiments.simulation import advance, samples, simulated_holding_error
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.recordings.recording import Recording
@@ -188,7 +188,7 @@ def _friction(arm: Arm, compensation: Compensation) -> FrictionCompensator | Non
         return None
     friction = compensation.friction or Friction.of_arm(arm)
     return FrictionCompensator(
-        friction, ratio=compensation.friction_ratio, holding_error=holding_error(compensation.model)
+        friction, ratio=compensation.friction_ratio, holding_error=simulated_holding_error(compensation.model)
     )
 
 

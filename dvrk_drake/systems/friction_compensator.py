@@ -68,12 +68,12 @@ class FrictionCompensator(LeafSystem):
             hysteresis_ratio: Minimum compensated share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves a
                 released arm back towards its earlier position; see `safe_ratios`.
             holding_error: Error (n,) [N m, N] of the gravity compensation. A large error reduces the compensated
-                shares; see `safe_ratios`. None: no error.
+                shares; see `safe_ratios`. `holding_error` returns the error of a model. None: only with a `ratio` of 0.
             widening: Ratio of the scales of the compensating elements to the identified scales, 1..10.
             period: Period of the update [s].
 
         Raises:
-            ControllerError: A number is out of range.
+            ControllerError: A number is out of range, or `holding_error` is missing.
         """
         super().__init__()
         friction.arm.refuse_locked_joints("a friction compensator")
@@ -83,6 +83,8 @@ class FrictionCompensator(LeafSystem):
                 f"widening must be 1..10 and period must be larger than 0 and smaller than 1 s; got {widening:g} and "
                 f"{period:g} s"
             )
+        if ratio and holding_error is None:
+            raise ControllerError("a friction ratio above 0 requires holding_error, the error of the gravity model")
         n = friction.arm.num_joints
         error = np.zeros(n) if holding_error is None else holding_error
         self._ratios = safe_ratios(friction, ratio, error, hysteresis_ratio)

@@ -303,7 +303,7 @@ def test_friction_requires_holding_error(tmp_path, capsys):
     IdentifiedModel.from_arm(ARM).save(path)
     assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
     said = capsys.readouterr().err
-    assert "--friction-ratio requires a --model identified from static poses" in said and said.count("\n") == 1
+    assert "friction compensation requires a model identified from static poses" in said and said.count("\n") == 1
 
 
 def test_live_status_has_rate_and_round_trip():

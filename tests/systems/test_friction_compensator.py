@@ -13,6 +13,7 @@ from dvrk_drake.dynamics.friction_compensation import (
     MAX_HYSTERESIS_RATIO,
     MAX_RATIO,
     Friction,
+    holding_error,
     safe_ratios,
 )
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -74,7 +75,7 @@ class Compensator:
     """The system alone, stepped manually."""
 
     def __init__(self, **options):
-        self.system = FrictionCompensator(FRICTION, **options)
+        self.system = FrictionCompensator(FRICTION, **{"holding_error": NO_EFFORT, **options})
         self.context = self.system.CreateDefaultContext()
         self.system.GetInputPort("effort_wanted").FixValue(self.context, NO_EFFORT)
         self.new = self.system.AllocateDiscreteVariables()
@@ -197,7 +198,7 @@ def test_sum_is_clamped_to_effort_limits():
 
 def test_elements_restart_relaxed():
     builder = DiagramBuilder()
-    system = builder.AddSystem(FrictionCompensator(FRICTION))
+    system = builder.AddSystem(FrictionCompensator(FRICTION, holding_error=NO_EFFORT))
     builder.ExportInput(system.GetInputPort("state_estimated"))
     builder.ExportInput(system.GetInputPort("effort_wanted"))
     diagram = builder.Build()
@@ -221,7 +222,22 @@ def test_elements_restart_relaxed():
 )
 def test_invalid_numbers_are_refused(options, what):
     with pytest.raises(ControllerError, match=what):
-        FrictionCompensator(FRICTION, **options)
+        FrictionCompensator(FRICTION, **{"holding_error": NO_EFFORT, **options})
+
+
+def test_friction_is_compensated_only_with_an_error_bound_of_gravity():
+    with pytest.raises(ControllerError, match="a friction ratio above 0 requires holding_error"):
+        FrictionCompensator(FRICTION)
+    FrictionCompensator(FRICTION, ratio=0.0, hysteresis_ratio=0.5)
+    model = IdentifiedModel.from_arm(ARM, dynamics=True)
+    with pytest.raises(ControllerError, match="this model has no error bound at rest, so the arm could creep"):
+        holding_error(model)
+    for joint in model.joints[1:]:
+        joint.rms_leave_one_out_included = 0.1
+    with pytest.raises(ControllerError, match=f"no error bound at rest for {ARM.joint_names[0]}, so"):
+        holding_error(model)
+    model.joints[0].rms_leave_one_out_included = 0.1
+    np.testing.assert_allclose(holding_error(model), np.full(7, 0.2), rtol=0, atol=1e-12)
 
 
 def test_active_friction_is_refused():
@@ -239,7 +255,9 @@ def test_push_decays_with_less_friction_and_delay(seed):
         ARM.effects.without("cables").without("springs"), friction=laws, delay=DelayEffect(measurement=1, command=1)
     )
     station = ArmStation(ARM, effects=effects, seed=seed)
-    friction = FrictionCompensator(Friction.of_arm(ARM), ratio=MAX_RATIO, hysteresis_ratio=MAX_HYSTERESIS_RATIO)
+    friction = FrictionCompensator(
+        Friction.of_arm(ARM), ratio=MAX_RATIO, hysteresis_ratio=MAX_HYSTERESIS_RATIO, holding_error=NO_EFFORT
+    )
     builder = DiagramBuilder()
     add_closed_loop(
         builder, station, GravityPidController(IdentifiedModel.from_arm(ARM), mode="gravity"), friction=friction
