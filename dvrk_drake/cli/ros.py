@@ -88,9 +88,10 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.systems.ros.deadman import Deadman
+    from dvrk_drake.systems.ros.deadman import Deadman, request_priority
     from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
+    priority = request_priority()  # the threads of DDS inherit it
     ros = open_ros_domain(domain)
     from dvrk_drake.systems.ros.crtk_client import find_arm
 
@@ -103,5 +104,5 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
     stopped = stop_on_signals()
     # A closed terminal must not end this process.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    print(f"deadman of {namespace}; Ctrl-C ends it", flush=True)
+    print(f"deadman of {namespace}; Ctrl-C ends it; it has {priority}", flush=True)
     monitor.run(stopped)

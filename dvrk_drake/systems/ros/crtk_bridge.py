@@ -19,7 +19,7 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
-from dvrk_drake.systems.ros.deadman import DeadmanProcess
+from dvrk_drake.systems.ros.deadman import DeadmanProcess, describe_priority
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
@@ -368,7 +368,7 @@ def connect_bridge(
     stopped: Callable[[], bool] = lambda: False,
     polled: bool = False,
 ) -> CrtkBridge:
-    """Finds an arm on ROS 2 and connects a bridge with its deadman process.
+    """Finds an arm on ROS 2 and connects a bridge with its deadman process. Call `compile_guard` before.
 
     Args:
         arm: Arm to connect.
@@ -386,12 +386,14 @@ def connect_bridge(
     Raises:
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
-    compile_guard(arm, driver)
     ros = open_ros_domain(domain)
     commands = ("servo_jp", "servo_jf", "hold")
     client = connect_client(ros, arm, topic, commands, report=report, stopped=stopped, polled=polled)
     deadman = DeadmanProcess(client.namespace, domain, stopped)
-    report(f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms")
+    report(
+        f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms; it has "
+        f"{describe_priority(deadman.pid)}"
+    )
     try:
         return CrtkBridge(client, driver, send_status, report=report, deadman=deadman)
     except BaseException:

@@ -11,7 +11,7 @@ from pydrake.systems.lcm import LcmInterfaceSystem
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, connect_bridge
+from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, compile_guard, connect_bridge
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 
 #: Period in which the system receives measurements and publishes commands [s].
@@ -37,9 +37,11 @@ class CrtkBridgeSystem(LeafSystem):
             DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
         """
         super().__init__()
+        guard_driver = driver.guard_driver()
+        compile_guard(arm, guard_driver)
         self._bridge: CrtkBridge = connect_bridge(
             arm,
-            driver.guard_driver(),
+            guard_driver,
             lambda data: lcm.Publish(status_channel(arm), data),
             topic=driver.namespace or None,
             domain=driver.domain,

@@ -243,6 +243,23 @@ class DeadmanProcess:
             self._process.wait()
 
 
+def request_priority() -> str:
+    """Requests real-time priority for this thread and those that it starts. Returns `describe_priority`."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    return describe_priority(0)
+
+
+def describe_priority(pid: int) -> str:
+    """Returns the real-time priority of a deadman process as a text. 0: this process."""
+    if os.sched_getscheduler(pid) in (os.SCHED_FIFO, os.SCHED_RR):
+        return f"real-time priority {os.sched_getparam(pid).sched_priority}"
+    return (
+        "no real-time priority, so a busy computer can delay it. Give the user an rtprio limit of "
+        f"{_PRIORITY}, or CAP_SYS_NICE"
+    )
+
+
 def _report(line: str) -> None:
     # The terminal of the bridge may be closed. This must not end the process.
     with contextlib.suppress(OSError):
@@ -265,8 +282,7 @@ def main(namespace: str, domain: str) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    request_priority()
     deadman = Deadman(open_ros_domain(int(domain) if domain else None), namespace, _report)
     deadman.run(lambda: bool(received), sys.stdin.fileno(), _report_connected)
     # Without the destructors of Cyclone DDS, which may wait for ever if another participant ends at the same time.

@@ -240,6 +240,46 @@ def test_stopped_start_leaves_no_process(monkeypatch, error):
     assert started[0].poll() is not None
 
 
+#: Prints the requested priority, and that of a thread that started afterwards, as the threads of DDS do.
+PRIORITY = """
+import os, threading
+from dvrk_drake.systems.ros import deadman
+if {refused}:
+    def refuse(*_):
+        raise PermissionError(1, "not permitted")
+    os.sched_setscheduler = refuse
+print(deadman.request_priority())
+thread = threading.Thread(target=lambda: print(os.sched_getscheduler(0) == os.SCHED_FIFO))
+thread.start()
+thread.join()
+"""
+REFUSED = (
+    "no real-time priority, so a busy computer can delay it. Give the user an rtprio limit of 60, or CAP_SYS_NICE\n"
+)
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_real_time_priority_is_stated(refused):
+    code = PRIORITY.format(refused=refused)
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    granted = "" if refused else "real-time priority 60\nTrue\n"
+    assert printed in (granted, f"{REFUSED}False\n")  # the system may refuse the request
+
+
+def test_stand_alone_command_requests_priority_before_dds(monkeypatch, capsys):
+    from dvrk_drake.cli import main
+    from dvrk_drake.systems.ros import crtk_client, open_domain
+
+    calls, requested = [], "real-time priority 60"
+    monkeypatch.setattr(deadman, "request_priority", lambda: calls.append("priority") or requested)
+    monkeypatch.setattr(open_domain, "open_ros_domain", lambda domain: calls.append("domain"))
+    monkeypatch.setattr(crtk_client, "find_arm", lambda *_, **__: ARM)
+    monkeypatch.setattr(deadman, "Deadman", lambda *_: SimpleNamespace(run=lambda stopped: calls.append("run")))
+    assert main(["deadman", "--arm", "mtml"]) == 0
+    assert calls == ["priority", "domain", "run"]
+    assert capsys.readouterr().out == f"deadman of {ARM}; Ctrl-C ends it; it has {requested}\n"
+
+
 def test_changes_of_the_connection_are_reported():
     bench = Bench()
     bench.hold.connections = 0
