@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import lcm
+import numpy as np
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
@@ -29,6 +30,8 @@ _RESTART = 1.0
 _QUEUE = 20_000
 #: Reasons why messages do not belong to the arm's session.
 _FOREIGN = (StatusFilter.OTHER_SESSION, StatusFilter.JUMP, StatusFilter.NOT_AUTHENTIC)
+#: Number of messages whose median period is used, and number of intervals that are compared with it at once.
+_PERIOD_WINDOW, _CHECKED_INTERVALS = 100, 20
 #: Longest wait for a message between two checks for a stop [s].
 _POLL = 0.1
 
@@ -49,6 +52,58 @@ class Rate:
         while self._arrivals and self._arrivals[0] < now - 1:
             self._arrivals.popleft()
         return len(self._arrivals) if self._arrivals and self._arrivals[-1] >= now - SILENCE else None
+
+
+class MissingMessages:
+    """Number of messages that are missing on a periodic topic, determined from the stamps of the received messages.
+
+    DDS does not number messages for its users, and does not report messages that it overwrites.
+    """
+
+    def __init__(self) -> None:
+        """Starts without messages."""
+        self._count, self._longest = 0, 0
+        self._stamps: deque[int] = deque(maxlen=_PERIOD_WINDOW)
+        self._unchecked: list[int] = []
+
+    def add(self, stamp: int) -> None:
+        """Counts a message with a time stamp [ns] that is later than that of the previous message."""
+        if self._stamps:
+            interval = stamp - self._stamps[-1]
+            if interval == 0:
+                return  # the measurement was published twice
+            if interval < 0:  # the clock was set back
+                self._check()
+                self._stamps.clear()
+            else:
+                self._unchecked.append(interval)
+        self._stamps.append(stamp)
+        if len(self._unchecked) >= _CHECKED_INTERVALS:
+            self._check()
+
+    @property
+    def count(self) -> int:
+        """Number of missing messages."""
+        self._check()
+        return max(self._count, 0)
+
+    @property
+    def longest(self) -> float:
+        """Longest time between two messages [s]."""
+        self._check()
+        return 1e-9 * self._longest
+
+    def _check(self) -> None:
+        if len(self._stamps) < 3 or not self._unchecked:
+            return
+        # The stamps are times of an arm's own loop. If messages are published with a period that is no multiple of the
+        # period of this loop, long and short intervals alternate. The sum of two intervals is nearly constant.
+        stamps = np.array(self._stamps)
+        period = float(np.median(stamps[2:] - stamps[:-2])) / 2
+        # A message that was published late is followed by intervals that are shorter than half a period.
+        self._count += int(np.sum(np.rint(np.array(self._unchecked) / period) - 1))
+        self._longest = max(self._longest, *self._unchecked)
+        self._unchecked.clear()
 
 
 class Recorder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.processes.recorder import FIRST_STATUS, Rate
+from dvrk_drake.processes.recorder import FIRST_STATUS, MissingMessages, Rate
 from dvrk_drake.recordings.arm_bag import FrameMessages, joint_state_topics
 from dvrk_drake.recordings.mcap_writer import GrowingMcap, Topic
 from dvrk_drake.recordings.recording_stream import check_stream_output
@@ -69,6 +70,7 @@ class RosRecorder:
         self._rate = Rate()
         self._subscriptions: list[Subscription[JointState]] = []
         self._silent: set[str] = set()
+        self._missing: dict[str, MissingMessages] = {}
         self._bag: GrowingMcap | None = None
         self._frames: FrameMessages | None = None
         self._positions: dict[str, float] = {}
@@ -86,7 +88,15 @@ class RosRecorder:
             RecordingError: The arm was not found, see `find_topic`. No valid message arrived within 10 s, the messages
                 have other joints, or the file cannot be written.
         """
-        self._subscribe(stopped)
+        with closing(self._domain):
+            self._subscribe(stopped)
+            self._record_until(duration, stopped, show)
+        if self._bag is None:
+            raise RecordingError(self._no_message_reason(stopped()))
+
+    def _record_until(
+        self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]
+    ) -> None:
         end = time.monotonic() + FIRST_STATUS
         try:
             while not stopped() and time.monotonic() < end:
@@ -101,27 +111,28 @@ class RosRecorder:
         finally:
             if self._bag is not None:
                 self._bag.close(lambda share: show(lambda: f"{self._path}: index {share:.0%}"))
-        if self._bag is None:
-            raise RecordingError(self._no_message_reason(stopped()))
 
     def describe(self) -> str:
-        """Returns the text of the status line: the number of messages, the rate, and lost messages."""
+        """Returns the text of the status line: the number of messages, the rate, and missing messages."""
         rate = self._rate.per_second(time.monotonic())
         if self._bag is None:
             return f"waiting for a valid message on {self._subscriptions[0].topic}"
         if rate is None:
             return f"{self._arm.name}: no more messages; {self.num_rows} rows"
-        parts = [f"{self._arm.name}: {self.num_rows} rows", f"{rate} Hz", f"{self._num_lost()} lost"]
+        parts = [f"{self._arm.name}: {self.num_rows} rows", f"{rate} Hz", f"{self._num_missing()} missing"]
         return ", ".join([*parts, *(f"no message on {topic}" for topic in sorted(self._silent))])
 
     def notes(self) -> list[str]:
-        """Returns one line each for lost messages, invalid messages, and topics without messages."""
+        """Returns one line each for missing messages, invalid messages, and topics without messages."""
         counts = {
-            "messages lost by DDS": self._num_lost(),
+            "messages missing (gaps of the time stamps)": self._num_missing(),
             "messages with header stamp 0, which marks invalid data": self._num_invalid,
         }
+        lines = [f"{text}: {count}" for text, count in counts.items() if count]
+        if self._num_missing():
+            lines[0] += f", longest gap {max(missing.longest for missing in self._missing.values()):.3g} s"
         silent = [f"no message on {topic}; commands of dvrk-drake need this topic" for topic in sorted(self._silent)]
-        return [*(f"{text}: {count}" for text, count in counts.items() if count), *silent]
+        return [*lines, *silent]
 
     def _subscribe(self, stopped: Callable[[], bool]) -> None:
         """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one."""
@@ -134,6 +145,7 @@ class RosRecorder:
             subscription = self._domain.subscribe(name, JointState, depth=_DEPTH, reliable=topics.get(name, True))
             self._subscriptions.append(subscription)
             self._silent.add(name)
+            self._missing[name] = MissingMessages()
 
     def _record(self, subscription: Subscription[JointState], message: JointState, published: int) -> None:
         """Writes a message. The bag is created at the first valid message of the arm."""
@@ -152,6 +164,7 @@ class RosRecorder:
         self._bag.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, arrived)
         if is_valid:
             self._write_frames(message, arrived)
+            self._missing[subscription.topic].add(message.header.nanoseconds)
         self._silent.discard(subscription.topic)
         if subscription is self._subscriptions[0]:
             self.num_rows += is_valid
@@ -182,5 +195,5 @@ class RosRecorder:
             return f"{self._path} was not written: the recording ended before the first message on {topic}"
         return f"no message within {FIRST_STATUS:.0f} s on {topic}"
 
-    def _num_lost(self) -> int:
-        return sum(subscription.num_lost for subscription in self._subscriptions)
+    def _num_missing(self) -> int:
+        return sum(missing.count for missing in self._missing.values())

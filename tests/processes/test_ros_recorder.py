@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 from unittest.mock import ANY
 
@@ -16,6 +17,7 @@ from waiting import TIMEOUT
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import ros_recorder as module
+from dvrk_drake.processes.recorder import MissingMessages
 from dvrk_drake.processes.ros_recorder import RosRecorder
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.ros import discovery
@@ -67,6 +69,61 @@ def test_recording_has_the_published_numbers(publisher, tmp_path):
     assert len(recording) >= 0.95 * (numbers[-1] - numbers[0] + 1)
 
 
+def test_messages_that_dds_overwrites_are_counted(publisher, tmp_path, monkeypatch):
+    """The recorder is stopped several times, so that messages arrive that do not fit into the history of DDS."""
+    monkeypatch.setattr(module, "_DEPTH", 5)
+    recorder, pauses = RosRecorder(PSM, tmp_path / "a.mcap", "/dvrk/PSM1", publisher), iter((40, 80, 81, 120))
+    pause, last = next(pauses), 160
+
+    def show(text):
+        nonlocal pause
+        if recorder.num_rows >= pause:
+            pause = next(pauses, np.inf)
+            time.sleep(0.2)  # 40 messages of each topic
+
+    recorder.run(np.inf, lambda: recorder.num_rows >= last, show)
+    missing = 0
+    with AnyReader([tmp_path / "a.mcap"]) as bag:
+        for topic in ("/dvrk/PSM1/measured_js", "/dvrk/PSM1/jaw/measured_js"):
+            connections = [each for each in bag.connections if each.topic == topic]
+            stamps = [bag.deserialize(data, c.msgtype).header.stamp for c, _, data in bag.messages(connections)]
+            k = [(stamp.sec * 10**9 + stamp.nanosec - START) / PERIOD for stamp in stamps if stamp.sec]
+            missing += round(k[-1] - k[0]) + 1 - len(k)
+    assert missing > 4 * 2 * 20
+    line = f"messages missing (gaps of the time stamps): {missing}, longest gap 0."
+    assert recorder.notes()[0].startswith(line)
+    assert f", {missing} missing" in recorder.describe()
+
+
+def stamps(count, period=1_000_000, jitter=0.0, loop=1):
+    """Returns time stamps [ns] of messages that a loop of another period publishes with jitter."""
+    late = np.random.default_rng(0).uniform(0, jitter, count)
+    return (np.floor(np.arange(count) * period / loop) * loop + period * late).astype(int) + START
+
+
+@pytest.mark.parametrize(
+    "times",
+    [stamps(1000), stamps(1000, jitter=0.4), stamps(1000, loop=666_667), stamps(1000, loop=400_000), stamps(2)],
+    ids=["exact", "jitter", "slow loop", "loop", "two"],
+)
+def test_missing_messages_are_counted_with_jitter(times):
+    missing, complete = MissingMessages(), MissingMessages()
+    removed = {*range(300, 345), 500, 700, 702} if len(times) > 2 else set()
+    for k, time_ns in enumerate(times):
+        complete.add(int(time_ns))
+        if k not in removed:
+            missing.add(int(time_ns))
+            missing.add(int(time_ns))
+    assert (complete.count, missing.count) == (0, len(removed))
+
+
+def test_clock_that_is_set_back_is_no_gap():
+    missing = MissingMessages()
+    for time_ns in [*stamps(50), *(stamps(50) - 10**12)]:
+        missing.add(int(time_ns))
+    assert (missing.count, missing.longest) == (0, pytest.approx(1e-3, abs=1e-9))
+
+
 @pytest.mark.parametrize("publisher", ["reliable"], indirect=True)
 def test_messages_name_the_topics_that_exist(publisher, tmp_path, monkeypatch):
     monkeypatch.setattr(discovery, "_DISCOVERY", 1.5)
@@ -98,13 +155,16 @@ class SubstituteDomain:
 
     def subscribe(self, topic, message_type, *, depth, reliable):
         pending = iter(self._messages.get(topic, ()))
-        return SimpleNamespace(topic=topic, num_lost=0, take=lambda: [m for m in [next(pending, None)] if m])
+        return SimpleNamespace(topic=topic, take=lambda: [m for m in [next(pending, None)] if m])
 
     def wait(self, seconds):
         pass
 
     def wait_until(self, condition, seconds):
         return condition()
+
+    def close(self):
+        pass
 
 
 @pytest.fixture
@@ -141,7 +201,7 @@ def test_invalid_messages_do_not_start_the_recording(record, tmp_path):
 
 def test_missing_jaw_is_noted(record):
     recorder, lines = record({TOPIC: [message(k) for k in range(9)]})
-    assert any(line.endswith(f"0 lost, no message on {JAW}") for line in lines)
+    assert any(line.endswith(f"0 missing, no message on {JAW}") for line in lines)
     assert recorder.notes() == [f"no message on {JAW}; commands of dvrk-drake need this topic"]
 
 

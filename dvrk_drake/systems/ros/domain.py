@@ -7,10 +7,12 @@ import contextlib
 import ctypes
 import os
 import select
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from textwrap import shorten
+from weakref import WeakSet, finalize
 
 from cyclonedds.__library__ import library_path
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
@@ -57,6 +59,33 @@ class Endpoint:
     is_own: bool
 
 
+class _WakeUpPipe:
+    """Pipe to which listeners write, because Cyclone DDS has no file descriptor for arriving messages.
+
+    Attributes:
+        readable: File descriptor that is readable after a message has arrived, or -1 after the end.
+    """
+
+    def __init__(self) -> None:
+        self.readable, self._writable = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._lock = threading.Lock()
+
+    def notify(self, reader: DataReader) -> None:
+        """Makes the pipe readable. Cyclone DDS calls this function in a thread of its own, also after `close`."""
+        # A full pipe already wakes up the reader. The number of a closed descriptor may belong to another file.
+        with self._lock, contextlib.suppress(BlockingIOError):
+            if self._writable >= 0:
+                os.write(self._writable, b"\0")
+
+    def close(self) -> None:
+        """Closes both ends. Repeated calls have no effect."""
+        with self._lock:
+            for descriptor in (self.readable, self._writable):
+                if descriptor >= 0:
+                    os.close(descriptor)
+            self.readable = self._writable = -1
+
+
 class RosDomain:
     """DDS participant of a ROS 2 domain.
 
@@ -90,13 +119,18 @@ class RosDomain:
         }
         self._unread = ReadCondition(self._publications, SampleState.NotRead | ViewState.Any | InstanceState.Any)
         self._num_changes = 0
-        # Cyclone DDS has no file descriptor for arriving messages. Its listeners write to this pipe.
-        self._readable, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._topics: WeakSet[Publisher | Subscription] = WeakSet()
+        self._pipe = _WakeUpPipe()
+        finalize(self, self._pipe.close).atexit = False
 
     def close(self) -> None:
-        """Leaves the domain. Publishers and subscriptions of this domain must not be used any more."""
+        """Leaves the domain and ends its publishers and subscriptions. None of them must be used any more."""
+        for topic in list(self._topics):
+            topic.close()
+        self._topics.clear()
         self.participant = self._publications = self._subscriptions = None
         self._alive, self._unread = {}, None
+        self._pipe.close()
 
     @property
     def num_changes(self) -> int:
@@ -131,7 +165,9 @@ class RosDomain:
             depth: Number of messages that are kept for slow subscriptions.
             latched: Whether subscriptions that join later receive the last 100 messages.
         """
-        return Publisher(self.participant, topic, message_type, _LATCHED if latched else depth, latched)
+        publisher = Publisher(self.participant, topic, message_type, _LATCHED if latched else depth, latched)
+        self._topics.add(publisher)
+        return publisher
 
     def subscribe(
         self,
@@ -160,23 +196,26 @@ class RosDomain:
         qos = ros_qos(
             depth, reliable=reliable, latched=latched, type_hash=type_hash(message_type), ignore_own=ignore_own
         )
-        return Subscription(self.participant, topic, message_type, qos, self._notify if wakes else None)
+        notify = self._pipe.notify if wakes else None
+        subscription = Subscription(self.participant, topic, message_type, qos, depth, notify)
+        self._topics.add(subscription)
+        return subscription
 
     def fileno(self) -> int:
         """Returns a file descriptor that is readable after a message of a subscription has arrived."""
-        return self._readable
+        return self._pipe.readable
 
     def clear(self) -> None:
         """Makes the file descriptor unreadable until the next message arrives. Call this method before `take`."""
         try:
-            while os.read(self._readable, 4096):
+            while os.read(self._pipe.readable, 4096):
                 pass
         except BlockingIOError:
             pass
 
     def wait(self, seconds: float) -> bool:
         """Waits until a message of a subscription arrives, at most `seconds`. Returns whether one arrived."""
-        ready = bool(select.select([self._readable], [], [], max(seconds, 0.0))[0])
+        ready = bool(select.select([self._pipe.readable], [], [], max(seconds, 0.0))[0])
         if ready:
             self.clear()
         return ready
@@ -193,11 +232,6 @@ class RosDomain:
         while not (met := condition()) and (left := end - time.monotonic()) > 0:
             self.wait(min(poll, left))
         return met
-
-    def _notify(self, reader: DataReader) -> None:
-        # Cyclone DDS calls this function in a thread of its own. A full pipe already wakes up the reader.
-        with contextlib.suppress(BlockingIOError):
-            os.write(self._wake, b"\0")
 
     def _endpoints(self, reader: BuiltinDataReader) -> list[Endpoint]:
         found = []

@@ -11,7 +11,7 @@ import queue
 import threading
 import weakref
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 from uuid import UUID
 
 from cyclonedds.core import DDSException, Listener, Policy, Qos
@@ -128,6 +128,10 @@ class Publisher(Generic[Message]):
         except DDSException as error:
             raise DvrkDrakeError(f"{self.topic}: the message could not be sent: {error}") from error
 
+    def close(self) -> None:
+        """Ends the publisher. It must not be used any more."""
+        del self._writer
+
     def num_subscribers(self) -> int:
         """Returns the number of subscriptions that receive the messages."""
         return len(self._writer.get_matched_subscriptions())
@@ -150,7 +154,8 @@ class Subscription(Generic[Message]):
 
     Attributes:
         topic: ROS 2 name of the topic.
-        num_malformed: Number of messages with a text that is not UTF-8. DDS itself discards messages of another layout.
+        num_malformed: Number of messages that could not be decoded, e.g. because a text is not UTF-8. DDS itself
+            discards messages of another layout.
     """
 
     def __init__(
@@ -159,20 +164,17 @@ class Subscription(Generic[Message]):
         topic: str,
         message_type: type[Message],
         qos: Qos,
+        depth: int,
         notify: Callable[[DataReader], None] | None,
     ) -> None:
         """Subscribes to a topic, see `RosDomain.subscribe`."""
         self.topic, self.num_malformed = topic, 0
         self._message_type = message_type
-        self._lost = lost = [0]
-
-        def count_lost(reader: DataReader, status: Any) -> None:
-            # Cyclone DDS calls this function in a thread of its own.
-            lost[0] = status.total_count
-
+        # DDS keeps `depth` messages. The end of a publisher is a sample as well.
+        self._at_once = depth + 1
         # The listener must not refer to this object. In a reference cycle, cyclonedds frees the listener, but does not
         # delete the reader in DDS, and the next event causes a segmentation fault.
-        listener = Listener(on_sample_lost=count_lost)
+        listener = Listener()
         if notify is not None:
             listener.set_on_data_available(notify)
         self._reader = DataReader(
@@ -181,17 +183,22 @@ class Subscription(Generic[Message]):
         _READERS.add(self._reader)
         _LISTENERS.append(listener)
         _start_deletion()
-        weakref.finalize(self, _UNUSED.put, self._reader).atexit = False
+        self._end = weakref.finalize(self, _UNUSED.put, self._reader)
+        self._end.atexit = False
 
-    @property
-    def num_lost(self) -> int:
-        """Returns the number of messages that DDS reported as lost."""
-        return self._lost[0]
+    def close(self) -> None:
+        """Ends the subscription. It must not be used any more."""
+        _remove_listener(self._reader)
+        del self._reader
+        self._end()
 
     def take(self) -> list[tuple[Message, int]]:
-        """Returns the messages since the last call, with their times of publication [ns since 1970]."""
+        """Returns messages since the last call, with their times of publication [ns since 1970].
+
+        At most as many samples are taken as DDS keeps, so that a flood of messages cannot delay the caller for ever.
+        """
         messages: list[tuple[Message, int]] = []
-        while True:
+        for _ in range(self._at_once):
             try:
                 samples = self._reader.take(1)
             except DDSException:
@@ -200,10 +207,11 @@ class Subscription(Generic[Message]):
                 self.num_malformed += 1
                 continue
             if not samples:
-                return messages
+                break
             sample = samples[0]
             if isinstance(sample, self._message_type):
                 messages.append((sample, sample.sample_info.source_timestamp))
+        return messages
 
     def num_publishers(self) -> int:
         """Returns the number of publishers whose messages are received."""
