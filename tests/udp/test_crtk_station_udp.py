@@ -10,6 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 from ros_publisher import DOMAIN_FILE
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import StationError
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.station_config import load_station_config, make_arm_station
@@ -50,3 +51,27 @@ def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
         np.testing.assert_allclose(applied[-1][0].effort, gravity, rtol=0, atol=0.05)
         # The Diagram no longer advances, so the deadman process holds the arm.
         assert arm.domain.wait_until(lambda: bool(holds.take()), 20.0)
+
+
+def test_later_station_of_a_process_replaces_an_earlier_one(tmp_path, monkeypatch):
+    """In a notebook, the Diagram of the first station still exists when its cell is executed again."""
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    path = tmp_path / "station.yaml"
+    path.write_text(yaml.safe_dump({"arm": "mtml", "ros_driver": {}}))
+    config, simulators = load_station_config(path), []
+    with start_simulated_arm("mtml", "MTML", 1000.0) as arm:
+        for word, homed in (("enable", False), ("home", True)):
+            arm.state_command(word)
+            assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)
+        for _ in range(3):
+            station = make_arm_station(config, hardware=True)
+            simulators.append(Simulator(station))
+            measured = station.GetOutputPort("mtml.position_measured")
+            while not np.all(np.isfinite(measured.Eval(simulators[-1].get_context()))):
+                time = simulators[-1].get_context().get_time()
+                simulators[-1].AdvanceTo(time + 0.01)
+                assert time < 60.0, "no measurement"
+        for simulator in simulators[:-1]:
+            with pytest.raises(StationError, match=r"^/MTML: this station has ended, because a later station of this"):
+                simulator.AdvanceTo(simulator.get_context().get_time() + 0.01)
+        simulators[-1].AdvanceTo(simulators[-1].get_context().get_time() + 0.01)

@@ -120,6 +120,11 @@ class CrtkBridge:
         self._has_commands = True
 
     @property
+    def client(self) -> CrtkClient:
+        """Client of the arm."""
+        return self._client
+
+    @property
     def is_commanded(self) -> bool:
         """True if a controller commands positions or efforts."""
         return self.guard.state in (lcmt_dvrk_status.STATE_POSITION, lcmt_dvrk_status.STATE_EFFORT)
@@ -388,8 +393,13 @@ def connect_bridge(
     """
     ros = open_ros_domain(domain)
     commands = ("servo_jp", "servo_jf", "hold")
-    client = connect_client(ros, arm, topic, commands, report=report, stopped=stopped, polled=polled)
-    deadman = DeadmanProcess(client.namespace, domain, stopped)
+    try:
+        client = connect_client(ros, arm, topic, commands, report=report, stopped=stopped, polled=polled)
+        deadman = DeadmanProcess(client.namespace, domain, stopped)
+    except BaseException:
+        # A traceback may keep the publishers, which a second attempt would find.
+        ros.close()
+        raise
     report(
         f"deadman process {deadman.pid} publishes hold if this bridge is silent for 50 ms; it has "
         f"{describe_priority(deadman.pid)}"

@@ -9,13 +9,37 @@ from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.lcm import LcmInterfaceSystem
 
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, compile_guard, connect_bridge
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
+from dvrk_drake.systems.ros.open_domain import domain_number
 
 #: Period in which the system receives measurements and publishes commands [s].
 _PERIOD = 1e-3
+
+
+#: Bridges of this process, each with the number of its ROS domain.
+_BRIDGES: list[tuple[int, CrtkBridge]] = []
+
+
+@atexit.register
+def _close_bridges() -> None:
+    for _, bridge in _BRIDGES:
+        bridge.close()
+
+
+def _close_earlier(arm: Arm, driver: CrtkDriver) -> None:
+    """Ends the bridge of an earlier station to the same arm, whose Diagram may still exist, e.g. in a notebook."""
+    number = domain_number(driver.domain)
+    wanted = f"/{driver.namespace.strip('/')}".removesuffix("/measured_js")
+    for entry in list(_BRIDGES):
+        client = entry[1].client
+        if entry[0] == number and client.arm.name == arm.name and wanted in ("/", client.namespace):
+            _BRIDGES.remove(entry)
+            entry[1].close()
+            client.domain.close()
 
 
 class CrtkBridgeSystem(LeafSystem):
@@ -23,6 +47,8 @@ class CrtkBridgeSystem(LeafSystem):
 
     The Simulator must run in real time (`set_target_realtime_rate(1.0)`). If it stops, the arm holds its pose after 50
     ms, because the deadman process publishes `hold`. Changes of the guard's state are logged as warnings.
+
+    A later system for the same arm in this process ends the bridge of this system.
     """
 
     def __init__(self, arm: Arm, driver: CrtkDriver, lcm: DrakeLcm) -> None:
@@ -38,6 +64,7 @@ class CrtkBridgeSystem(LeafSystem):
         """
         super().__init__()
         guard_driver = driver.guard_driver()
+        _close_earlier(arm, driver)
         compile_guard(arm, guard_driver)
         self._bridge: CrtkBridge = connect_bridge(
             arm,
@@ -47,11 +74,16 @@ class CrtkBridgeSystem(LeafSystem):
             domain=driver.domain,
             report=logging.getLogger(__name__).warning,
         )
-        atexit.register(self._bridge.close)
+        _BRIDGES.append((domain_number(driver.domain), self._bridge))
         lcm.Subscribe(command_channel(arm), self._bridge.put)
         self.DeclarePeriodicPublishEvent(_PERIOD, 0.0, self._update)
 
     def _update(self, context: Context) -> None:
+        if all(bridge is not self._bridge for _, bridge in _BRIDGES):
+            raise StationError(
+                f"{self._bridge.client.namespace}: this station has ended, because a later station of this process "
+                "connected to the arm. Use the later station"
+            )
         self._bridge.update()
 
 

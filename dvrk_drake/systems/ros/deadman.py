@@ -229,11 +229,12 @@ class DeadmanProcess:
             is_confirmed: Whether the arm has confirmed `hold`. If not, the process sends `hold` until the arm confirms
                 it, also after the end of the bridge.
         """
-        assert self._process.stdin is not None
+        assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(OSError):
             if is_confirmed:
                 self._process.stdin.write(b"\0")
             self._process.stdin.close()
+        self._process.stdout.close()
         if not is_confirmed:
             return
         try:

@@ -238,6 +238,7 @@ def test_stopped_start_leaves_no_process(monkeypatch, error):
         DeadmanProcess(ARM, None, stopped)
     assert error or "the start of the deadman process was stopped; no command was sent" in str(raised.value)
     assert started[0].poll() is not None
+    assert started[0].stdin.closed and started[0].stdout.closed
 
 
 #: Prints the requested priority, and that of a thread that started afterwards, as the threads of DDS do.
