@@ -44,6 +44,7 @@ def bridge(
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import load_driver, stop_on_signals
+    from dvrk_drake.processes.teacher import EnterKey
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
     from dvrk_drake.systems.ros.open_domain import domain_number
 
@@ -73,6 +74,7 @@ def bridge(
         stopped=stopped,
         report=lambda line: print(line, flush=True),
         ready=ready,
+        enter=EnterKey.of_terminal(),
     )
     if not is_confirmed:
         raise ControllerError("the bridge has ended, but the arm has not confirmed hold. The deadman process continues")

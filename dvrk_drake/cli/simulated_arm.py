@@ -79,6 +79,7 @@ def arm(
     from dvrk_drake.processes.live_view import live_view
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
+    from dvrk_drake.processes.teacher import EnterKey
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
     quiet_drake()
@@ -103,7 +104,7 @@ def arm(
                 print_warning(warning)
         settle_memory()
         print(f"simulated {simulated_arm.name} on LCM {url}; press Ctrl-C to end", flush=True)
-        pace = simulated.run(stopped, lambda line: print(line, flush=True))
+        pace = simulated.run(stopped, lambda line: print(line, flush=True), EnterKey.of_terminal())
     print(f"ended; {pace.describe()}", flush=True)
 
 

@@ -34,6 +34,7 @@ def run_bridge(
     stopped: Callable[[], bool],
     report: Callable[[str], None],
     ready: Callable[[], None] = lambda: None,
+    enter: Callable[[], bool] = lambda: False,
 ) -> bool:
     """Connects an arm until `stopped` returns true. The arm then holds its pose.
 
@@ -48,6 +49,8 @@ def run_bridge(
         stopped: Function that returns whether to stop.
         report: Function that is called with one line for each change of the state.
         ready: Function that is called before the networks are opened, e.g. to request real-time scheduling.
+        enter: Function that returns whether a person pressed Enter since the last call; see
+            `CommandGuard.allow_reset`.
 
     Returns:
         Whether the arm has confirmed the last command, `hold`.
@@ -87,6 +90,8 @@ def run_bridge(
                 for _ in range(_MESSAGES_PER_STEP):
                     if not handle_message(network, 0.0):
                         break
+            if enter():
+                bridge.guard.allow_reset()
             is_answer = bridge.update()
             if polls:
                 timeout = 0.0 if bridge.is_commanded and not is_answer else _PAUSE

@@ -169,7 +169,12 @@ class SimulatedArm:
         """Publishes the last status."""
         network.publish(status_channel(self.arm), self._status)
 
-    def run(self, stopped: Callable[[], bool], report: Callable[[str], None] = lambda line: None) -> Pace:
+    def run(
+        self,
+        stopped: Callable[[], bool],
+        report: Callable[[str], None] = lambda line: None,
+        enter: Callable[[], bool] = lambda: False,
+    ) -> Pace:
         """Steps the simulation by the wall clock until `stopped` returns true.
 
         A status is published when a tick begins. The simulation then computes the next state while the controller
@@ -178,6 +183,8 @@ class SimulatedArm:
         Args:
             stopped: Function that returns whether to stop. It is called once per tick.
             report: Function that is called with a line of text at every change of the guard's state.
+            enter: Function that returns whether a person pressed Enter since the last call; see
+                `CommandGuard.allow_reset`.
 
         Returns:
             Pace with the number of late ticks.
@@ -196,6 +203,8 @@ class SimulatedArm:
         described = ""
         while not stopped():
             pace.wait()
+            if enter():
+                self._driver.AllowReset()
             for _ in range(_MESSAGES_PER_STEP):
                 if not handle_message(network, 0.0):
                     break

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import select
+import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
@@ -130,11 +131,25 @@ class EnterKey:
     def __init__(self, stream: IO[str]) -> None:
         """Starts reading `stream`, e.g. sys.stdin. No other code may read from this stream."""
         self._descriptor, self._open = stream.fileno(), True
+        self._is_terminal = os.isatty(self._descriptor)
+
+    @classmethod
+    def of_terminal(cls) -> Callable[[], bool]:
+        """Returns an object for the terminal of this process, or a function that returns False without a terminal."""
+        return cls(sys.stdin) if sys.stdin is not None and sys.stdin.isatty() else lambda: False
 
     def __call__(self) -> bool:
         """Returns whether Enter was pressed since the last call, or False after the end of the stream."""
-        if not self._open or not select.select([self._descriptor], [], [], 0.0)[0]:
+        if not self._open:
             return False
-        data = os.read(self._descriptor, 4096)
+        try:
+            # The system would stop a background process that reads from its terminal.
+            if self._is_terminal and os.tcgetpgrp(self._descriptor) != os.getpgrp():
+                return False
+            if not select.select([self._descriptor], [], [], 0.0)[0]:
+                return False
+            data = os.read(self._descriptor, 4096)
+        except OSError:  # the terminal was closed
+            data = b""
         self._open = bool(data)
         return b"\n" in data

@@ -34,6 +34,7 @@ class HardwareArmStation(Diagram):
     DVRK_COMMAND messages every `driver.status_period` and on forced publishing. The command guard of the arm checks
     these messages. With a `CrtkDriver`, the guard and the bridge to ROS 2 are part of this station, and the messages
     stay in memory; see `CrtkBridgeSystem`. If the effort input is unconnected, the messages command HOLD.
+    These messages also end the control of another process.
 
     If the watchdog of the guard holds the arm, e.g. because this process stopped for 50 ms, an operator must resume:
 

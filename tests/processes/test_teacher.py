@@ -1,6 +1,7 @@
 """Poses that are taught by hand."""
 
 import os
+import pty
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,4 +95,29 @@ def test_enter_key_does_not_block():
         os.write(writing, b"\n")
         assert key() and not key()
         os.close(writing)
+        assert not key() and not key()
+
+
+def test_background_process_does_not_read_its_terminal(monkeypatch):
+    """The system would stop a background process, e.g. a bridge, that reads from its terminal."""
+    master, slave = pty.openpty()
+    foreground = os.getpgrp() + 1
+    monkeypatch.setattr(os, "tcgetpgrp", lambda descriptor: foreground)
+    with open(slave) as stream:
+        key = EnterKey(stream)
+        os.write(master, b"\n")
+        assert not key() and not key()
+        foreground = os.getpgrp()
+        assert key()
+    os.close(master)
+
+
+def test_closed_terminal_ends_no_process(monkeypatch):
+    master, slave = pty.openpty()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda descriptor: os.getpgrp())
+    with open(slave) as stream:
+        key = EnterKey(stream)
+        os.write(master, b"\n")
+        assert key() and not key()
+        os.close(master)
         assert not key() and not key()

@@ -225,7 +225,7 @@ def test_invalid_numbers_are_refused(options, what):
         FrictionCompensator(FRICTION, **{"holding_error": NO_EFFORT, **options})
 
 
-def test_friction_is_compensated_only_with_an_error_bound_of_gravity():
+def test_compensation_needs_an_error_bound_of_gravity():
     with pytest.raises(ControllerError, match="a friction ratio above 0 requires holding_error"):
         FrictionCompensator(FRICTION)
     FrictionCompensator(FRICTION, ratio=0.0, hysteresis_ratio=0.5)

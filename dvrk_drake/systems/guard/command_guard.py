@@ -38,6 +38,15 @@ _MAX_STEP = 0.01
 #: been moved.
 _MAX_GAP = 0.1
 
+#: Number of faults within a time [us] after which only a person at the arm's process allows a reset. A controller that
+#: answers each fault with a reset would otherwise have EFFORT again after `start_time`.
+_MAX_FAULTS, _FAULT_TIME = 3, 10_000_000
+
+_PERSON = (
+    f". {_MAX_FAULTS} faults within {_FAULT_TIME / 1e6:g} s: look at the arm, and press Enter in the terminal of its "
+    "process, or restart this process"
+)
+
 #: States in which a position controller regulates the arm to a target.
 _REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
 
@@ -136,7 +145,8 @@ class CommandGuard:
     - a fault that the driver reports.
 
     A fault is reset by a HOLD command in which `reset_fault` changes from false to true. If the cause persists, the
-    fault occurs again.
+    fault occurs again. After three faults within 10 s, a person at the arm's process must first allow the reset; see
+    `allow_reset`. Faults that the driver reports are not counted.
 
     **Bumpless transfer**: After STARTING, HOLD keeps the target of the position controller. After POSITION or FAULT,
     HOLD keeps this target only if the arm is near the target. Otherwise, HOLD latches the measured pose as the target.
@@ -200,6 +210,8 @@ class CommandGuard:
         )
         self._in_force = CommandInForce()
         self._powered = True
+        #: Times of the last faults [us], except those that the driver reported.
+        self._fault_times: tuple[int, ...] = ()
         #: Reason why the last measurement is invalid. Empty if it is valid.
         self._problem = ""
         self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
@@ -367,8 +379,23 @@ class CommandGuard:
             powered = self._powered
             self._hold()
             self.state, self._powered = lcmt_dvrk_status.STATE_FAULT, powered
-            self.fault_code, self.fault_text = code, text
+            # The driver reports a fault before each step until its cause has ended, so a reset cannot end it.
+            if code != lcmt_dvrk_status.FAULT_DRIVER:
+                now = self._measured.utime or 0
+                self._fault_times = (*(time for time in self._fault_times if now - time <= _FAULT_TIME), now)
+            self.fault_code, self.fault_text = code, text + (_PERSON if self.needs_person else "")
         self._powered &= has_power
+
+    @property
+    def needs_person(self) -> bool:
+        """True if resets are refused until a person at the arm's process allows them; see `allow_reset`."""
+        return self.state == lcmt_dvrk_status.STATE_FAULT and len(self._fault_times) >= _MAX_FAULTS
+
+    def allow_reset(self) -> None:
+        """Allows the reset of a fault after several faults. Call this method only for a person at the arm's process."""
+        if self.needs_person:
+            self._fault_times = ()
+            self.fault_text = self.fault_text.removesuffix(_PERSON)
 
     def block(self, reason: str) -> None:
         """Refuses POSITION and EFFORT until the driver calls this method with "". The arm holds in the meantime.
@@ -492,7 +519,9 @@ class CommandGuard:
         elif mode == lcmt_dvrk_command.HOLD:
             # The pose that is held after a reset must be a valid and plausible measurement.
             problem = self._problem or self.limits.implausible_pose(self._q())
-            if resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
+            if self.needs_person:
+                pass
+            elif resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
                 self.fault_text = problem
             elif resets and not problem:
                 self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""

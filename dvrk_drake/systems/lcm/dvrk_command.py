@@ -172,7 +172,7 @@ class DvrkCommandReceiver(LeafSystem):
         """
         super().__init__()
         n = arm.num_joints
-        self.stalled = False
+        self.stalled = self._allows_reset = False
         self._num_joints, self._clock = n, clock or ArmClock()
         self._effort_limits = arm.effort_limits
         self._command = self.DeclareAbstractInputPort("lcmt_dvrk_command", AbstractValue.Make(lcmt_dvrk_command()))
@@ -196,6 +196,10 @@ class DvrkCommandReceiver(LeafSystem):
         """Adds a received message to the inbox that the next update reads."""
         self._inbox.put(data)
 
+    def AllowReset(self) -> None:
+        """Allows the reset of a fault in the next update; see `CommandGuard.allow_reset`."""
+        self._allows_reset = True
+
     def GetGuard(self, context: Context) -> CommandGuard:
         """Returns the guard of this context, read-only."""
         return context.get_abstract_state(int(self._guard)).get_value()
@@ -205,6 +209,9 @@ class DvrkCommandReceiver(LeafSystem):
             return
         guard = state.get_mutable_abstract_state(int(self._guard)).get_mutable_value()
         utime = self._clock.utime(context)
+        if self._allows_reset:
+            self._allows_reset = False
+            guard.allow_reset()
         self._inbox.deliver(guard, utime)
         if self._command.HasValue(context):
             command = self._command.Eval(context)

@@ -110,6 +110,10 @@ class SimDvrkDriver(Diagram):
         """Adds a message of the command channel to the inbox that the next update reads."""
         self._receiver.Receive(data)
 
+    def AllowReset(self) -> None:
+        """Allows the reset of a fault in the next update; see `CommandGuard.allow_reset`."""
+        self._receiver.AllowReset()
+
     def SetStalled(self, stalled: bool) -> None:
         """Stops or continues the steps of the guard, to simulate a bridge whose process is stopped.
 

@@ -45,6 +45,48 @@ def test_reset_requires_a_change_of_the_flag():
     assert (bench.guard.state, bench.guard.fault_code, bench.guard.fault_text) == (Status.STATE_HOLD, 0, "")
 
 
+def reset(bench):
+    """Resets a fault as a controller would do it. Returns whether the guard accepts efforts again."""
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    return bench.guard.state == Status.STATE_HOLD
+
+
+PERSON = (
+    "oscillates. 3 faults within 10 s: look at the arm, and press Enter in the terminal of its process, or restart "
+    "this process"
+)
+
+
+def test_third_fault_within_ten_seconds_needs_a_person():
+    bench = Bench()
+    for _ in range(2):
+        bench.started().guard.report_fault("oscillates", Status.FAULT_OSCILLATION)
+        assert (bench.guard.fault_text, reset(bench)) == ("oscillates", True)
+    bench.guard.allow_reset()  # has no effect before it is needed
+    bench.started().guard.report_fault("oscillates", Status.FAULT_OSCILLATION)
+    assert (bench.guard.fault_text, bench.guard.needs_person) == (PERSON, True)
+    for _ in range(2):
+        assert not any(reset(bench) for _ in range(20))
+        bench.tick(12_000)  # waiting does not help
+    assert (bench.guard.fault_text, bench.guard.accepted_modes) == (PERSON, modes(Command.HOLD))
+    bench.guard.allow_reset()
+    assert (bench.guard.state, bench.guard.fault_text) == (Status.STATE_FAULT, "oscillates")
+    assert reset(bench)
+    bench.started()
+
+
+def test_rare_faults_and_faults_of_the_driver_need_no_person():
+    bench = Bench()
+    for _ in range(4):
+        bench.guard.report_fault("oscillates", Status.FAULT_OSCILLATION)
+        assert reset(bench)
+        bench.tick(5001)
+    for _ in range(4):
+        bench.guard.report_fault("no power", has_power=False)
+        assert reset(bench)
+
+
 def test_pose_beyond_limit_faults_in_effort_mode():
     bench = Bench().started()
     bench.q = Q.copy()

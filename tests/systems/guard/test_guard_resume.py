@@ -109,7 +109,7 @@ def test_old_hold_of_another_sender_is_ignored():
         assert (code, bench.guard.state) == (Status.REFUSAL_OTHER_SENDER, Status.STATE_EFFORT)
 
 
-def test_hold_of_another_sender_neither_supplies_power_nor_resets():
+def test_hold_of_another_sender_does_not_reset():
     bench = Bench(modes=WITH_OFF)
     bench.run(Command.HOLD, 1)
     bench.run(Command.OFF, 1)

@@ -313,3 +313,16 @@ def test_messages_require_the_same_key(tmp_path):
         owner.step()
         np.testing.assert_allclose(port.Eval(station.GetMyContextFromRoot(context)), POSES["mtml"], atol=1e-3)
     assert arm.drift() < 1e-3
+
+
+def test_person_at_the_process_of_the_arm_allows_a_reset():
+    arm = SimulatedArm(DrakeLcm("memq://"))
+    for _ in range(3):
+        arm.guard.report_fault("oscillates", Status.FAULT_OSCILLATION)
+        arm.guard.state = Status.STATE_FAULT if arm.guard.needs_person else Status.STATE_HOLD
+    arm.step()
+    assert arm.guard.needs_person
+    arm.driver.AllowReset()
+    arm.step()
+    arm.step()
+    assert not arm.guard.needs_person
