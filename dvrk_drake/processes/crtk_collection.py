@@ -17,6 +17,7 @@ from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, approaches, estimated_duration
+from dvrk_drake.processes.recorder import MissingMessages
 from dvrk_drake.recordings.arm_bag import joint_state_topics
 from dvrk_drake.recordings.mcap_writer import GrowingMcap, Topic
 from dvrk_drake.recordings.pose_file import CollectionFile
@@ -73,6 +74,7 @@ class MeasurementBag:
         topics = [topic.name for topic in joint_state_topics(arm, namespace)]
         self._subscriptions = [domain.subscribe(topic, JointState, depth=_DEPTH) for topic in topics]
         self._bag = GrowingMcap(path, [Topic(topic, JOINT_STATE) for topic in topics])
+        self._missing = [MissingMessages() for _ in topics]
 
     def update(self) -> None:
         """Writes the messages that have arrived.
@@ -80,11 +82,18 @@ class MeasurementBag:
         Raises:
             RecordingError: The messages cannot be written.
         """
-        for subscription in self._subscriptions:
+        for subscription, missing in zip(self._subscriptions, self._missing, strict=True):
             for message, published in subscription.take():
+                if message.header.nanoseconds:  # 0 marks invalid data
+                    missing.add(message.header.nanoseconds)
                 # ROS 2 uses version 1 of the CDR encoding.
                 data = message.serialize(use_version_2=False)
                 self._bag.write_encoded(subscription.topic, data, published, time.time_ns())
+
+    @property
+    def num_missing(self) -> int:
+        """Number of messages that are missing in the bag, from gaps of the time stamps."""
+        return sum(missing.count for missing in self._missing)
 
     def close(self) -> None:
         """Ends the bag.
@@ -152,26 +161,26 @@ def run_crtk_collection(
     control_model = ControlModel(model or IdentifiedModel.from_arm(arm))
     control_model.gravity_effort(np.zeros(arm.num_joints))  # compiles the function
     remaining = poses[~output.finished(poses)]
-    ros = open_ros_domain(domain)
-    client = _connect(ros, arm, topic, dialog)
-    assert client.measurement is not None
-    for line in summary(arm, client.measurement.q, remaining, settings):
-        dialog.report(line)
-    dialog.confirm()
-    if dialog.stopped():
-        return None
-    collector = CrtkCollector(
-        poses,
-        client,
-        output,
-        settings,
-        control_model,
-        stopped=dialog.stopped,
-        enter=dialog.enter,
-        report=dialog.report,
-    )
-    recorder = MeasurementBag(ros, arm, client.namespace, bag)
     with contextlib.ExitStack() as stack:
+        ros = stack.enter_context(contextlib.closing(open_ros_domain(domain)))
+        client = _connect(ros, arm, topic, dialog)
+        assert client.measurement is not None
+        for line in summary(arm, client.measurement.q, remaining, settings):
+            dialog.report(line)
+        dialog.confirm()
+        if dialog.stopped():
+            return None
+        collector = CrtkCollector(
+            poses,
+            client,
+            output,
+            settings,
+            control_model,
+            stopped=dialog.stopped,
+            enter=dialog.enter,
+            report=dialog.report,
+        )
+        recorder = MeasurementBag(ros, arm, client.namespace, bag)
         # In the case of an exception, all three are called, the last one first.
         stack.callback(recorder.close)
         stack.callback(output.close)
@@ -181,6 +190,8 @@ def run_crtk_collection(
             collector.update(time.monotonic())
             recorder.update()
             dialog.show(collector.describe)
+    if recorder.num_missing:
+        dialog.report(f"{bag}: messages missing (gaps of the time stamps): {recorder.num_missing}")
     return collector
 
 
