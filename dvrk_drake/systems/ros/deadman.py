@@ -230,10 +230,9 @@ class DeadmanProcess:
                 it, also after the end of the bridge.
         """
         assert self._process.stdin is not None and self._process.stdout is not None
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), self._process.stdin:  # the process may have ended
             if is_confirmed:
                 self._process.stdin.write(b"\0")
-            self._process.stdin.close()
         self._process.stdout.close()
         if not is_confirmed:
             return
