@@ -146,7 +146,7 @@ def test_random_commands_of_others_stop_the_bridge(arm, tmp_path):
     try:
         wait_for_line(bridge, "effort, sender")
         publishers = [other.advertise("/MTML/servo_jf", arm.m.JointState)]
-        line = wait_for_line(bridge, "fault: ")
+        line = wait_for_line(bridge, "fault: another")
         assert line.startswith("fault: another process publishes /MTML/servo_jf. End it")
         publishers += [other.advertise(f"/MTML/{name}", arm.m.JointState) for name in ("servo_jp", "move_jp")]
         operator.until(lambda status: status.guard_state == Status.STATE_FAULT, "fault", process=bridge)

@@ -72,8 +72,16 @@ def test_latched_states_reach_a_late_subscription(domain, arm):
     # The answer of the arm arrives after anything that the arm would send to the volatile subscription.
     command, measured = domain.advertise(ros_arm.COMMAND, JointState), domain.subscribe(ros_arm.MEASURED, JointState)
     assert domain.wait_until(lambda: command.num_subscribers() and measured.num_publishers(), TIMEOUT)
-    command.publish(joint_state(1))
-    assert received(domain, measured, 1) == [joint_state(1)]
+    answers = []
+
+    def is_answered():
+        """Repeats the command, since the arm may not have discovered the subscription of its answer yet."""
+        command.publish(joint_state(1))
+        answers.extend(message for message, _ in measured.take())
+        return answers
+
+    assert domain.wait_until(is_answered, TIMEOUT)
+    assert answers[0] == joint_state(1)
     assert volatile.take() == []
     latched = domain.subscribe(ros_arm.STATE, OperatingState, depth=100, latched=True)
     assert [m.state for m in received(domain, latched, len(ros_arm.STATES))] == ros_arm.STATES
