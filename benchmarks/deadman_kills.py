@@ -48,10 +48,7 @@ from ros_bridge import CommandMonitor
 from ros_publisher import DOMAIN_FILE
 
 from dvrk_drake import cli
-from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.pace import make_realtime
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.ros.crtk_bridge import compile_guard
 
 #: Name of each condition, processes that get the signal, and the signal.
 CONDITIONS = {
@@ -258,7 +255,3 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
-elif __name__ == "__mp_main__":
-    # Compile the guards once, in the process from which the bridges are forked.
-    for arm_name in ("mtml", "psm"):
-        compile_guard(load_arm(arm_name), DvrkDriver())

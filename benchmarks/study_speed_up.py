@@ -2,7 +2,7 @@
 
     python benchmarks/study_speed_up.py [STUDY.yaml] [--workers 1 2] [--set duration=11]
 
-The times include starting the workers. Each worker imports Drake and compiles the equations of the arm.
+The times include starting the workers. Each worker imports Drake.
 """
 
 import argparse

@@ -112,7 +112,7 @@ def run(
         print(status, flush=True)
 
     try:
-        # Messages that arrived during the compilation of the controller are out of date, so a new link is opened.
+        # Messages that arrived during the creation of the controller are out of date, so a new link is opened.
         control(link(), controller, stopped, show)
     finally:
         line.clear()

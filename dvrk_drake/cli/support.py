@@ -63,9 +63,9 @@ def import_interruptibly() -> None:
 def interrupt_ends_process() -> Iterator[None]:
     """Context manager in which Ctrl-C ends the process at once. No file may be partly written in the block.
 
-    A KeyboardInterrupt can be lost, because numba's compiler and extension modules call Python code without propagating
-    exceptions. A handler that the block installs is kept, so that signals are always handled. In a thread, the context
-    manager has no effect.
+    A KeyboardInterrupt can be lost, because extension modules call Python code without propagating exceptions. A
+    handler that the block installs is kept, so that signals are always handled. In a thread, the context manager has no
+    effect.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -59,12 +59,9 @@ def run_bridge(
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
     require_cyclonedds()
-    from dvrk_drake.systems.ros.crtk_bridge import compile_guard, connect_bridge
+    from dvrk_drake.systems.ros.crtk_bridge import connect_bridge
 
-    # Threads of LCM and DDS inherit the scheduling of this thread. A compilation with real-time scheduling would stop
-    # all other processes of its core.
-    compile_guard(arm, driver)
-    ready()
+    ready()  # threads of LCM and DDS inherit the scheduling of this thread
     network, channel, problem = lcm.LCM(url), status_channel(arm), ""
 
     def send_status(data: bytes) -> None:

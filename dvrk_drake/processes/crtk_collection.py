@@ -159,7 +159,6 @@ def run_crtk_collection(
         DvrkDrakeError: The arm is not found or not ready, another process could move it, or a file cannot be written.
     """
     control_model = ControlModel(model or IdentifiedModel.from_arm(arm))
-    control_model.gravity_effort(np.zeros(arm.num_joints))  # compiles the function
     remaining = poses[~output.finished(poses)]
     with contextlib.ExitStack() as stack:
         ros = stack.enter_context(contextlib.closing(open_ros_domain(domain)))

@@ -357,22 +357,22 @@ def test_interrupt_at_any_import_gives_one_line(module):
 
 
 @pytest.mark.parametrize("command", ["arm", "run", "collect", "teach"])
-def test_interrupt_is_not_lost_during_numba_compilation(command, tmp_path, monkeypatch):
+def test_interrupt_is_not_lost_in_extension_modules(command, tmp_path, monkeypatch):
     poses, out = str(tmp_path / "poses.yaml"), str(tmp_path / "out.csv")
     words = [command]
     if command in ("collect", "teach"):
         assert main(["collect", "--arm", "mtml", "--poses", poses, "--random", "1"]) == 0
         words = ["collect", "--poses", poses, *(["--output", out] if command == "collect" else ["--teach"])]
 
-    def compiles(*arguments, **options):
+    def calls_extension_module(*arguments, **options):
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
             signal.sigtimedwait([], 0)  # lets Python call the handler
         sys.exit("the interrupt was lost")
 
     monkeypatch.setattr(control, "first_status", lambda link: (lcmt_dvrk_status(), 1e-3))
-    monkeypatch.setattr(arm_controller, "ArmController", compiles)
-    monkeypatch.setattr(simulated_arm, "SimulatedArm", compiles)
+    monkeypatch.setattr(arm_controller, "ArmController", calls_extension_module)
+    monkeypatch.setattr(simulated_arm, "SimulatedArm", calls_extension_module)
     monkeypatch.setattr(sys, "argv", ["dvrk-drake", *words, "--arm", "mtml", "--lcm-url", "memq://"])
     code, printed = forked_program(main)
     assert printed.splitlines()[-1] == "dvrk-drake: interrupted"

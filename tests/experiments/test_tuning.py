@@ -406,7 +406,6 @@ def test_psm_insertion_ultimate_gain_matches_analytic():
 
 @pytest.mark.slow
 def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
-    # Use one worker process, since each process compiles the arm again.
     monkeypatch.setattr("dvrk_drake.experiments.tuning.tuning.local_executor", partial(local_executor, 1))
     tuning = tune_arm("psm", ["model"], conditions=CONDITIONS[:1], poses=1)
     settling = tuning.comparison.table("model", "settling")

@@ -167,7 +167,7 @@ class Bench:
     """
 
     def __init__(self, arm: Arm, condition: Condition = NOMINAL) -> None:
-        """Builds the loop. The first loop of an arm in a process takes seconds, since it compiles the controller."""
+        """Builds the loop."""
         self.arm = arm
         # Heavier links increase both gravity and inertia. Scale the model so that true and modelled gravity have the
         # ratio `gravity`.

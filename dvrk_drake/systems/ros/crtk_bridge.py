@@ -373,7 +373,7 @@ def connect_bridge(
     stopped: Callable[[], bool] = lambda: False,
     polled: bool = False,
 ) -> CrtkBridge:
-    """Finds an arm on ROS 2 and connects a bridge with its deadman process. Call `compile_guard` before.
+    """Finds an arm on ROS 2 and connects a bridge with its deadman process.
 
     Args:
         arm: Arm to connect.
@@ -389,8 +389,10 @@ def connect_bridge(
         Bridge. Call `CrtkBridge.close` at the end.
 
     Raises:
-        DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
+        DvrkDrakeError: The driver's model cannot be used, the arm is not found, its topics do not fit, or another
+            process could move it.
     """
+    driver.load_model(arm)  # a model that cannot be used is refused before an arm is searched
     ros = open_ros_domain(domain)
     commands = ("servo_jp", "servo_jf", "hold")
     try:
@@ -409,20 +411,3 @@ def connect_bridge(
     except BaseException:
         deadman.close()
         raise
-
-
-def compile_guard(arm: Arm, driver: DvrkDriver) -> None:
-    """Compiles the functions of the guard. During a compilation, no message can be received.
-
-    Args:
-        arm: Arm of the guard.
-        driver: Configuration with the settings and the model of the guard.
-
-    Raises:
-        ModelError: The driver's model cannot be read, or is not valid for this arm.
-    """
-    model = ControlModel(driver.load_model(arm) or IdentifiedModel.from_arm(arm))
-    guard = CommandGuard(arm, draw_id(), model, driver.guard)
-    zero = np.zeros(arm.num_joints)
-    for utime in (1_000, 2_000, 3_000):
-        guard.step(utime, utime, np.clip(zero, arm.position_lower, arm.position_upper), zero, zero)

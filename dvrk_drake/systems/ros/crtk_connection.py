@@ -12,7 +12,7 @@ from pydrake.systems.lcm import LcmInterfaceSystem
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, compile_guard, connect_bridge
+from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, connect_bridge
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import domain_number
 
@@ -65,7 +65,6 @@ class CrtkBridgeSystem(LeafSystem):
         super().__init__()
         guard_driver = driver.guard_driver()
         _close_earlier(arm, driver)
-        compile_guard(arm, guard_driver)
         self._bridge: CrtkBridge = connect_bridge(
             arm,
             guard_driver,

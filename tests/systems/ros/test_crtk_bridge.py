@@ -11,9 +11,6 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import MessageKey, create_key_file
-from dvrk_drake.processes.bridge import run_bridge
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.ros import crtk_bridge
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
 
 HOME = "/MTML: switched off the dVRK's own gravity compensation"
@@ -412,28 +409,6 @@ def test_jaw_is_commanded_again_after_hold_in_a_fault(monkeypatch):
     bench.clear()
     bench.tick(2)
     assert bench.names()[:2] == ["separate/servo_jf", "servo_jf"]
-
-
-def test_guard_is_compiled_once_before_real_time_scheduling(monkeypatch):
-    calls = []
-
-    def refuse(domain):
-        raise DvrkDrakeError("no domain")
-
-    monkeypatch.setattr(crtk_bridge, "compile_guard", lambda *_: calls.append("compile"))
-    monkeypatch.setattr(crtk_bridge, "open_ros_domain", refuse)
-    with pytest.raises(DvrkDrakeError, match="no domain"):
-        run_bridge(
-            ARMS["mtml"],
-            DvrkDriver(),
-            "memq://",
-            topic=None,
-            domain=None,
-            stopped=lambda: False,
-            report=print,
-            ready=lambda: calls.append("ready"),
-        )
-    assert calls == ["compile", "ready"]
 
 
 def test_close_publishes_hold_and_ends_the_deadman(bench):
