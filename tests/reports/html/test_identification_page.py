@@ -277,7 +277,6 @@ def test_command_names_the_report_or_the_option(tmp_path, capsys):
     assert "dvrk-drake validate" in report.read_text()
 
 
-@pytest.mark.slow
 def test_page_in_a_browser(motion, open_page, tmp_path):
     path = tmp_path / "report.html"
     write_report(motion, path)
