@@ -181,7 +181,8 @@ def test_torque_limits_are_the_torque_range_plus_ten_percent():
     arm = model.arm
     file = compensation_from_model(model)
     tau = model.holding_torque(arm.sample_poses(100000, np.random.default_rng(12)))
-    assert np.all((tau >= file.torque_lower) & (tau <= file.torque_upper))
+    rounding = 1e-15  # the torque of the balanced roll is a sum of terms that cancel
+    assert np.all((tau >= file.torque_lower - rounding) & (tau <= file.torque_upper + rounding))
     assert np.all(np.abs([file.torque_lower, file.torque_upper]) <= arm.effort_limits)
     # The margin is 10 % at both ends, and the ranges of the two samples differ by a few percent.
     assert np.all(np.ptp([file.torque_lower, file.torque_upper], axis=0) <= 1.25 * np.ptp(tau, axis=0) + 1e-9)
