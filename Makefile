@@ -96,5 +96,7 @@ $(VENV)/.installed-%: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
 	touch $@
 
+# numba does not notice changes of compiled functions in other files than that of the caller.
 clean:
 	rm -rf $(VENV) demo_output docs/_build docs/generated dist
+	find dvrk_drake -name '*.nb[ci]' -delete

@@ -1,7 +1,8 @@
 """Options and small functions of compiled code (numba).
 
 A function with the decorator `compiled` is compiled once per installation and then read from numba's cache. numba
-notices changes of the file of a function, but not of the files of the functions that it calls. Assignments between
+notices changes of the file of a function, but not of the files of the functions that it calls: after a change of one of
+these, delete the cache (`find dvrk_drake -name '*.nb[ci]' -delete`). Assignments between
 slices are avoided, because the message on their sizes takes seconds to compile.
 """
 
