@@ -2,8 +2,8 @@
 
 A function with the decorator `compiled` is compiled once per installation and then read from numba's cache. numba
 notices changes of the file of a function, but not of the files of the functions that it calls: after a change of one of
-these, delete the cache (`find dvrk_drake -name '*.nb[ci]' -delete`). Assignments between
-slices are avoided, because the message on their sizes takes seconds to compile.
+these, delete the cache (`find dvrk_drake -name '*.nb[ci]' -delete`). Assignments between slices are avoided, because
+the message on their sizes takes seconds to compile.
 """
 
 from __future__ import annotations
