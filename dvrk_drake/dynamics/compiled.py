@@ -54,7 +54,7 @@ def _is_cached(function: Callable[..., None], folder: Path) -> bool:
 def _announce() -> None:
     """Prints once why the first import takes long."""
     print(
-        "dvrk_drake compiles its functions once per installation, which takes about 10 s", file=sys.stderr, flush=True
+        "dvrk_drake compiles its functions once per installation, which takes 10 to 30 s", file=sys.stderr, flush=True
     )
 
 
