@@ -17,9 +17,9 @@ from pinocchio_arm import build_pinocchio, regressor_loop
 from timing import measured_times, median_ratio, print_table, write_json
 
 from dvrk_drake.dynamics.compiled import entry_point
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.holding_torque import holding_torque_into
 from dvrk_drake.dynamics.static_model import static_model
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 

@@ -32,7 +32,7 @@ IDENTIFY_BASE = IDENTIFY
 #: Program that prints the formulas, and then the CPU time and the wall time of the derivation in the last line.
 DERIVE = """
 import sys, time
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import shared_plant
 arm = load_arm(sys.argv[1])

@@ -27,7 +27,7 @@ def model(
         format: Generate source code of the gravity torque and its regressor in this language.
         output: File for the source code. Default: standard output.
     """
-    from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+    from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
     from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
     from dvrk_drake.export import gravity_sources
     from dvrk_drake.models.arm_files import load_arm

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import sympy
 
-from dvrk_drake.dynamics import codegen
-from dvrk_drake.dynamics.gravity_regressor import GRAVITY, SymbolicGravity
+from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicGravity
 
 
 def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) -> str:
@@ -67,9 +67,9 @@ def to_python(gravity: SymbolicGravity) -> str:
         f"{_lengths(gravity)}.\n"
         'The torque is written to out[j], the regressor to out[j, k] of a numpy array.\n"""\n\nimport math\n\n'
         f"#: (nominal value, meaning) of each base parameter.\nBASE_PARAMETERS = [\n{entries}]\n\n\n"
-        + codegen.python_source("gravity_torque", [*arguments, beta_argument], torque, "Writes Y(q) beta to `out` (n).")
+        + _python_source("gravity_torque", [*arguments, beta_argument], torque, "Writes Y(q) beta to `out` (n).")
         + "\n\n"
-        + codegen.python_source("gravity_regressor", arguments, regressor, "Writes Y(q) to `out` (n, b).")
+        + _python_source("gravity_regressor", arguments, regressor, "Writes Y(q) to `out` (n, b).")
     )
 
 
@@ -99,21 +99,21 @@ def c_identifier(name: str) -> str:
 
 
 def c_source(
-    name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: codegen.SharedTerms, comment: str = ""
+    name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: _SharedTerms, comment: str = ""
 ) -> str:
     """Returns C99 source of a function `void name(..., double *out)`, which fills the row-major array `out`.
 
     Args:
         name: Name of the function.
-        arguments: Name and symbols of each argument, see `codegen.python_source`.
+        arguments: Name and symbols of each argument, see `_python_source`.
         terms: Expressions to compute.
         comment: Comment above the function. "": no comment.
     """
-    parameters = [f"double {n}" if codegen.is_scalar(n, s) else f"const double {n}[{len(s)}]" for n, s in arguments]
+    parameters = [f"double {n}" if _is_scalar(n, s) else f"const double {n}[{len(s)}]" for n, s in arguments]
     size = math.prod(terms.shape)
     lines = [f"/* {comment} */"] if comment else []
     lines += ["#include <math.h>", "", f"void {name}({', '.join(parameters)}, double out[{size}]) {{"]
-    lines += codegen.unpacking_lines(arguments, terms, "  const double {symbol} = {array}[{index}];")
+    lines += _unpacking_lines(arguments, terms, "  const double {symbol} = {array}[{index}];")
     lines += [f"  const double {symbol} = {sympy.ccode(e)};" for symbol, e in terms.assignments]
     lines.append(f"  for (int i = 0; i < {size}; ++i) out[i] = 0.0;")
     for index, e in terms.entries:
@@ -132,10 +132,10 @@ def _title(gravity: SymbolicGravity) -> str:
 
 def _functions(
     gravity: SymbolicGravity,
-) -> tuple[codegen.SharedTerms, codegen.SharedTerms, list[tuple[str, Sequence]], tuple[str, Sequence]]:
+) -> tuple[_SharedTerms, _SharedTerms, list[tuple[str, Sequence]], tuple[str, Sequence]]:
     beta = _beta_symbols(gravity)
-    torque = codegen.share_terms(sympy.Array(list(sympy.Matrix(gravity.regressor) * sympy.Matrix(beta))))
-    regressor = codegen.share_terms(gravity.regressor)
+    torque = _share_terms(sympy.Array(list(sympy.Matrix(gravity.regressor) * sympy.Matrix(beta))))
+    regressor = _share_terms(gravity.regressor)
     return torque, regressor, [("q", gravity.q), ("g", (GRAVITY,))], ("beta", beta)
 
 
@@ -193,3 +193,79 @@ def _latex_name(text: str) -> str:
         else:
             words.append(word)
     return " ".join(words)
+
+
+@dataclass(frozen=True)
+class _SharedTerms:
+    """Array of expressions after common subexpression elimination.
+
+    Attributes:
+        assignments: Symbol and expression of each common subexpression, in the order of evaluation.
+        entries: Index and expression of each array element that is not identically zero.
+        shape: Shape of the array.
+    """
+
+    assignments: list[tuple[sympy.Symbol, sympy.Expr]]
+    entries: list[tuple[tuple[int, ...], sympy.Expr]]
+    shape: tuple[int, ...]
+
+
+def _share_terms(array: sympy.NDimArray | sympy.MatrixBase) -> _SharedTerms:
+    """Eliminates common subexpressions of a vector or matrix of expressions."""
+    dense = sympy.ImmutableDenseNDimArray(array)
+    indices = list(np.ndindex(*dense.shape))
+    flat = [dense[index] for index in indices]
+    assignments, reduced = sympy.cse(flat, symbols=sympy.numbered_symbols("x"), optimizations="basic")
+    entries = [(index, e) for index, e in zip(indices, reduced, strict=True) if e != 0]
+    return _SharedTerms(assignments, entries, dense.shape)
+
+
+def _python_source(
+    name: str,
+    arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]],
+    terms: _SharedTerms,
+    docstring: str = "",
+) -> str:
+    """Returns the source of a Python function `name(*arguments, out)` that fills the array `out`.
+
+    Args:
+        name: Name of the function.
+        arguments: Name and symbols of each argument. An argument with one symbol of the same name is a scalar. Other
+            arguments are arrays with one element per symbol.
+        terms: Expressions to compute.
+        docstring: Docstring of the function. If it is "", the function has no docstring.
+    """
+    lines = [f"def {name}({', '.join(n for n, _ in arguments)}, out):"]
+    if docstring:
+        lines.append(f'    """{docstring}"""')
+    lines += _unpacking_lines(arguments, terms, "    {symbol} = {array}[{index}]")
+    lines += [f"    {symbol} = {sympy.pycode(e)}" for symbol, e in terms.assignments]
+    if len(terms.entries) < math.prod(terms.shape):
+        lines.append("    out[:] = 0.0")
+    lines += [f"    out[{', '.join(map(str, index))}] = {sympy.pycode(e)}" for index, e in terms.entries]
+    return "\n".join(lines) + "\n"
+
+
+def _is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
+    """Returns whether an argument is a scalar. A scalar argument has a single symbol with the name of the argument."""
+    return len(symbols) == 1 and symbols[0].name == name
+
+
+def _unpacking_lines(
+    arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: _SharedTerms, form: str
+) -> list[str]:
+    """Returns one line of code for each array element that `terms` use.
+
+    Args:
+        arguments: Arguments of `_python_source`.
+        terms: Expressions to compute.
+        form: Format of a line, with {symbol}, {array} and {index}.
+    """
+    used = set().union(*(e.free_symbols for _, e in [*terms.assignments, *terms.entries]), set())
+    return [
+        form.format(symbol=symbol, array=name, index=index)
+        for name, symbols in arguments
+        if not _is_scalar(name, symbols)
+        for index, symbol in enumerate(symbols)
+        if symbol in used
+    ]

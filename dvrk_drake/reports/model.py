@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.markup import escape
 
-from dvrk_drake.dynamics.gravity_regressor import SymbolicGravity
+from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
 from dvrk_drake.reports.terminal_tables import make_table, print_answer
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.models.arm_files import load_arm
 
 pytestmark = pytest.mark.numeric

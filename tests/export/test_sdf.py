@@ -16,13 +16,13 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.inertial_parameters import (
     LinkInertia,
     link_inertias,
     parameters_from_pseudo_inertia,
 )
 from dvrk_drake.dynamics.model_links import nearest_links
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.export.gltf import to_obj
 from dvrk_drake.export.gravity_sources import c_identifier

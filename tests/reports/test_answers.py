@@ -14,7 +14,7 @@ from loaded_arm import two_days
 from report_results import operator_forces, study_results, tuning_result
 
 import dvrk_drake as dvrk
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.experiments.demo.demo import DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.models.arm_files import unsafe_difference
 from dvrk_drake.models.lcm_messages import describe_refusal
 from dvrk_drake.systems.guard.command_expiry import CommandExpiry
 from dvrk_drake.systems.guard.command_stream import (
@@ -28,6 +27,7 @@ from dvrk_drake.systems.guard.measurement import Measurement
 from dvrk_drake.systems.guard.monitors import AgeMonitor, OscillationMonitor, PeriodMonitor
 from dvrk_drake.systems.guard.plausibility import Plausibility
 from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.guard.unsafe_arm import unsafe_difference
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm

@@ -5,6 +5,7 @@ This file has no postponed annotations, because yaml_load_typed reads the types 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.schema_fault import number_fault, within
@@ -177,8 +178,8 @@ class GuardSettings:
         return ", ".join([*_weaker(self, GuardSettings()), *_weaker(self.plausibility, PlausibilitySettings())])
 
 
-def _weaker(settings: object, default: object) -> Iterator[str]:
-    for entry in fields(default):  # type: ignore[arg-type]
+def _weaker(settings: Any, default: Any) -> Iterator[str]:
+    for entry in fields(default):
         value, usual = getattr(settings, entry.name), getattr(default, entry.name)
         if isinstance(usual, bool):
             if value:

@@ -13,6 +13,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.processes.live_status import LiveStatusMaker
 from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, content_refusal, is_finite
 from dvrk_drake.systems.guard.measurement import Measurement
+from dvrk_drake.systems.guard.settings import _WEAKER_IF_SMALLER as WEAKER_IF_SMALLER
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
@@ -371,6 +372,8 @@ def test_resume_requires_operator_by_default(value):
 
 def test_settings_weaker_than_defaults_are_named():
     assert GuardSettings().weaker_than_default() == ""
+    assert GuardSettings(margin=0.01).weaker_than_default().startswith("margin is 0.01 (default: ")
+    assert GuardSettings(expiry=0.2).weaker_than_default() == "expiry is 0.2 (default: 0.05)"
     stronger = {name: low if name not in WEAKER_IF_SMALLER else high for name, (low, _, high) in SETTINGS.items()}
     checks = {n: low if n not in WEAKER_IF_SMALLER else high for n, (low, _, high) in PLAUSIBILITY_SETTINGS.items()}
     assert GuardSettings(**stronger, plausibility=PlausibilitySettings(**checks)).weaker_than_default() == ""
@@ -383,19 +386,6 @@ def test_settings_weaker_than_defaults_are_named():
         settings = GuardSettings(resume_automatically=True, plausibility=PlausibilitySettings(**{name: value}))
         both = f"resume_automatically is true (default: false), {name} is {value:g} (default: {default:g})"
         assert settings.weaker_than_default() == both
-
-
-WEAKER_IF_SMALLER = [
-    "start_time",
-    "margin",
-    "margin_fraction",
-    "effort_rise_time",
-    "traverse_time",
-    "oscillation_time",
-    "frozen_speed",
-    "response_memory",
-    "detection_time",
-]
 
 
 def test_late_commands_do_not_act_again_without_an_operator():

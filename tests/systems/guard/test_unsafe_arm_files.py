@@ -3,9 +3,10 @@
 import pytest
 
 from dvrk_drake.errors import StationError
-from dvrk_drake.models.arm_files import known_arms, load_arm, unsafe_difference
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, local_path
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.unsafe_arm import unsafe_difference
 
 KNOWN = load_arm("mtml")
 ARM = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text()

@@ -6,8 +6,8 @@ import sympy
 from paper_regressor import paper_regressor
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.gravity_regressor import GRAVITY, derive_gravity
 from dvrk_drake.dynamics.static_model import static_model
+from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, derive_gravity
 from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
