@@ -70,7 +70,7 @@ def coverage(arm: Arm, travel: NDArray[np.float64], coordinates: Coordinates) ->
     """Returns the share (n,) of the range between the limits that a recording covers, 0 for a joint that did not move.
 
     At most half a revolution of a revolute joint counts as its range, because the gravity torque changes its sign after
-    half a revolution.
+    half a revolution. The share is at most 1.
 
     Args:
         arm: Arm that was recorded.
@@ -80,7 +80,7 @@ def coverage(arm: Arm, travel: NDArray[np.float64], coordinates: Coordinates) ->
     to_output = np.abs(arm.transmission.matrix) if coordinates == "actuator" else np.eye(arm.num_joints)
     width = np.minimum(arm.position_upper - arm.position_lower, arm.per_joint(np.pi, np.inf))
     moved = to_output @ travel > arm.per_joint(*MIN_RANGE)
-    return np.asarray(np.where(moved, (to_output @ travel) / (to_output @ width), 0.0))
+    return np.asarray(np.where(moved, np.minimum((to_output @ travel) / (to_output @ width), 1.0), 0.0))
 
 
 def judge(effort: float, error: float, tolerance: Tolerance, covered: float, *, commanded: bool = True) -> Verdict:
@@ -126,7 +126,7 @@ def reason(
     return (
         f"The RMS error is {error:.2g} {unit} or {100 * error / effort:.0f} % of the measured effort. Dry friction: "
         f"{tolerance.friction:.2g} {unit}. Torque of the gains at {travel}: {tolerance.stiffness:.2g} {unit}. Range "
-        f"covered: {100 * covered:.0f} %."
+        f"covered{'' if prismatic else ' (at most 180 deg count)'}: {100 * covered:.0f} %."
     )
 
 

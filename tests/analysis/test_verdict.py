@@ -92,6 +92,7 @@ def test_range_of_a_joint_is_at_most_half_a_revolution():
     np.testing.assert_allclose(covered, [0, 0.5 / width[1], 0, *(1 / width[3:6]), 0.5], atol=1e-12)
     # The actuator of the elbow also moves if only the shoulder moves.
     assert coverage(ARM, np.eye(7)[1], "actuator")[2] > 0 == coverage(ARM, np.eye(7)[1], "joint")[2]
+    assert np.all(coverage(ARM, np.full(7, 20.0), "joint") == 1.0)
 
 
 def test_the_worst_verdict_and_the_joints_that_fail():

@@ -243,7 +243,7 @@ def test_verdicts_have_the_words_and_reasons_of_the_rule(motion):
     judged = 1.0, 0.3, Tolerance(0.4, 0.6), 0.5
     text = reason(judge(*judged), *judged)
     assert text.startswith("The RMS error is 0.3 N m or 30 % of the measured effort. Dry friction: 0.4 N m.")
-    assert text.endswith("at 15 mrad: 0.6 N m. Range covered: 50 %.")
+    assert text.endswith("at 15 mrad: 0.6 N m. Range covered (at most 180 deg count): 50 %.")
     assert "not separated from friction" in reason("off", *judged)
 
 
