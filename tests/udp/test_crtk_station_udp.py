@@ -20,6 +20,7 @@ ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclone
 pytestmark = [pytest.mark.network, pytest.mark.realtime]
 
 
+@pytest.mark.watchdog
 def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
     from dvrk_drake.systems.ros.messages import Empty, JointState

@@ -154,7 +154,7 @@ class CommandGuard:
     - measurements that are not plausible, not finite or too old,
     - a pose that exceeds a position limit by more than half of the setting `margin` while efforts act,
     - a joint that does not follow its target or is pushed away from the target,
-    - efforts that oscillate, either as commanded or between the command and the limits,
+    - efforts that oscillate: commanded, between the command and the limits, or of the arm's own position controller,
     - an arm clock that goes backwards or stands still,
     - an output that is not finite,
     - a fault that the driver reports.
@@ -236,7 +236,16 @@ class CommandGuard:
         self._problem = ""
         self._measured = Measurement(arm.joint_names, round(1e6 * self.settings.measurement_age))
         self._plausibility = Plausibility(arm, model, self.settings.plausibility, self.limits.speed)
-        self._period, self._oscillation = PeriodMonitor(self.settings), OscillationMonitor(self.settings, arm)
+        self._period = PeriodMonitor(self.settings)
+        self._oscillation = OscillationMonitor(
+            self.settings,
+            arm,
+            "the commanded effort oscillates",
+            "the joint moves to and fro between the command and a soft wall or the speed limit",
+        )
+        self._regulation = OscillationMonitor(
+            self.settings, arm, "the measured effort oscillates while the arm's own position controller acts"
+        )
         self._ages = AgeMonitor(self.settings)
         self._follower = Follower(self.limits, self.limits.safe_gains(arm, model))
         self._acted = self._is_in_safe_state = False
@@ -257,6 +266,7 @@ class CommandGuard:
             "_plausibility",
             "_period",
             "_oscillation",
+            "_regulation",
             "_ages",
         ):
             part = getattr(self, name)
@@ -371,8 +381,8 @@ class CommandGuard:
         self._watch_period(dt)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.position_limit_fault(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
-        if self._is_regulated_by_arm() and (deviation := self._follower.following_fault(self._q())):
-            self.report_fault(deviation, lcmt_dvrk_status.FAULT_FOLLOWING)
+        if self._is_regulated_by_arm():
+            self._watch_regulation()
         self.output = self._output(min(max(dt, 0.0), _MAX_STEP))
         if not self.output.is_finite():
             self.report_fault("the guard's output is not finite", lcmt_dvrk_status.FAULT_NOT_FINITE)
@@ -381,7 +391,7 @@ class CommandGuard:
             self.output = self._follower.hold(0.0)
         elif self.state == lcmt_dvrk_status.STATE_EFFORT:
             self._commanded = self.output.effort.copy()
-            text = self._oscillation.add(self._follower.effort, self._commanded, min(max(dt, 0.0), _MAX_STEP))
+            text = self._oscillation.add(min(max(dt, 0.0), _MAX_STEP), self._follower.effort, self._commanded)
             if text:
                 self.report_fault(text, lcmt_dvrk_status.FAULT_OSCILLATION)
                 self.output = self._output(0.0)
@@ -472,6 +482,13 @@ class CommandGuard:
             dt, self._last_wall_step = 1e-6 * (now - self._last_wall_step) if self._last_wall_step else 0.0, now
         if self._period.add(dt) and self._is_starting_or_in_force():
             self._take_over(self._period.fault)
+
+    def _watch_regulation(self) -> None:
+        """Checks that the arm's own position controller regulates the arm. Late measurements let it oscillate."""
+        if deviation := self._follower.following_fault(self._q()):
+            self.report_fault(deviation, lcmt_dvrk_status.FAULT_FOLLOWING)
+        if text := self._regulation.add(min(self._measured.dt, _MAX_STEP), self._measured.effort):
+            self.report_fault(text, lcmt_dvrk_status.FAULT_OSCILLATION)
 
     def _begin_safe_state(self) -> None:
         """Starts the regulation with reduced gains in FAULT, from the present effort."""
@@ -594,6 +611,7 @@ class CommandGuard:
             self._follower.begin_position()
         else:
             self._oscillation.restart()
+            self._regulation.restart()
             self._follower.begin_effort(self._measured.effort, self._q())
 
     def _hold(self) -> None:

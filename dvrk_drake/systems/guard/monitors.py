@@ -91,36 +91,32 @@ class AgeMonitor(_MedianMonitor):
 
 
 class OscillationMonitor:
-    """Monitor that counts reversals of the commanded efforts. The count decays exponentially.
+    """Monitor that counts reversals of the efforts of the joints. The count decays exponentially.
 
     The alternating part of an effort is x = tau - filter(tau), with a first-order low-pass filter. A reversal is a
     change of x from above h to below -h, or from below -h to above h. The threshold h is the fraction `oscillation` of
-    the effort limit. The monitor counts the reversals of the commands, and those of the output, which includes soft
-    walls and the speed limit.
+    the effort limit. The monitor counts the reversals of each signal, e.g. those of the commands and those of the
+    output, which includes soft walls and the speed limit.
     """
 
-    def __init__(self, settings: GuardSettings, arm: Arm) -> None:
-        """Creates a monitor for the joints of `arm`."""
+    def __init__(self, settings: GuardSettings, arm: Arm, *texts: str) -> None:
+        """Creates a monitor for the joints of `arm`, with one description of an oscillation per signal."""
         self._scale, self._time = 1.0 / (settings.oscillation * arm.effort_limits), settings.oscillation_time
-        self._allowed, self._names = settings.oscillation_reversals, arm.joint_names
+        self._allowed, self._names, self._texts = settings.oscillation_reversals, arm.joint_names, texts
         self._mean: Vector | None = None
 
     def restart(self) -> None:
         """Resets the counts and filters."""
         self._mean = None
 
-    def add(self, command: Vector, output: Vector, dt: float) -> str:
-        """Adds efforts that act for `dt` [s].
-
-        Args:
-            command: Commanded efforts (n,) [N m, N], limited in size and rate.
-            output: The same efforts with the efforts of the soft walls and the speed limit.
-            dt: Time for which the efforts act [s].
+    def add(self, dt: float, *efforts: Vector) -> str:
+        """Adds the efforts of each signal (n,) [N m, N] that act for `dt` [s].
 
         Returns:
-            Description of the oscillation, or "" if no joint oscillates.
+            Joint and description of its oscillation, or "" if no joint oscillates. If several signals of this joint
+            oscillate, the description is that of the first.
         """
-        scaled = np.concatenate((self._scale * command, self._scale * output))
+        scaled = np.concatenate([self._scale * effort for effort in efforts])
         if self._mean is None:
             self._mean = scaled
             self._side = self._reversals = np.zeros_like(scaled)
@@ -140,7 +136,6 @@ class OscillationMonitor:
         if not self._reversals[worst] > self._allowed:
             return ""
         joint = worst % len(self._names)
-        name = self._names[joint]
-        if self._reversals[joint] > 0.5 * self._allowed:
-            return f"{name}: the commanded effort oscillates"
-        return f"{name}: the joint moves to and fro between the command and a soft wall or the speed limit"
+        # The cause of an oscillation comes first in the signals. Its count may be behind that of the effect.
+        counts = self._reversals[joint :: len(self._names)]
+        return f"{self._names[joint]}: {self._texts[int(np.argmax(counts > 0.5 * self._allowed))]}"

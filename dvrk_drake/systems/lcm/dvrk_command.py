@@ -6,7 +6,7 @@ import secrets
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
@@ -143,8 +143,9 @@ class DvrkCommandReceiver(LeafSystem):
     - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose with zero
       velocity.
     - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
-      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If
-      `position_control_effort` is not finite, the gravity effort of the model is used instead.
+      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`, limited in rate
+      as a commanded effort. If `position_control_effort` is not finite, the gravity effort of the model is used
+      instead.
     - `guard`: the CommandGuard, read-only.
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
@@ -182,14 +183,18 @@ class DvrkCommandReceiver(LeafSystem):
         self._gravity = self.DeclareVectorInputPort("gravity_effort", n)
         self._guard = self.DeclareAbstractState(AbstractValue.Make(guard))
         self._last_command_id = self.DeclareAbstractState(AbstractValue.Make((0, 0, 0)))
+        # Effort of the previous step. Not finite before the first step, whose effort is not limited in rate.
+        self._last_effort = self.DeclareDiscreteState(np.full(n, np.nan))
         own = {self.abstract_state_ticket(self._guard)}
         self.DeclareVectorOutputPort("control_mode", 1, self._calc_control_mode, own)
         self.DeclareVectorOutputPort("desired_state", 2 * n, self._calc_desired_state, own)
         efforts = {self.input_port_ticket(port.get_index()) for port in (self._position_control, self._gravity)}
-        self.DeclareVectorOutputPort("effort", n, self._calc_effort, own | efforts)
+        last = self.discrete_state_ticket(self._last_effort)
+        self._applied = self.DeclareVectorOutputPort("effort", n, self._calc_effort, own | efforts | {last})
         self.DeclareAbstractOutputPort("guard", lambda: AbstractValue.Make(guard), self._calc_guard, own)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._clock.period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(self._clock.period, 0.0, self._store_effort)
         self._inbox = CommandInbox(guard, key)
 
     def Receive(self, data: bytes) -> None:
@@ -225,6 +230,11 @@ class DvrkCommandReceiver(LeafSystem):
             effort = effort - self._gravity.Eval(context)
         guard.step(utime, utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
 
+    def _store_effort(self, context: Context, values: DiscreteValues) -> None:
+        # Drake calls this method after `_update`, and together with the step of a discrete plant that uses the effort.
+        if not self.stalled:
+            values.set_value(self._applied.Eval(context))
+
     def _calc_control_mode(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self.GetGuard(context).output.control_mode)
 
@@ -243,6 +253,9 @@ class DvrkCommandReceiver(LeafSystem):
             effort = self._position_control.Eval(context)
             # The effort of the position controller is not finite while measurements are missing for a few periods.
             effort = effort if is_finite(effort.tolist()) else self.GetGuard(context).gravity_effort
+            last = context.get_discrete_state(self._last_effort).value()
+            if is_finite(last.tolist()):
+                effort = self.GetGuard(context).limits.limit_effort_rate(effort, last, self._clock.period)
             output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
 
     def _calc_guard(self, context: Context, output: AbstractValue) -> None:

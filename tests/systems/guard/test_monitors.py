@@ -10,6 +10,7 @@ from dvrk_drake.systems.guard.monitors import OscillationMonitor, PeriodMonitor
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 SETTINGS = GuardSettings()
+OSCILLATES = "the effort oscillates"
 
 
 @pytest.mark.parametrize(("period", "slow"), [(0.001, False), (0.005, False), (0.0051, True), (0.020, True)])
@@ -88,7 +89,7 @@ def reversals(monitor, wave, seconds=6.0):
     """Returns the time and joint of the detected oscillation of the effort wave(t) (n,), or (None, None)."""
     for k in range(round(1e3 * seconds)):
         effort = wave(1e-3 * k)
-        if text := monitor.add(effort, effort, 1e-3):
+        if text := monitor.add(1e-3, effort):
             return 1e-3 * k, ARM.joint_names.index(text.partition(":")[0])
     return None, None
 
@@ -98,7 +99,7 @@ def reversals(monitor, wave, seconds=6.0):
 def test_oscillating_efforts_are_found(joint, frequency):
     unit = np.eye(N)[joint] * LIMIT
     wave = lambda t: unit * np.sign(np.sin(2 * np.pi * frequency * (t + 1e-4)))  # noqa: E731
-    time, found = reversals(OscillationMonitor(SETTINGS, ARM), wave)
+    time, found = reversals(OscillationMonitor(SETTINGS, ARM, OSCILLATES), wave)
     assert found == joint
     # Each half period is a reversal. Four reversals are allowed, with exponential decay. The mean settles slowly.
     assert time <= 8 / (2 * frequency) + 0.11
@@ -114,17 +115,17 @@ def test_oscillating_efforts_are_found(joint, frequency):
     ],
 )
 def test_normal_efforts_are_no_oscillation(wave):
-    assert reversals(OscillationMonitor(SETTINGS, ARM), wave) == (None, None)
+    assert reversals(OscillationMonitor(SETTINGS, ARM, OSCILLATES), wave) == (None, None)
 
 
 @pytest.mark.parametrize(("half_period", "restart", "found"), [(0.1, 99, True), (0.1, 4, False), (5.0, 99, False)])
 def test_reversals_decay_and_restart_resets_them(half_period, restart, found):
-    monitor, joints = OscillationMonitor(SETTINGS, ARM), []
+    monitor, joints = OscillationMonitor(SETTINGS, ARM, OSCILLATES), []
     for k in range(20):
         if k % restart == 0:
             monitor.restart()
         effort = (-1.0) ** k * LIMIT
-        joints += [monitor.add(effort, effort, 1e-3) for _ in range(round(1e3 * half_period))]
+        joints += [monitor.add(1e-3, effort) for _ in range(round(1e3 * half_period))]
     assert any(joints) == found
 
 
@@ -149,6 +150,29 @@ def test_guard_holds_on_oscillating_commands():
     assert (bench.guard.fault_code, bench.output.control_mode) == (Status.FAULT_OSCILLATION, Command.EFFORT)
     assert bench.guard.fault_text == "elbow_pitch: the commanded effort oscillates"
     np.testing.assert_array_equal(bench.output.position, Q)
+
+
+@pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION])
+@pytest.mark.parametrize(("share", "oscillates"), [(1.0, True), (0.35, False)])
+def test_oscillating_position_controller_is_a_fault(mode, share, oscillates):
+    """The controller of the arm may get late measurements, although their time stamps are recent."""
+    bench = Bench()
+    bench.run(mode, 260)
+    state = bench.guard.state
+    for k in range(1000):
+        bench.effort[4] = share * LIMIT[4] * np.sign(np.sin(2 * np.pi * 10 * 1e-3 * k))
+        bench.run(mode, 1)
+        if bench.guard.state == Status.STATE_FAULT:
+            break
+    if not oscillates:
+        assert bench.guard.state == state
+        return
+    assert k < 500
+    assert (bench.guard.fault_code, bench.output.control_mode) == (Status.FAULT_OSCILLATION, Command.EFFORT)
+    assert bench.guard.fault_text.endswith(
+        ": the measured effort oscillates while the arm's own position controller acts"
+    )
+    assert bench.guard.fault_text.startswith(ARM.joint_names[4])
 
 
 def test_constant_full_effort_is_no_oscillating_command():

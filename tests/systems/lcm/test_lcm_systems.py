@@ -14,8 +14,10 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import StatusFilter, create_key_file
+from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
@@ -65,6 +67,27 @@ def test_controller_starts_acts_and_hold_follows(name):
     run(lcm, 100, arm, controller)
     assert arm.statuses[-1].guard_state == Status.STATE_EFFORT
     assert (arm.statuses[-1].num_lost, arm.drift() < 1e-3) == (0, True)
+
+
+def test_effort_of_the_position_controller_is_limited_in_rate():
+    """Measurements that jump would reverse the efforts within one step."""
+    model = ControlModel(IdentifiedModel.from_arm(ARM))
+    receiver = DvrkCommandReceiver(ARM, CommandGuard(ARM, 1, model))
+    simulator = Simulator(receiver)
+    context, limit = simulator.get_mutable_context(), ARM.effort_limits
+    receiver.GetInputPort("state_estimated").FixValue(context, np.zeros(2 * ARM.num_joints))
+    receiver.GetInputPort("effort_measured").FixValue(context, np.zeros(ARM.num_joints))
+    control = receiver.GetInputPort("position_control_effort").FixValue(context, limit)
+    efforts = []
+    for k in range(60):
+        control.GetMutableData().set_value((-1.0 if k >= 10 else 2.0) * limit)
+        simulator.AdvanceTo(1e-3 * k)
+        efforts.append(receiver.GetOutputPort("effort").Eval(context) / limit)
+    steps = np.diff(efforts, axis=0)
+    # The effort changes by its limit within 20 ms.
+    np.testing.assert_allclose(efforts[:10], 1.0, atol=1e-12)
+    np.testing.assert_allclose(steps[10:48], -0.05, atol=1e-12)
+    np.testing.assert_allclose(efforts[-1], -1.0, atol=1e-12)
 
 
 def test_the_status_echoes_the_last_accepted_command():
