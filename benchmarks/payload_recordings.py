@@ -5,9 +5,9 @@
 FOLDER contains psm_one.csv, psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in the
 coordinates "wpi", with a header and times (docs/public_recordings.md).
 
-The first table contains the estimated payloads. The second table shows how the model error depends on the duration of
-the recording to which friction is refitted. The third table compares the model errors after refitting to the same
-phases of the motion and to other phases.
+The first table contains the estimated payloads, with a reference recording and with a model only. The second table
+shows how the model error depends on the duration of the recording to which friction is refitted. The third table
+compares the model errors after refitting to the same phases of the motion and to other phases.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ def main() -> int:
     models = {name: identify_dynamic([read(name)], arm).model for name in ("psm_one_no_weight", "psm_one")}
     for reference, model in models.items():
         for name, link, mass, position in WEIGHTS:
-            (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])
-            _print_payload(arm, read(name), reference, name, payload, mass, np.array(position))
+            for known, what in ((read(reference), f"reference {reference}"), (None, f"model of {reference}")):
+                (payload,) = estimate_payload(known, read(name), model.dynamic_model, [link])
+                _print_payload(arm, read(name), what, name, payload, mass, np.array(position))
     # To the recording of the other day, which has no payload, add the torque of an exactly known payload.
     for reference, other in (("psm_one_no_weight", "psm_one"), ("psm_one", "psm_one_no_weight")):
         model = models[reference].dynamic_model
@@ -62,7 +63,7 @@ def main() -> int:
             loaded = _with_payload(read(other), model, link, mass, np.array(position))
             (payload,) = estimate_payload(read(reference), loaded, model, [link])
             name = f"{other} with the torque of {1000 * mass:.0f} g added"
-            _print_payload(arm, loaded, reference, name, payload, mass, np.array(position))
+            _print_payload(arm, loaded, f"reference {reference}", name, payload, mass, np.array(position))
     _print_seconds(models["psm_one"], read("psm_one_no_weight"))
     _print_phases(models["psm_one"], read("psm_one_no_weight"))
     return 0
@@ -80,10 +81,10 @@ def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: fl
 
 
 def _print_payload(
-    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, position: np.ndarray
+    arm: Arm, recording: Recording, compared_with: str, name: str, payload: Payload, mass: float, position: np.ndarray
 ) -> None:
     body, offset = payload.body, payload.position_in_base - payload.body.position
-    print(f"{name}, reference {reference}, payload on {payload.link}")
+    print(f"{name}, {compared_with}, payload on {payload.link}")
     print(f"  mass {1000 * body.mass:.0f} +- {1000 * payload.mass_error:.0f} g (true {1000 * mass:.0f})")
     for axis in range(3):
         estimate = "not determined"

@@ -318,11 +318,13 @@ def recalibrate(
 
 @app.command(group=IDENTIFY)
 def payload(
-    reference: str,
-    loaded: str,
+    recording: str,
+    loaded: str | None = None,
     /,
     *,
-    arm: Annotated[Arm | None, Parameter(group=_SOURCE, help="Identify the model of this arm from REFERENCE.")] = None,
+    arm: Annotated[
+        Arm | None, Parameter(group=_SOURCE, help="Identify the model of this arm from the first recording.")
+    ] = None,
     model: Annotated[Model | None, Parameter(group=_SOURCE, help="Model identified from a motion.")] = None,
     link: Annotated[str | None, Parameter(metavar="NAME")] = None,
     file: FileOptions = _FILE,
@@ -335,10 +337,11 @@ def payload(
 ) -> None:
     """Estimate the mass and centre of mass of a payload.
 
-    The command compares two recordings of the same motion, one without and one with the payload.
+    The command compares two recordings of the same motion, one without and one with the payload. With --model and one
+    recording, it compares the recording with the efforts of the model.
 
     Args:
-        reference: Recording of the motion without the payload.
+        recording: Recording of the motion without the payload. If LOADED is not given: recording with the payload.
         loaded: Recording of the same motion with the payload.
         link: SDF link to which the payload is attached. Default: the link with the smallest cross-validated error.
     """
@@ -349,16 +352,22 @@ def payload(
         raise ModelError("--gravity requires --arm; with --model, the gravity vector of the model is used")
     if model is not None and locked is not None:
         raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
+    if model is None and loaded is None:
+        raise ModelError(
+            "--arm requires two recordings, without and with the payload; with one recording, give --model"
+        )
+    paths = [recording] if loaded is None else [recording, loaded]
     if json is not None:
-        check_output(json, reference, loaded, overwrite=overwrite)
-    check_report(report, reference, loaded, model or "", overwrite=overwrite)
+        check_output(json, *paths, overwrite=overwrite)
+    check_report(report, *paths, model or "", overwrite=overwrite)
     identified = None if model is None else dvrk.IdentifiedModel.load(model)
     recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
-        without_payload, with_payload = (file.read(path, recorded_arm, steps) for path in (reference, loaded))
-        for recording in (without_payload, with_payload):
-            print_notes(recording.source, recording.notes)
-        result = dvrk.payload(without_payload, with_payload, identified or recorded_arm, link, progress=steps)
+        recordings = [file.read(path, recorded_arm, steps) for path in paths]
+        for read in recordings:
+            print_notes(read.source, read.notes)
+        reference = recordings[0] if loaded else None
+        result = dvrk.payload(reference, recordings[-1], identified or recorded_arm, link, progress=steps)
     if json is not None:
         write_json(json, result.as_dicts())
     console = make_console()
@@ -369,5 +378,5 @@ def payload(
     if report is not None:
         from dvrk_drake.reports.html.payload import payload_page
 
-        inputs = [reference, loaded, *([model] if model else [])]
+        inputs = [*paths, *([model] if model else [])]
         write_page(report, lambda origin: payload_page(result, origin, model), *inputs)

@@ -50,10 +50,17 @@ def print_payload(
         if model_path is None
         else f"--model {model_path}"
     )
-    command = f"dvrk-drake payload REFERENCE LOADED {command} " + ("--json FILE" if clear else "--link LINK")
+    files = "REFERENCE LOADED" if result.has_reference else "LOADED"
+    command = f"dvrk-drake payload {files} {command} " + ("--json FILE" if clear else "--link LINK")
     print_answer(console, answer, command, "green" if clear else "yellow")
     if payload.found:
         console.print(_estimate_table(payload))
+    if not result.has_reference:
+        print_note(
+            console,
+            "The intervals contain the errors of the model. A recording of the same motion without the payload makes "
+            "them narrower.",
+        )
     if verbose:
         console.print()
         _print_links(console, estimates)

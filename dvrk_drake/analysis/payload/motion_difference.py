@@ -1,4 +1,4 @@
-"""Computes the difference between the efforts of two recordings of the same motion, after alignment in time."""
+"""Computes how the efforts of a recording differ from those of another recording of the motion, or from a model."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, motio
 from dvrk_drake.analysis.signals.repetition import SAME_MOTION, period_of
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.recordings.recording import Recording
 
 
@@ -91,13 +92,13 @@ _STEP = 0.01
 
 @dataclass(frozen=True, eq=False)
 class MotionDifference:
-    """Difference of the efforts of two recordings of the same motion: second recording minus reference.
+    """Difference of the efforts of a recording from those of a reference, or from the efforts of the model.
 
     Attributes:
-        grid: Resampled motion of the second recording.
+        grid: Resampled motion of the recording.
         rows: Mask (r,) of the inner rows of `grid` at times that the reference also covers. It selects k rows.
         period: Period of the motion [s], or None if the motion does not repeat.
-        shift: Time shift [s]. Time t of the second recording corresponds to time t + shift of the reference.
+        shift: Time shift [s]. Time t of the recording corresponds to time t + shift of the reference.
         tau: Low-pass filtered difference (k, n) of the actuator efforts [N m, N]. The effect of small differences
             between the two motions is predicted by the model and subtracted.
         changes: Columns (k, n, c) for possible changes of each drive: an offset, dry and viscous friction, and
@@ -114,15 +115,17 @@ class MotionDifference:
     deviation: NDArray[np.float64]
 
 
-def motion_difference(reference: Recording, other: Recording, model: DynamicModel) -> MotionDifference:
-    """Aligns two recordings of one motion in time and subtracts the efforts of the reference.
+def motion_difference(reference: Recording | None, other: Recording, model: DynamicModel) -> MotionDifference:
+    """Subtracts the efforts of a reference from those of a recording, after alignment in time.
 
     Of a recording with gaps, the longest segment between gaps is used.
 
     Args:
-        reference: Recording of the motion without payload, in joint or actuator coordinates.
-        other: Recording of the same motion with the payload, in joint or actuator coordinates.
-        model: Model of the arm without payload. It predicts the effect of small differences between the two motions.
+        reference: Recording of the same motion without payload, in joint or actuator coordinates. None: the efforts of
+            the model are subtracted.
+        other: Recording of the motion with the payload, in joint or actuator coordinates.
+        model: Model of the arm without payload. With a reference, it predicts the effect of small differences between
+            the two motions.
 
     Raises:
         RecordingError: A recording is not a motion of this arm, an effort has the wrong sign, or the recordings are not
@@ -130,21 +133,28 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
     """
     signals = model.section.signals
     settings = replace(signals, effort_cut_off=min(CUT_OFF, signals.effort_cut_off))
-    reference, other = reference.longest_segment(), other.longest_segment()
-    reference_grid, grid = (motion_grid(recording, model.arm, settings) for recording in (reference, other))
-    period = period_of(grid)
-    shift = _shift(reference_grid, grid, period, other)
+    other = other.longest_segment()
+    grid = motion_grid(other, model.arm, settings)
     expected = drive_efforts(model, grid)
-    tau, residual = _efforts(other, grid, expected, model)
-    _, reference_residual = _efforts(reference, reference_grid, drive_efforts(model, reference_grid), model)
-    t, reference_t = grid.row_times[grid.inner] + shift, reference_grid.row_times[reference_grid.inner]
-    rows = (t >= reference_t[0]) & (t <= reference_t[-1])
-    changes = _changes(model, grid, expected)[rows]
-    size = np.sqrt(np.mean(tau**2, axis=0))
+    tau, change = _efforts(other, grid, expected, model)
+    period, changes = period_of(grid), _changes(model, grid, expected)
+    # An error of the model, or a change of the arm since its identification, also depends on the position.
+    expected_change = DRIFT * np.sqrt(np.mean(tau**2, axis=0))
+    if reference is None:
+        rows, shift = np.ones(len(change), bool), 0.0
+        expected_change = np.hypot(expected_change, model.half_width / half_width(1.0, None))
+    else:
+        reference = reference.longest_segment()
+        reference_grid = motion_grid(reference, model.arm, settings)
+        shift = _shift(reference_grid, grid, period, other)
+        _, reference_residual = _efforts(reference, reference_grid, drive_efforts(model, reference_grid), model)
+        t, reference_t = grid.row_times[grid.inner] + shift, reference_grid.row_times[reference_grid.inner]
+        rows = (t >= reference_t[0]) & (t <= reference_t[-1])
+        change = change[rows] - _interpolate(reference_t, reference_residual, t[rows])
+        changes = changes[rows]
     deviation = np.full(changes.shape[1:], np.inf)
     sizes = np.sqrt(np.mean(changes[..., _NUM_WITHOUT_PRIOR:] ** 2, axis=0))
-    deviation[:, _NUM_WITHOUT_PRIOR:] = DRIFT * size[:, None] * sizes / np.linalg.norm(sizes, axis=1, keepdims=True)
-    change = residual[rows] - _interpolate(reference_t, reference_residual, t[rows])
+    deviation[:, _NUM_WITHOUT_PRIOR:] = expected_change[:, None] * sizes / np.linalg.norm(sizes, axis=1, keepdims=True)
     return MotionDifference(grid, rows, period, shift, change, changes, deviation)
 
 

@@ -1,4 +1,4 @@
-"""Estimates mass and position of a payload, with standard errors, from two recordings of the same motion."""
+"""Estimates mass and position of a payload, with standard errors, from one recording or from two of the same motion."""
 
 from __future__ import annotations
 
@@ -126,13 +126,17 @@ class Payload:
 
 
 def estimate_payload(
-    reference: Recording,
+    reference: Recording | None,
     loaded: Recording,
     model: DynamicModel,
     links: Sequence[str] | None = None,
     progress: Callable[[float], object] = lambda _: None,
 ) -> list[Payload]:
     """Estimates a point mass on each link from the change of the efforts. The best link is first.
+
+    Without a reference, the change is the difference between the measured efforts and those of the model. The errors of
+    the model are then part of the change. They are less certain than the changes of an arm between two recordings, so
+    their prior standard deviation is larger (`motion_difference`).
 
     The model of the change of an actuator's effort has two parts: the ten regressor columns of the link with the
     parameters of a point mass, and possible changes of the drives (`MotionDifference.changes`). The dimensions of
@@ -146,8 +150,8 @@ def estimate_payload(
     errors are at least those for independent rows.
 
     Args:
-        reference: Motion with efforts, without the payload.
-        loaded: The same motion with the payload.
+        reference: Motion with efforts, without the payload. None: the change from the efforts of the model is used.
+        loaded: Motion with the payload, the same as that of the reference.
         model: Model of the arm without the payload. It predicts the dry friction at each row, and the effect of small
             differences between the two motions.
         links: Names of the links. None means all moving links.
@@ -166,10 +170,8 @@ def estimate_payload(
     progress(0.2)
     grid = difference.grid
     if np.sqrt(np.mean(difference.tau**2)) < MIN_DIFFERENCE * np.sqrt(np.mean(loaded.measured_effort() ** 2)):
-        raise RecordingError(
-            f"{loaded.source or 'recording'}: the efforts equal the efforts of the reference. Use two different "
-            "recordings of the motion."
-        )
+        other = "the model" if reference is None else "the reference. Use two different recordings of the motion"
+        raise RecordingError(f"{loaded.source or 'recording'}: the efforts equal the efforts of {other}.")
     Y = regressor.regressor(grid.q, grid.v, grid.vd)
     J_inverse = model.arm.transmission.inverse.matrix
     estimates = []
@@ -191,6 +193,7 @@ class PayloadIdentification(Reportable):
         model: Model of the arm without the payload.
         warnings: Findings about links that explain the change better, and about the recordings.
         link: Name of the given link, or None.
+        has_reference: False if the change of the efforts is the difference from the efforts of the model.
     """
 
     payload: Payload
@@ -198,6 +201,7 @@ class PayloadIdentification(Reportable):
     model: IdentifiedModel
     warnings: tuple[Finding, ...] = ()
     link: str | None = None
+    has_reference: bool = True
 
     def as_dicts(self) -> list[dict]:
         """Returns the output of `payload --json`: payload on the given link, or on every link if none is given."""
@@ -206,18 +210,19 @@ class PayloadIdentification(Reportable):
 
 
 def payload(
-    reference: Recording,
+    reference: Recording | None,
     loaded: Recording,
     model: IdentifiedModel | Arm,
     link: str | None = None,
     *,
     progress: Progress | None = None,
 ) -> PayloadIdentification:
-    """Checks two recordings of one motion and estimates the payload of the arm, as `dvrk-drake payload` does.
+    """Checks the recordings and estimates the payload of the arm, as `dvrk-drake payload` does.
 
     Args:
-        reference: Motion with efforts (m, n), without the payload.
-        loaded: The same motion with the payload.
+        reference: Motion with efforts (m, n), without the payload. None: the efforts are compared with those of the
+            model. The estimate is then less accurate, because it contains the errors of the model.
+        loaded: Motion with the payload, the same as that of the reference.
         model: Model identified from a motion of the arm without the payload. If an arm is given instead, the model is
             identified from `reference`.
         link: SDF link to which the payload is attached. None: the link that explains the change best.
@@ -229,9 +234,10 @@ def payload(
         and `warnings`.
 
     Raises:
-        RecordingError: `check` rejects a recording, or the two motions differ. The attribute `findings` of the error
-            contains the reasons.
-        ModelError: The model has no dynamics, or the link does not exist or does not move.
+        RecordingError: `check` rejects a recording, the two motions differ, or the model was identified from `loaded`.
+            The attribute `findings` of the error contains the reasons of `check`.
+        ModelError: The model has no dynamics, there is neither a model nor a reference, or the link does not exist or
+            does not move.
         IdentificationError: The model of the arm is not identifiable from `reference`.
 
     Example:
@@ -253,24 +259,35 @@ def payload(
     """
     arm = model if isinstance(model, Arm) else model.arm
     check_links(DynamicRegressor(arm), [] if link is None else [link])
+    if reference is None and isinstance(model, Arm):
+        raise ModelError("a payload requires a reference recording, or a model of the arm without the payload")
+    if not isinstance(model, Arm) and model.provenance.includes(loaded.sha256):
+        raise RecordingError(
+            f"{loaded.source or 'recording'}: the model was identified from this recording, so it contains the "
+            "payload. Give a model of the arm without the payload."
+        )
     warnings: tuple[Finding, ...] = ()
-    (reference, dropped), (loaded, dropped_loaded) = with_power(reference, arm), with_power(loaded, arm)
-    for recording, findings in ((reference, dropped), (loaded, dropped_loaded)):
+    recordings = []
+    for given in (loaded,) if reference is None else (reference, loaded):
+        recording, findings = with_power(given, arm)
+        recordings.append(recording)
         report = require_usable(recording, arm, progress)
         if recording.tau is not None and np.any(unmeasured := recording.unmeasured):
             names = ", ".join(f"tau{j + 1}" for j in np.flatnonzero(unmeasured))
             raise RecordingError(
                 f"{report.source}: {names} was not measured, but a payload requires the efforts of all joints. Record "
-                "both motions with power on all motors."
+                "with power on all motors."
             )
         warnings += tuple(replace(finding, where=f"{report.source}: {finding.where}") for finding in findings)
         warnings += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
+    *references, loaded = recordings
     if isinstance(model, Arm):
-        model = identify_dynamic([reference], arm, step_progress(progress, "identifying")).model
+        model = identify_dynamic(references, arm, step_progress(progress, "identifying")).model
+    reference = references[0] if references else None
     estimates = estimate_payload(reference, loaded, model.dynamic_model, progress=step_progress(progress, "estimating"))
     result = estimates[0] if link is None else next(p for p in estimates if p.link == link)
     warnings = (*better_link_warnings(result, estimates), *warnings)
-    return PayloadIdentification(result, estimates, model, warnings, link)
+    return PayloadIdentification(result, estimates, model, warnings, link, bool(references))
 
 
 def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:

@@ -16,6 +16,7 @@ from dvrk_drake.analysis.payload.payload import (
     equally_good_links,
     estimate_payload,
 )
+from dvrk_drake.analysis.payload.payload import payload as estimate
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -94,6 +95,17 @@ def test_intervals_contain_the_true_values(case, seed):
     # The position along a bar that keeps its orientation is not identifiable.
     np.testing.assert_array_equal(known, [True, case != "bar", True])
     assert np.isnan(payload.position_error[1]) == (case == "bar")
+
+
+def test_one_recording_is_compared_with_the_model():
+    name, link, mass, position = CASES["end"]
+    model, _, loaded = two_days(name, link, mass, position, 0)
+    (payload,) = estimate_payload(None, loaded, model, [link])
+    assert payload.found and payload.shift == 0.0
+    assert abs(payload.body.mass - mass) < 1.5 * payload.quantile * payload.mass_error
+    _, _, unloaded = two_days(name, link, 0.0, [0.0, 0.0, 0.0], 0)
+    (none,) = estimate_payload(None, unloaded, model, [link])
+    assert not none.found and none.largest_at_com < mass
 
 
 def test_finds_the_link_and_equally_good_links():
@@ -207,8 +219,10 @@ def test_payload_command(tmp_path, capsys):
     assert main(["payload", *paths, "--arm", name, "--link", "nose"]) == 2
     assert main(["payload", *paths, "--arm", name, "--json", paths[0]]) == 2
     assert main(["payload", paths[0], str(tmp_path / "none.csv"), "--arm", name]) == 2
+    assert main(["payload", paths[1], "--arm", name]) == 2
     errors = messages(capsys.readouterr().err)
-    assert len(errors) == 3 and 'unknown link "nose"' in errors[0] and "is an input" in errors[1]
+    assert len(errors) == 4 and 'unknown link "nose"' in errors[0] and "is an input" in errors[1]
+    assert errors[3].endswith("with one recording, give --model")
 
 
 def test_given_link_is_compared_with_all_links(tmp_path, capsys):
@@ -229,6 +243,19 @@ def test_given_link_is_compared_with_all_links(tmp_path, capsys):
     assert main([*command, link]) == 0
     output = capsys.readouterr()
     assert not messages(output.err) and f"Payload on {link}" in output.out and "explains the change" not in output.out
+    assert main([*command[:1], *command[2:], link]) == 0
+    assert "The intervals contain the errors of the model." in " ".join(capsys.readouterr().out.split())
+
+
+def test_model_of_the_loaded_recording_is_refused():
+    model, _, loaded = two_days(*CASES["end"], 0)
+    loaded = dataclasses.replace(loaded, sha256="a" * 64)
+    known = IdentifiedModel.from_arm(model.arm)
+    known.provenance.sha256 = loaded.sha256
+    with pytest.raises(RecordingError, match="it contains the payload"):
+        estimate(None, loaded, known)
+    with pytest.raises(ModelError, match="a reference recording, or a model"):
+        estimate(None, loaded, model.arm)
 
 
 #: File, link, mass [kg] and height above the remote centre [m], from the README of the recordings. docs/payload.md
@@ -259,6 +286,15 @@ def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
     assert abs(payload.position_in_base[2] - height) < payload.quantile * payload.position_error[2]
     assert abs(payload.body.mass / mass - 1) < 0.15
     assert payload.found
+
+
+@pytest.mark.parametrize(("file", "link", "mass", "height"), WEIGHTS)
+def test_known_weights_without_reference(unloaded, file, link, mass, height):
+    folder, _, model = unloaded
+    (payload,) = estimate_payload(None, read_recording(folder / file, model.arm, "actuator"), model, [link])
+    assert payload.found
+    assert abs(payload.body.mass - mass) < payload.quantile * payload.mass_error < 0.5 * mass
+    assert abs(payload.position_in_base[2] - height) < payload.quantile * payload.position_error[2]
 
 
 def test_reports_a_real_payload_on_another_link(unloaded, capsys):
