@@ -19,8 +19,8 @@ from dvrk_drake.systems.lcm.dvrk_command import draw_id
 #: Driver configuration for an arm without dynamics: it measures no effort, although gravity acts on its model.
 #: The timeouts are long, so that a busy computer does not end the commands.
 LENIENT_DRIVER = """guard:
-  {resume_automatically: true, expiry: 0.5, clock_tolerance: 0.5, measurement_age: 0.1, longest_period: 1.0,
-  slow_period: 0.02, plausibility: {start_gravity: 2.0, bad_samples: 100}}
+  {resume_automatically: true, expiry: 0.5, command_age: 0.5, clock_tolerance: 0.5, measurement_age: 0.1,
+  longest_period: 1.0, slow_period: 0.02, plausibility: {start_gravity: 2.0, bad_samples: 100}}
 """
 
 
