@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.compiled import compiled
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS, kind_fault
 from dvrk_drake.models.effects_schema import DriveEffect
 
 
@@ -173,7 +173,9 @@ def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
     return ActuatorEffect(coordinate, "spring", float(f"{1.01 * np.abs(x).max():.3g}"))
 
 
-def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFECT_KINDS) -> str:
+def effect_fault(
+    arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFECT_KINDS, coefficient: float = 0.0
+) -> str:
     """Returns a message that explains why an effect is not valid for an arm, or "" if it is valid.
 
     The message includes the allowed values.
@@ -182,16 +184,13 @@ def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFE
         arm: Arm of the effect.
         effect: Effect to check.
         kinds: Allowed kinds.
+        coefficient: Coefficient of the effect, if it is known.
     """
     coordinates = arm.effect_coordinates
     if effect.coordinate not in coordinates:
         return f'coordinate is "{effect.coordinate}"; allowed: {", ".join(coordinates)}'
-    if effect.kind not in kinds:
-        return f'kind is "{effect.kind}"; allowed: {", ".join(kinds)}'
-    kind = EFFECT_KINDS[effect.kind]
-    if kind.revolute and is_prismatic(arm, effect.coordinate):
+    if fault := kind_fault(effect.kind, effect.scale, coefficient, kinds):
+        return fault
+    if EFFECT_KINDS[effect.kind].revolute and is_prismatic(arm, effect.coordinate):
         return f"kind {effect.kind} requires a revolute coordinate, but {effect.coordinate} is prismatic"
-    if not (0 < effect.scale < math.inf if kind.scale else effect.scale == 0):
-        allowed = f"a positive number, the {kind.scale}" if kind.scale else "0"
-        return f"scale is {effect.scale:g}; allowed for kind {effect.kind}: {allowed}"
     return ""

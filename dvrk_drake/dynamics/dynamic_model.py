@@ -247,8 +247,5 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
 
 def _check_effects(arm: Arm, section: DynamicSection) -> None:
     for i, effect in enumerate(section.effects):
-        where, actuator_effect = f"dynamics.effects[{i}]", ActuatorEffect.of(effect)
-        if fault := effect_fault(arm, actuator_effect):
-            raise ModelError(f"{where}: {fault}")
-        if actuator_effect.dissipative and effect.coefficient < 0:
-            raise ModelError(f"{where}: coefficient is {effect.coefficient:g}; for friction it must be 0 or more")
+        if fault := effect_fault(arm, ActuatorEffect.of(effect), coefficient=effect.coefficient):
+            raise ModelError(f"dynamics.effects[{i}]: {fault}")

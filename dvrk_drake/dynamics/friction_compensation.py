@@ -67,10 +67,8 @@ class Friction:
             if effect.kind not in EFFECT_KINDS or (effect.dissipative and effect.kind not in varying)
         ]
         for k in kept:
-            if fault := effect_fault(arm, effects[k]):
-                raise ControllerError(f"friction: {fault}")
-            if not 0 <= values[k] < np.inf:
-                raise ControllerError(f"friction: {effects[k]} has coefficient {values[k]:g}; it must be 0 or more")
+            if fault := effect_fault(arm, effects[k], coefficient=values[k]):
+                raise ControllerError(f"friction of {effects[k].coordinate}: {fault}")
         kept = [k for k in kept if values[k] > 0]
         return cls(arm, tuple(effects[k] for k in kept), values[kept])
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -74,3 +76,24 @@ EFFECT_KINDS: dict[str, EffectKind] = {
 }
 #: Kinds of effects that depend on position only.
 POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.role in ("position", "offset"))
+
+
+def kind_fault(kind: str, scale: float, coefficient: float, kinds: Collection[str] = EFFECT_KINDS) -> str:
+    """Returns why an effect with these numbers is not valid, including the allowed values, or "" if it is valid.
+
+    Args:
+        kind: Kind of the effect.
+        scale: Number with the meaning `EffectKind.scale`.
+        coefficient: Coefficient of the effect; 0 if it is unknown.
+        kinds: Allowed kinds.
+    """
+    if kind not in kinds:
+        return f'kind is "{kind}"; allowed: {", ".join(kinds)}'
+    meaning = EFFECT_KINDS[kind].scale
+    if not (0 < scale < math.inf if meaning else scale == 0):
+        allowed = f"a positive number, the {meaning}" if meaning else "0"
+        return f"scale is {scale:g}; allowed for kind {kind}: {allowed}"
+    if not -math.inf < coefficient < math.inf or (EFFECT_KINDS[kind].dissipative and coefficient < 0):
+        allowed = "0 or more, since it is friction" if EFFECT_KINDS[kind].dissipative else "a finite number"
+        return f"coefficient is {coefficient:g}; allowed for kind {kind}: {allowed}"
+    return ""

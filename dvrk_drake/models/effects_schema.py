@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
+from dvrk_drake.models.effect_kinds import POSITION_KINDS, kind_fault
 from dvrk_drake.models.immutable import Shared
 from dvrk_drake.models.schema_fault import formerly, number_fault, within
 
@@ -193,21 +193,18 @@ class ArmEffects(Shared):
         for table, values in tables.items():
             if unknown := sorted(set(values) - set(joint_names)):
                 raise ArmError(f"{table}: unknown actuator {unknown[0]}; allowed: {', '.join(joint_names)}")
+        for group, effects, kinds in (
+            ("friction", self.friction, FRICTION_KINDS),
+            ("cables", self.cables, POSITION_KINDS),
+            ("springs", self.springs, POSITION_KINDS),
+        ):
+            for effect in effects:
+                if fault := kind_fault(effect.kind, effect.scale, effect.coefficient, kinds):
+                    raise ArmError(f"{group} of {effect.coordinate}: {fault}")
         for effect in self.friction:
-            where = f"friction of {effect.coordinate}"
-            if effect.kind not in FRICTION_KINDS:
-                raise ArmError(f'{where}: kind is "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
-            if effect.coefficient < 0 and effect.kind != "presliding forward":
-                raise ArmError(f"{where}: coefficient of {effect.kind} is {effect.coefficient:g}; allowed: 0 or more")
-            if EFFECT_KINDS[effect.kind].scale and effect.scale == 0:
-                raise ArmError(f"{where}: scale of {effect.kind} is 0; allowed: more than 0")
             if effect.fall_speed and effect.kind != "presliding":
+                where = f"friction of {effect.coordinate}"
                 raise ArmError(f"{where}: fall_speed of {effect.kind} is {effect.fall_speed:g}; allowed: 0")
-        for group, laws in (("cables", self.cables), ("springs", self.springs)):
-            for law in laws:
-                if law.kind not in POSITION_KINDS:
-                    where = f"{group} of {law.coordinate}"
-                    raise ArmError(f'{where}: kind is "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
 
 
 #: Kinds that `friction` accepts: friction that the solver of the plant can compute.

@@ -80,8 +80,8 @@ def test_unknown_part_is_an_error(tmp_path):
             "stiction, scale: 0.015",
             'effects.friction of actuator.wrist_roll: kind is "stiction"; allowed',
         ),
-        ("scale: 0.015", "scale: 0.0", "scale of presliding is 0"),
-        ("coefficient: 0.0011", "coefficient: -0.0011", "coefficient of presliding is -0.0011"),
+        ("scale: 0.015", "scale: 0.0", "scale is 0; allowed for kind presliding: a positive number"),
+        ("coefficient: 0.0011", "coefficient: -0.0011", "coefficient is -0.0011; allowed for kind presliding: 0"),
     ):
         assert old in text
         (tmp_path / "m.yaml").write_text(text.replace(old, new))
