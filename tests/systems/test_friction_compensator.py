@@ -241,7 +241,7 @@ def test_compensation_needs_an_error_bound_of_gravity():
 
 
 def test_active_friction_is_refused():
-    with pytest.raises(ControllerError, match="allowed for kind .*: 0 or more"):
+    with pytest.raises(ControllerError, match=r"allowed for kind .*: 0 or more"):
         Friction.of(ARM, EFFECTS, -COEFFICIENTS)
     with pytest.raises(ControllerError, match=r"allowed: actuator\.outer_yaw"):
         Friction.of(ARM, [ActuatorEffect("actuator.nose", "viscous")], [1.0])
