@@ -61,7 +61,7 @@ def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectr
         rate: Sampling rate [Hz].
         period: Period of the motion [s], or None if the motion does not repeat.
     """
-    from scipy.signal import welch  # takes 0.3 s, see `low_pass`
+    from scipy.signal import welch  # takes 0.3 s
 
     length = min(int(SEGMENT_DURATION * rate), len(x) // 4)
     frequency, power = welch(x, rate, nperseg=length, axis=0)
