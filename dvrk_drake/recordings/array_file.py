@@ -133,6 +133,7 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         sha256=digest.hexdigest(),
         notes=(*notes, *time_notes),
         line_label=label,
+        times_from="array" if options.rate is None else "rate",
     )
     return options.with_coordinates(recording)
 
