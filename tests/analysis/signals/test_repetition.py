@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.signals.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.signals.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.signals.repetition import find_period, motion_floor, repeatability_floor
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
