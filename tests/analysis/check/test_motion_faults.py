@@ -192,7 +192,7 @@ def test_real_steps_are_no_jumps(rate):
     assert jump_fault(replace(whole, q=coarse), ARM) is None
 
 
-def test_static_poses_may_be_recorded_without_the_motion_between_them():
+def test_unrecorded_motions_between_poses_are_no_jumps():
     poses = ARM.sample_poses(20, np.random.default_rng(2), 0.1)
     poses[:, 6] = 0.0  # Its range exceeds 2 pi.
     tau = holding_torques(ARM, poses)
