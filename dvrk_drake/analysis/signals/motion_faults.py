@@ -32,7 +32,7 @@ SAME_SOURCE, MIN_JUMP = 0.2, 0.02
 #: steps.
 WRAP_TOLERANCE, WRAP_SPEED, ISOLATED = 0.5, 50.0, 10.0
 #: Smallest ratio of a jump to the largest other step within NEARBY [s]. Lost rows that are no gap give a ratio of `GAP`
-#: at most, and public motions of seven arms give up to 3.0.
+#: at most, and public motions of eight arms give up to 3.0.
 JUMP_RATIO, NEARBY = 2 * GAP, 0.25
 #: Units of times in which recorders write, with their size [s].
 _TIME_UNITS = {
