@@ -63,9 +63,9 @@ def main() -> None:
     ):
         arm = load_arm(name)
 
-        begin = time.perf_counter()
+        begin = time.process_time()
         model = identify_dynamic([read_public(options.folder / file, arm)], arm).model
-        seconds = time.perf_counter() - begin
+        seconds = time.process_time() - begin
         dynamics = model.dynamics
         assert dynamics is not None
 
@@ -94,7 +94,7 @@ def main() -> None:
         print(f"smallest eigenvalue of all pseudo-inertias: {min(e.least_eigenvalue for e in dynamics.links):.1e}\n")
         print(f"smallest eigenvalue of M(q) at {len(q)} random poses: {least:.1e}\n")
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"identification time: {seconds:.1f} s; peak memory of this process: {peak:.0f} MB\n")
+        print(f"processor time of the identification: {seconds:.1f} s; peak memory of this process: {peak:.0f} MB\n")
 
 
 def read_public(path: Path, arm: Arm) -> Recording:

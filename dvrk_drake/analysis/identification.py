@@ -114,6 +114,8 @@ def identify(
         note = f"{note} Gravity in the base frame, estimated from the poses: {direction} from the arm file.".strip()
     tilted = _tilt_warning(direction, report.source) if direction and not estimate_gravity else ()
     warnings = (*dropped, *report.warnings, *tilted, *_friction_in_segments(static, poses.measured))
+    if tilted:
+        static.model.provenance.base_tilt = f"gravity estimated from the poses: {direction} from the assumed direction"
     return replace(static, warnings=warnings, note=note, num_rows=len(poses.recording))
 
 

@@ -119,6 +119,10 @@ def export(
         print_written(path)
         if format in ("sdf", "urdf"):
             print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")
+    if tilt := loaded.provenance.base_tilt:
+        what = f"the base of the recorded arm seems to be tilted, but the model assumes that it is not ({tilt})"
+        advice = "Identify again with --gravity before you use an exported file."
+        print(f"dvrk-drake: warning: {origin}: {what}. {advice}", file=sys.stderr, flush=True)
     if diff:
         loaded.arm.refuse_locked_joints("--diff")
         bodies = model_bodies(loaded)

@@ -126,7 +126,8 @@ class Provenance:
 
     `recording` is the name of the recording, or the names separated by commas. `sha256` is the hash of the recording's
     bytes, or the hashes separated by spaces. `poses` is the number of rows of all recordings. `condition_number` is inf
-    if the regressor does not have full rank.
+    if the regressor does not have full rank. `base_tilt` is a text on a tilt of the base that the recording shows but
+    the model does not contain, or None.
     """
 
     recording: str = ""
@@ -136,6 +137,7 @@ class Provenance:
     rank: int = field(default=0, metadata=within(0, 10**6))
     condition_number: float = field(default=0.0, metadata=within(0.0, 1e100, also=(math.inf,)))
     version: str = ""
+    base_tilt: str | None = None
 
     def includes(self, sha256: str) -> bool:
         """Returns whether the model was identified from the recording with this hash, which is "" if unknown."""

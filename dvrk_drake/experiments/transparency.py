@@ -112,7 +112,7 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
     """
     recording = recording.in_joint_coordinates(arm)
     if recording.t is None:
-        raise ScenarioError(f"{recording.source}: the recording has no times; column t is required")
+        raise ScenarioError(f"{recording.source}: the recording has no times; t [s] is required")
     if not 0 < speed <= 10:
         raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
     A, lower, upper = arm.limit_matrix()

@@ -1,4 +1,4 @@
-"""Reads recordings from arrays in MATLAB files (version 4 to 7.3) and NumPy archives (.npz).
+"""Makes recordings from arrays in MATLAB files (version 4 to 7.3) and NumPy archives (.npz).
 
 The arrays q, qd, tau and t are named by the user or recognised by their names. Two public layouts are recognised:
 
@@ -11,31 +11,20 @@ The arrays q, qd, tau and t are named by the user or recognised by their names. 
 from __future__ import annotations
 
 import hashlib
-import io
-import pickle
-import struct
-import subprocess
-import sys
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
-from scipy.io.matlab import MatlabOpaque
 
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.recordings.array_content import ArrayContent, is_matlab, read_content
 from dvrk_drake.recordings.csv_rows import listed, read_bytes
 from dvrk_drake.recordings.file_options import FileOptions
-from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
+from dvrk_drake.recordings.joint_states import JointState, collect_joint_states, joint_recording
 from dvrk_drake.recordings.recording import Recording
 
-_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-_ZIP_MAGIC = b"PK\x03\x04"
-#: Type of a compressed variable in a MATLAB file of version 5 to 7.
-_COMPRESSED = 15
 _SUFFIXES = (".mat", ".npz")
 #: Recognised names of arrays, in lower case. The first names of q and tau are those of the public gravity collection.
 _NAMES = {
@@ -51,8 +40,6 @@ _NAMES = {
 QUANTITIES = tuple(_NAMES)
 #: First dimension of an array of static poses (joints and gripper), and number of joints.
 _POSE_ROWS, _POSE_JOINTS = 8, 7
-#: MATLAB classes of numbers.
-_NUMERIC_CLASSES = ("double", "single", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 #: Maximum number of arrays listed in a message.
 _LISTED = 12
 
@@ -64,8 +51,7 @@ def is_array_file(path: Path) -> bool:
     if path.suffix.lower() in _SUFFIXES:
         return True
     with path.open("rb") as file:
-        start = file.read(520)
-    return start[126:128] in (b"IM", b"MI") or _is_hdf5(start)
+        return is_matlab(file.read(520))
 
 
 def read_array_file(path: Path, options: FileOptions) -> Recording:
@@ -98,8 +84,8 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         options.progress(number / len(files))
         content = read_bytes(file)
         digest.update(content)
-        contents = _read_content(file, content)
-        if contents.messages and not names and not contents.has_positions and len(files) == 1:
+        contents = read_content(file, content)
+        if contents.messages and not names and not _has_positions(contents) and len(files) == 1:
             return _message_recording(path, contents.messages, options, digest.hexdigest())
         parts.append(_rows(file, contents, options.num_joints, names))
     for file, part in zip(files, parts, strict=True):
@@ -133,37 +119,9 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         sha256=digest.hexdigest(),
         notes=(*notes, *time_notes),
         line_label=label,
+        times_from="array" if options.rate is None else "rate",
     )
     return options.with_coordinates(recording)
-
-
-class _Content(NamedTuple):
-    """Content of a file.
-
-    Attributes:
-        arrays: Arrays of real numbers by name.
-        messages: Messages sensor_msgs/JointState by the name of their variable.
-        classes: Names of the MATLAB classes of objects that cannot be read.
-    """
-
-    arrays: dict[str, NDArray]
-    messages: dict[str, list[JointState]]
-    classes: list[str]
-
-    @property
-    def has_positions(self) -> bool:
-        """Returns whether an array has a recognised name of positions."""
-        return any(name.rpartition(".")[2].lower() in _NAMES["q"] for name in self.arrays)
-
-    @property
-    def unreadable(self) -> str:
-        """Returns a text on the objects that cannot be read, or ""."""
-        if not self.classes:
-            return ""
-        return (
-            f"objects of the MATLAB class {', '.join(self.classes)} are not read; save their numbers as arrays, e.g. "
-            "q = data.Data; t = data.Time; save('log.mat', 'q', 't', '-v7')"
-        )
 
 
 class _Rows(NamedTuple):
@@ -191,6 +149,11 @@ def _collection(folder: Path) -> list[Path]:
     )
 
 
+def _has_positions(content: ArrayContent) -> bool:
+    """Returns whether an array has a recognised name of positions."""
+    return any(name.rpartition(".")[2].lower() in _NAMES["q"] for name in content.arrays)
+
+
 def _message_recording(
     path: Path, variables: Mapping[str, list[JointState]], options: FileOptions, sha256: str
 ) -> Recording:
@@ -206,7 +169,7 @@ def _message_recording(
     return joint_recording(path, states, None, options, sha256, "message")
 
 
-def _rows(path: Path, content: _Content, n: int, names: Mapping[str, str]) -> _Rows:
+def _rows(path: Path, content: ArrayContent, n: int, names: Mapping[str, str]) -> _Rows:
     """Returns the rows of the named and the recognised arrays."""
     arrays = content.arrays
     shapes = [f"{name} ({_shape(array)})" for name, array in arrays.items()]
@@ -334,188 +297,3 @@ def _valid_rows(
         f"{path}, {label} {row + 1}: {problem}. Use --skip-invalid to omit invalid {label}s "
         f"({np.sum(~valid)} of {len(valid)} {label}s)."
     )
-
-
-def _is_hdf5(content: bytes) -> bool:
-    # MATLAB writes a header of 512 bytes before the HDF5 signature.
-    return any(content[start : start + 8] == _HDF5_MAGIC for start in (0, 512))
-
-
-def _read_content(path: Path, content: bytes) -> _Content:
-    """Returns the content of a file. Members of structures have names with dots: "log.q"."""
-    read = _read_hdf5 if _is_hdf5(content) else _read_npz if content[:4] == _ZIP_MAGIC else _read_mat
-    try:
-        with warnings.catch_warnings():
-            # Raises the warning "returned data may be corrupt" as an error.
-            warnings.simplefilter("error", UserWarning)
-            # scipy gives the name "None" to all objects of classes.
-            warnings.filterwarnings("ignore", 'Duplicate variable name "None"')
-            found = read(content)
-    except Exception as error:
-        # For a damaged file the libraries raise errors of many types: ValueError, OSError, zlib.error, KeyError, ...
-        text = " ".join(str(error).split())
-        raise RecordingError(f"{path}: the file is damaged, or not a MATLAB file or NumPy archive ({text})") from error
-    arrays = {
-        name: value for name, value in found.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
-    }
-    messages = {name: value for name, value in found.items() if isinstance(value, list)}
-    classes = sorted({value for value in found.values() if isinstance(value, str)})
-    return _Content(arrays, messages, classes)
-
-
-def _read_mat(content: bytes) -> dict[str, object]:
-    """Returns arrays by name, messages as lists, and the name of the class of each object."""
-    loaded = scipy.io.loadmat(io.BytesIO(content), **_LOADING) if _has_checksums(content) else _load_apart(content)
-    found: dict[str, object] = {}
-
-    def visit(name: str, value: object) -> None:
-        if isinstance(value, MatlabOpaque):
-            found[f"object {len(found)}"] = value["s2"][0].decode()
-        elif messages := _messages(value):
-            found[name] = messages
-        # A structure is an array (1, 1) of records.
-        elif isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
-            for member in value.dtype.names:
-                visit(f"{name}.{member}", value[member].item())
-        else:
-            found[name] = value
-
-    for name, value in loaded.items():
-        if not name.startswith("__"):
-            visit(name, value)
-    return found
-
-
-#: Options of scipy.io.loadmat.
-_LOADING: dict[str, Any] = {"simplify_cells": False, "squeeze_me": False, "struct_as_record": True}
-#: Program that reads a MATLAB file from its standard input.
-_LOADER = f"""
-import io, pickle, sys, warnings, scipy.io
-warnings.simplefilter("error", UserWarning)
-warnings.filterwarnings("ignore", 'Duplicate variable name "None"')
-content = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()), **{_LOADING})
-sys.stdout.buffer.write(pickle.dumps(content))
-"""
-
-
-def _has_checksums(content: bytes) -> bool:
-    """Returns whether all variables are compressed, with a checksum. True for a file of version 4."""
-    if content[126:128] not in (b"IM", b"MI"):
-        return True
-    order, position = "<" if content[126:128] == b"IM" else ">", 128
-    while position + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, position)
-        if kind != _COMPRESSED:
-            return False
-        position += 8 + size
-    return True
-
-
-def _load_apart(content: bytes) -> dict[str, Any]:
-    """Reads a file without checksums in another process, because damaged files can crash scipy (1.17)."""
-    run = subprocess.run([sys.executable, "-c", _LOADER], input=content, capture_output=True, check=False)
-    if run.returncode:
-        lines = run.stderr.decode(errors="replace").strip().splitlines()
-        raise ValueError(lines[-1] if lines and run.returncode > 0 else "the reader crashed")
-    loaded: dict[str, Any] = pickle.loads(run.stdout)
-    return loaded
-
-
-def _messages(value: object) -> list[JointState]:
-    """Returns the JointState messages in a structure array or a cell array, or an empty list.
-
-    `readMessages(bag, DataFormat="struct")` of MATLAB's ROS Toolbox returns such cell arrays.
-    """
-    if not isinstance(value, np.ndarray) or not (value.dtype.names or value.dtype == object):
-        return []
-    messages = []
-    for number, item in enumerate(value.reshape(-1), 1):
-        fields = _members(item)
-        stamp = _members(_members(fields.get("header")).get("stamp"))
-        if "sec" not in stamp or not {"name", "position"} <= fields.keys():
-            return []
-        sec, nanosec = (
-            int(np.sum(np.asarray(stamp.get(name, 0), np.int64)))
-            for name in ("sec", "nanosec" if "nanosec" in stamp else "nsec")
-        )
-        names = [str(np.asarray(name).item()) for name in np.asarray(fields["name"]).reshape(-1)]
-        blocks = [np.asarray(fields.get(name, ()), float).reshape(-1) for name in MESSAGE_BLOCKS]
-        messages.append(JointState(number, sec * 1_000_000_000 + nanosec, names, *blocks))
-    return messages
-
-
-def _members(value: object) -> dict[str, NDArray]:
-    """Returns the members of a record, or of an array with one record, by their names in lower case."""
-    if isinstance(value, dict):
-        return value
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.reshape(-1)[0]
-    return (
-        {name.lower(): value[name] for name in value.dtype.names}
-        if isinstance(value, np.void) and value.dtype.names
-        else {}
-    )
-
-
-def _read_hdf5(content: bytes) -> dict[str, object]:
-    # The import takes 0.2 s, and most commands read no file of version 7.3.
-    import h5py
-
-    found: dict[str, object] = {}
-
-    def is_of_references(item: Any) -> bool:
-        return isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is not None
-
-    def value(item: Any) -> Any:
-        """Returns a text, an array, or a dictionary of the members of a structure."""
-        if isinstance(item, h5py.Group):
-            return {name.lower(): value(member) for name, member in item.items()}
-        if "MATLAB_empty" in item.attrs:
-            return np.empty(0)
-        # MATLAB stores arrays by columns, HDF5 by rows.
-        numbers = np.asarray(item).T
-        if is_of_references(item):
-            return [value(item.file[reference]) for reference in numbers.reshape(-1)]
-        is_text = item.attrs.get("MATLAB_class", b"double") == b"char"
-        return "".join(map(chr, numbers.reshape(-1, order="F"))) if is_text else numbers
-
-    def visit(name: str, item: Any) -> None:
-        # MATLAB stores references under names that begin with #.
-        if name.startswith("#"):
-            return
-        if isinstance(item, h5py.Group):
-            # The members of a structure array are arrays of references to the values of its elements.
-            if len(item) and all(is_of_references(own) and "MATLAB_class" not in own.attrs for own in item.values()):
-                members = {key.lower(): value(member) for key, member in item.items()}
-                read_messages(
-                    name,
-                    [dict(zip(members, own, strict=True)) for own in zip(*members.values(), strict=True)],
-                    "struct",
-                )
-            else:
-                for key, member in item.items():
-                    visit(f"{name}.{key}" if name else key, member)
-        elif "MATLAB_empty" not in item.attrs:
-            matlab_class = item.attrs.get("MATLAB_class", b"double").decode()
-            if matlab_class in _NUMERIC_CLASSES:
-                found[name] = np.asarray(item).T
-            elif matlab_class == "cell":
-                read_messages(name, value(item), matlab_class)
-            elif matlab_class not in ("char", "logical"):
-                # The content of an object is not an array of numbers.
-                found[f"object {len(found)}"] = matlab_class
-
-    def read_messages(name: str, items: list[object], matlab_class: str) -> None:
-        elements = np.empty(len(items), dtype=object)
-        elements[:] = items
-        messages = _messages(elements)
-        found[name if messages else f"object {len(found)}"] = messages or matlab_class
-
-    with h5py.File(io.BytesIO(content), "r") as file:
-        visit("", file)
-    return found
-
-
-def _read_npz(content: bytes) -> dict[str, object]:
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}

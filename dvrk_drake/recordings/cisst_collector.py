@@ -111,6 +111,7 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
         source=str(path),
         lines=found.lines[new],
         sha256=sha256,
+        times_from="messages",
     )
     notes.append(f"signal {signal} of {origin}, in {options.coordinates or stated} coordinates")
     return dataclasses.replace(options.with_coordinates(recording, stated), notes=tuple(notes))

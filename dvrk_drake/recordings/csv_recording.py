@@ -126,6 +126,7 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         lines=found.lines,
         sha256=sha256,
         notes=(*time_notes, *found.notes),
+        times_from="column" if options.rate is None else "rate",
         file_coordinates=_statement(header, first, "coordinates"),  # type: ignore[arg-type]
         arm_name=_statement(header, first, "arm"),
     )

@@ -171,6 +171,7 @@ def joint_recording(
         *(q, tau, qd, 1e-9 * (states.stamps - states.stamps[0]), "joint", str(path), states.numbers, sha256),
         notes=(*notes, *name_notes),
         line_label=line_label,
+        times_from="messages",
         file_coordinates="joint",
         arm_name=arm.name,
     )

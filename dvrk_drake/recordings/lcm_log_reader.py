@@ -283,6 +283,7 @@ def read_status_log(path: Path, options: FileOptions) -> Recording:
     t, numbers, sha256 = np.array(times)[order], np.array(events)[order], log.sha256()
     return Recording(
         *(q, tau, qd, t - t[0], "joint", str(path), numbers, sha256, tuple(notes), "event"),
+        times_from="messages",
         file_coordinates="joint",
         arm_name=arm.name if arm else "",
     )

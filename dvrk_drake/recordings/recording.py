@@ -70,6 +70,7 @@ class Recording:
         file_coordinates: Coordinates that the source or the user states: "joint", "actuator" or "wpi". "" if they are
             not stated. With an arm, the data of a file in the coordinates "wpi" are converted to joint coordinates.
         arm_name: Name of the arm that the source states, or "".
+        times_from: Source of t: "column" of a table, "array", "messages" of an arm, or "rate" of the user.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -91,6 +92,7 @@ class Recording:
     line_label: str = "line"
     file_coordinates: Coordinates | Literal[""] = ""
     arm_name: str = ""
+    times_from: Literal["column", "array", "messages", "rate"] = "array"
     # Cache: mapping from a transmission to this recording in the other coordinates.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
@@ -129,6 +131,18 @@ class Recording:
         """
         t = self.t
         return t is not None and len(t) >= MIN_ROWS and float(np.median(np.abs(np.diff(t)))) < MAX_PERIOD
+
+    @property
+    def rest_advice(self) -> str:
+        """Advice on how to read the rows as static poses: without times and velocities."""
+        names = " t" if self.qd is None else "s t and qd"
+        how = {
+            "column": f"remove the column{names}",
+            "array": f"omit the array{names}",
+            "messages": f"write a table with dvrk-drake convert, and remove its column{names}",
+            "rate": "omit --rate (rate= in Python)",
+        }
+        return f"If the arm was at rest in each row, {how[self.times_from]}."
 
     @property
     def has_increasing_times(self) -> bool:

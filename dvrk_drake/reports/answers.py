@@ -73,10 +73,13 @@ def answer_of(
 def _after_identification(
     result: Identification, verdicts: Mapping[str, Verdict], model_path: str, file_options: str
 ) -> tuple[str, str]:
-    if any(finding.kind == "base tilt" and "--gravity estimate" in finding.advice for finding in result.warnings):
+    if tilt := next((finding for finding in result.warnings if finding.kind == "base tilt"), None):
         source = f"{source_argument(result.recording, file_options)} --arm {arm_argument(result.model.arm)}"
-        command = f"dvrk-drake identify {source} --gravity estimate --output {model_path} --overwrite"
-        return command, "Estimate the direction of gravity, because the base seems to be tilted."
+        how, gravity = "Estimate", "estimate"
+        if gravity not in tilt.advice:
+            how, gravity = "Measure", "X Y Z"
+        command = f"dvrk-drake identify {source} --gravity {gravity} --output {model_path} --overwrite"
+        return command, f"{how} the direction of gravity, because the base seems to be tilted."
     if worst(verdicts)[0] == "do not use":
         return _check(result.recording, result.model.arm, file_options)
     return _validate_other(model_path)

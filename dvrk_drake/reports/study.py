@@ -9,6 +9,7 @@ from rich.console import Console
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 #: Maximum number of variations in the first sentence, and of failed runs that are printed without `verbose`.
@@ -30,7 +31,7 @@ def print_study(
     summaries = summarise(study, rows)
     failed = [case for case in study.cases if case.index in rows and rows[case.index].error]
     first = study.measures[0]
-    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries[:_MAX_COUNT])
+    found = "; ".join(f"{s.variation}: {_headline(first, s, study.arm)}" for s in summaries[:_MAX_COUNT])
     answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
     command = study_path and f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
     print_answer(console, answer, command, "yellow" if failed else "green")
@@ -41,7 +42,7 @@ def print_study(
     table.columns[1].justify, table.columns[1].no_wrap = "left", False
     for measure in study.measures:
         for k, summary in enumerate(summaries):
-            table.add_row(measure.column if k == 0 else "", summary.variation, *_cells(measure, summary))
+            table.add_row(measure.column if k == 0 else "", summary.variation, *_cells(measure, summary, study.arm))
     console.print(table)
     console.print()
     if failed:
@@ -63,16 +64,18 @@ def print_study(
         console.print(f"{len(failed) - _MAX_COUNT} more runs failed. --verbose lists them.", style="yellow")
 
 
-def _headline(measure: Measure, summary: Summary) -> str:
+def _headline(measure: Measure, summary: Summary, arm: Arm) -> str:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
         return f"{value.count} of {value.runs} runs"
-    return f"median {value.median:.4g} {measure.unit}".strip()
+    return f"median {value.median:.4g} {measure.unit(arm)}".strip()
 
 
-def _cells(measure: Measure, summary: Summary) -> list[str]:
+def _cells(measure: Measure, summary: Summary, arm: Arm) -> list[str]:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
         share = f"{100 * value.count / value.runs:.1f} %"
         return [share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", ""]
-    return [f"{number:.4g} {measure.unit}".strip() for number in (value.median, value.percentile_95, value.largest)]
+    return [
+        f"{number:.4g} {measure.unit(arm)}".strip() for number in (value.median, value.percentile_95, value.largest)
+    ]

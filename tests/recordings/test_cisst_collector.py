@@ -42,7 +42,7 @@ def test_reads_joint_states_and_ignores_the_gripper(mtm, tmp_path):
         np.testing.assert_array_equal(read.qd, qd)
         np.testing.assert_array_equal(read.tau, tau)
         np.testing.assert_allclose(read.t, 0.005 * np.arange(6), atol=1e-9)
-        assert read.coordinates == "joint"
+        assert (read.coordinates, read.times_from) == ("joint", "messages")
         assert read.notes == (f"signal kin/measured_js of {JOINTS}.csv, in joint coordinates",)
 
 

@@ -199,7 +199,7 @@ def test_columns_of_messages_are_read_like_a_bag(tmp_path, layout):
     np.testing.assert_allclose(read.t, 0.01 * np.arange(5), atol=1e-12)
     first = text.count("#") + 2
     np.testing.assert_array_equal(read.lines, range(first, first + 5))
-    assert (read.file_coordinates, read.notes) == ("joint", ())
+    assert (read.file_coordinates, read.notes, read.times_from) == ("joint", (), "messages")
     if layout == "collection":
         assert_refused(
             "/MTMR is the namespace of the arm MTMR, not of MTML. Choose --arm mtmr.$", read_recording, read.source, ARM

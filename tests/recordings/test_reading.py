@@ -72,10 +72,12 @@ def test_a_rate_gives_times_to_files_without_times_only(tmp_path):
     q = wpi_rows(3)[:, :7]
     path = tmp_path / "motion.csv"
     write_recording(Recording(q=q, t=np.arange(3.0)), path)
+    assert read_recording(path).times_from == "column"
     assert_refused("--rate does not apply, because the file has times", read_recording, path, rate=200.0)
     write_recording(Recording(q=q), path)
     recording = read_recording(path, rate=50.0)
     np.testing.assert_array_equal(recording.t, [0, 0.02, 0.04])
+    assert recording.times_from == "rate"
     assert recording.notes == ("3 samples; the file has no times, so t = row / 50 Hz",)
 
 

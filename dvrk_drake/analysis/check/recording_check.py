@@ -11,9 +11,9 @@ from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
 from dvrk_drake.analysis.check.pose_check import check_poses
-from dvrk_drake.analysis.signals.motion_faults import source_fault, time_fault
+from dvrk_drake.analysis.signals.motion_faults import MotionFault, jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.signals.motion_grid import MIN_SEGMENT, default_settings, motion_grid
-from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.signals.static_segments import find_poses, static_poses
 from dvrk_drake.analysis.signals.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, usable_poses
@@ -61,7 +61,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         findings.append(Finding("note", "locked joints", ", ".join(arm.locked_joints), what, advice))
     try:
         joints = recording.in_joint_coordinates(arm)
-        if fault := source_fault(recording, arm):
+        if fault := source_fault(recording, arm) or _jump(recording, arm):
             return replace(report, findings=(Finding("refusal", *fault), *findings))
         recording.check_fits(arm)
         tau = joints.measured_effort()
@@ -86,6 +86,13 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     else:
         findings += check_poses(recording, arm)
     return replace(report, findings=tuple(sorted(findings, key=lambda finding: _ORDER[finding.severity])))
+
+
+def _jump(recording: Recording, arm: Arm) -> MotionFault | None:
+    """Returns a jump of the positions, or None if static poses are used, between which the arm may move unrecorded."""
+    fault = jump_fault(recording, arm)
+    poses = static_poses(recording, arm) if fault else None
+    return None if poses is not None and len(poses) >= MIN_POSES else fault
 
 
 def _joint_signals(joints: Recording, arm: Arm) -> tuple[JointSignals, ...]:
@@ -225,7 +232,7 @@ def _time(recording: Recording, arm: Arm, kind: str) -> list[Finding]:
     if t is None:
         if qd is not None and np.max(np.sqrt(np.mean(qd**2, axis=0))) > REST_SPEED[0]:
             what = "the arm moves (qd), but the rows have no times t"
-            advice = "The rows are treated as poses. Add a column t [s] to use them as a motion."
+            advice = "The rows are treated as poses. Add t [s], the time of each row, to use them as a motion."
             return [Finding("warning", "no times", "t", what, advice)]
         return []
     decreasing = np.flatnonzero(np.diff(t) <= 0)

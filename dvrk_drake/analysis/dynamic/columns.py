@@ -43,6 +43,8 @@ NAMED_FRICTION = {
 NAMED_EFFECTS = ("spring", *CABLES, *NAMED_FRICTION)
 
 
+#: Largest effort of an effect with a coefficient of 1 that is a rounding error, e.g. of efforts that cancel.
+MIN_SHAPE = 1e-9
 #: Kinds of the effects that differ between recordings.
 RECORDING_KINDS = ("offset", "viscous", "coulomb")
 
@@ -119,6 +121,21 @@ class DynamicColumns:
             tilts=np.concatenate([own.tilts for own in columns], axis=1),
             shapes=tuple(map(np.concatenate, zip(*(own.shapes for own in columns), strict=True))),
         )
+
+    @property
+    def acting(self) -> NDArray[np.bool_]:
+        """Mask (e,) of the effects that act on a measured effort.
+
+        Friction of a drive whose effort was not measured, or that did not move, does not act on the measured efforts.
+        """
+        size = [np.max(np.abs(shape), axis=0, initial=0.0) for shape in self.shapes]
+        return np.asarray(np.max(np.array(size).T * np.abs(self.rows), axis=1) > MIN_SHAPE)
+
+    def with_effects(self, kept: NDArray[np.bool_]) -> DynamicColumns:
+        """Returns the columns of the effects in the mask `kept` (e,)."""
+        effects = tuple(effect for effect, keep in zip(self.effects, kept, strict=True) if keep)
+        shapes = tuple(shape[:, kept] for shape in self.shapes)
+        return replace(self, effects=effects, shapes=shapes, rows=self.rows[kept])
 
     def with_load(
         self,

@@ -208,7 +208,7 @@ def motion_problem(
         tau: Measured efforts (m, n) of the actuators at the rows of each recording [N m, N].
         periods: Periods of the motions [s], None for a motion that does not repeat.
         effects: Effects of the model, all of which are mandatory. If None, the effects of `drive_effects` are mandatory
-            and those of `optional_effects` are candidates.
+            and those of `optional_effects` are candidates, without effects that do not act on a measured effort.
     """
     arm = grids[0].arm
     mandatory = effects if effects is not None else drive_effects(arm, grids)
@@ -217,6 +217,13 @@ def motion_problem(
     columns = [
         dynamic_columns(grid, own, regressor, [*mandatory, *candidates]) for grid, own in zip(grids, tau, strict=True)
     ]
+    whole = DynamicColumns.of_recordings(columns)
+    num_mandatory = len(mandatory)
+    if effects is None:
+        # Without information, only the prior would bound their coefficients.
+        acting = whole.acting
+        num_mandatory = int(np.sum(acting[:num_mandatory]))
+        whole = whole.with_effects(acting)
     num_folds = max(FOLDS // len(grids), MIN_FOLDS)
     folds, edges = zip(
         *(phase_folds(grid, period, num_folds) for grid, period in zip(grids, periods, strict=True)), strict=True
@@ -232,12 +239,12 @@ def motion_problem(
         grids=tuple(grids),
         kept=np.ones(sum(num_rows), dtype=bool),
         recording=np.repeat(np.arange(len(grids)), num_rows),
-        columns=DynamicColumns.of_recordings(columns),
+        columns=whole,
         regressor=regressor,
         fold=np.concatenate([fold + num_folds * i for i, fold in enumerate(folds)]),
         edge=np.concatenate(edges),
         independent=min(independent, sum(num_rows)),
-        num_mandatory=len(mandatory),
+        num_mandatory=num_mandatory,
     )
 
 

@@ -1,4 +1,4 @@
-"""Finds faults of a motion that make all further results meaningless: mixed sources, wrapped angles and wrong times."""
+"""Finds faults that make all results of a motion meaningless: two sources, wrapped angles, jumps and wrong times."""
 
 from __future__ import annotations
 
@@ -6,9 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_RANGE, MIN_RATE, MIN_ROWS, REST_SPEED, Recording
+from dvrk_drake.recordings.csv_rows import listed
+from dvrk_drake.recordings.recording import (
+    GAP,
+    MAX_PERIOD,
+    MIN_RANGE,
+    MIN_RATE,
+    MIN_ROWS,
+    REST_SPEED,
+    SAME_POSE,
+    Recording,
+)
 
 #: Smallest share of rows in which a signal jumps and returns, for the signals of two sources. If the rows of two
 #: sources follow in random order, the share is 25 %. Noise rarely returns in more than half of the channels at once.
@@ -20,6 +31,9 @@ SAME_SOURCE, MIN_JUMP = 0.2, 0.02
 #: [rad/s], which no arm reaches. Smallest ratio of the jump to the median step, because angles in degrees have large
 #: steps.
 WRAP_TOLERANCE, WRAP_SPEED, ISOLATED = 0.5, 50.0, 10.0
+#: Smallest ratio of a jump to the largest other step within NEARBY [s]. Lost rows that are no gap give a ratio of `GAP`
+#: at most, and public motions of eight arms give up to 3.0.
+JUMP_RATIO, NEARBY = 2 * GAP, 0.25
 #: Units of times in which recorders write, with their size [s].
 _TIME_UNITS = {
     "milliseconds": 1e-3,
@@ -114,6 +128,47 @@ def _wrapped_angle(recording: Recording, joints: Recording, arm: Arm) -> MotionF
     return None
 
 
+def jump_fault(recording: Recording, arm: Arm) -> MotionFault | None:
+    """Returns a fault if positions jump between two rows of a motion, or None.
+
+    A jump exceeds `SAME_POSE`, `MIN_JUMP` of the range of the joint, and `JUMP_RATIO` times the largest other step
+    nearby. A wrong row causes two jumps, so the next and the previous step do not count. A gap of the times is no jump.
+    """
+    if not (recording.is_motion and recording.has_increasing_times):
+        return None
+    spans = np.ptp(recording.q, axis=0)
+    moves = np.flatnonzero(spans > arm.per_joint(*MIN_RANGE))
+    smallest = np.maximum(MIN_JUMP * spans, arm.per_joint(*SAME_POSE))[moves]
+    # A window of 2 `half` + 1 steps on each side, from the second step before and after.
+    half = max(round(NEARBY / float(np.median(np.diff(np.asarray(recording.t)))) / 2), 1)
+    jumps = np.zeros(recording.q.shape)
+    for rows in recording.segments():
+        steps = np.abs(np.diff(recording.q[rows][:, moves], axis=0))
+        count = len(steps)
+        if count <= 2 * half + 2 or not np.any(steps > smallest):
+            continue
+        padded = np.pad(steps, ((2 * half + 2,) * 2, (0, 0)))
+        largest = maximum_filter1d(padded, 2 * half + 1, axis=0)
+        nearby = np.maximum(largest[half : half + count], largest[3 * half + 4 : 3 * half + 4 + count])
+        is_jump = (steps > smallest) & (steps > JUMP_RATIO * nearby)
+        jumps[rows.start + 1 : rows.stop, moves] = np.where(is_jump, steps, 0.0)
+    found = np.flatnonzero(np.any(jumps, axis=1))
+    if not len(found):
+        return None
+    row = int(found[0])
+    joint = int(np.argmax(jumps[row] / arm.per_joint(*SAME_POSE)))
+    unit = "m" if arm.prismatic[joint] else "rad"
+    what = f"q{joint + 1} jumps by {jumps[row, joint]:.2g} {unit} at {recording.where(row)}"
+    if len(found) > 1:
+        label, lines = ("row", found + 1) if recording.lines is None else (recording.line_label, recording.lines[found])
+        what += f"; positions jump at {len(found)} {label}s: {listed(lines)}"
+    advice = (
+        "Usual causes: recordings joined into one file, wrong rows, or lost encoder counts. Remove wrong rows. Write "
+        "joined recordings to one file each; identify accepts several files."
+    )
+    return MotionFault("jump", "q", what, advice)
+
+
 def time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
     """Returns a fault of the times of rows that are a motion.
 
@@ -146,7 +201,7 @@ def time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
                 unit_of_speed = "m/s" if arm.prismatic[joint] else "rad/s"
                 what = f"t implies an RMS speed of {speeds[joint]:.3g} {unit_of_speed} of joint {joint + 1}"
             what += f" (t may be in {unit}: {rate / _TIME_UNITS[unit]:.4g} Hz)" if unit else ""
-            advice = "Use t in s. If the arm was at rest in each row, remove the column t."
+            advice = f"Use t in s. {recording.rest_advice}"
             return MotionFault("wrong time", "t", what, advice if unit else "Use t in s, and q in rad (m).")
     if not moves or recording.is_motion:
         return None
@@ -155,8 +210,6 @@ def time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
         advice = "Static identification requires poses at rest. A dynamic model requires a longer motion."
         return MotionFault("too few rows", "rows", what, advice)
     what = f"the rows are a motion ({moves}), but the rate of {rate:.3g} Hz is too slow"
-    advice = (
-        f"Record a motion at {MIN_RATE:g} Hz or more, or poses at rest. If the arm was at rest in each row, remove the "
+    return MotionFault(
+        "too slow", "t", what, f"Record a motion at {MIN_RATE:g} Hz or more, or poses at rest. {recording.rest_advice}"
     )
-    advice += f"{'columns t and qd' if recording.qd is not None else 'column t'}."
-    return MotionFault("too slow", "t", what, advice)

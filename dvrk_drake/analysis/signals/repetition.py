@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.analysis.signals.low_pass import correlation, low_pass
+from dvrk_drake.analysis.signals.low_pass import correlation, low_pass, resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
 
 #: Largest difference D(T) of the positions of a motion that repeats after the period T, see `find_period`.
@@ -93,9 +93,14 @@ def motion_floor(tau: NDArray[np.float64], grid: MotionGrid, period: float) -> N
         grid: Resampled motion.
         period: Period of the motion [s].
     """
-    longest = max((rows for _, _, rows in grid.each_segment()), key=lambda rows: rows.stop - rows.start)
-    efforts = (tau @ grid.channels.T)[longest]
-    return repeatability_floor(efforts, grid.rate, period, grid.settings.effort_cut_off)
+    longest, rows = max(((own, rows) for own, _, rows in grid.each_segment()), key=lambda pair: len(pair[0].row_times))
+    efforts, rate, clock = (tau @ grid.channels.T)[rows], grid.rate, longest.clock
+    if not clock.reconstructed:
+        # Lost rows would shift the later rows against those of the next period.
+        rate = 1 / float(np.median(np.diff(clock.t)))
+        even = np.arange(clock.t[0], clock.t[-1] + 0.5 / rate, 1 / rate)
+        efforts = resample(clock.t, efforts[clock.rows], even)
+    return repeatability_floor(efforts, rate, period, grid.settings.effort_cut_off)
 
 
 #: Number of folds for cross-validation.

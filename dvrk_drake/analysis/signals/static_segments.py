@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.signals.motion_faults import source_fault, time_fault
+from dvrk_drake.analysis.signals.motion_faults import MotionFault, jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
@@ -257,7 +257,7 @@ def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = F
 
     Raises:
         RecordingError: The recording does not match the arm, has no efforts, or is a motion with decreasing times or
-            with a fault (`source_fault`, `time_fault`).
+            with a fault (`source_fault`, `time_fault`, `jump_fault`).
         IdentificationError: Low-speed segments are requested, but there are none.
     """
     fault = source_fault(recording, arm)
@@ -266,13 +266,21 @@ def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = F
         _check_times(recording, arm)
         fault = time_fault(recording, arm)
     if fault is not None:
-        raise RecordingError(f"{recording.source or 'recording'}: refused: {fault.where}: {fault.what}. {fault.advice}")
+        raise _refusal(recording, fault)
     poses = static_poses(recording, arm)
     if poses is not None and len(poses) >= MIN_POSES:
         return Poses(poses, None, f"Static poses found in the motion: {len(poses)}, in {len(recording)} rows.")
+    # The arm may move between static poses without being recorded.
+    if (fault := jump_fault(recording, arm)) is not None:
+        raise _refusal(recording, fault)
     if with_low_speed_segments:
         return Poses(*low_speed_segments(recording, arm), note=LOW_SPEED_NOTE)
     return Poses(recording, None, "", moves=poses is not None and bool(recording.motion(arm)))
+
+
+def _refusal(recording: Recording, fault: MotionFault) -> RecordingError:
+    source = recording.source or "recording"
+    return RecordingError(f"{source}: refused: {fault.where}: {fault.what}. {fault.advice}")
 
 
 def _check_times(recording: Recording, arm: Arm) -> None:

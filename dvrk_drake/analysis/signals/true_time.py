@@ -270,7 +270,9 @@ def increasing_times(recording: Recording) -> NDArray[np.float64]:
         RecordingError: There are no times, or they do not increase.
     """
     if recording.t is None:
-        raise RecordingError(f"{recording.source or 'recording'}: the recording has no times. Add a column t [s].")
+        raise RecordingError(
+            f"{recording.source or 'recording'}: the recording has no times. Add t [s], the time of each row."
+        )
     decreasing = np.flatnonzero(np.diff(recording.t) <= 0)
     if len(decreasing):
         row = int(decreasing[0]) + 1

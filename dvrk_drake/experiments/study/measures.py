@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import StudyError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import Simulation
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.schema_fault import number_fault, within
 
 
@@ -37,19 +38,10 @@ class Measure:
     time: float | None = field(default=None, metadata=within(1e-5, 3600.0, "s"))
     joints: list[str] = field(default_factory=list)
 
-    # Not a field of the file.
-    _is_prismatic = False
-
     @property
     def column(self) -> str:
         """Name of the column in the results."""
         return self.name or self.kind
-
-    @property
-    def unit(self) -> str:
-        """Unit of the values; "" for shares and boolean measures. `check` determines the type of the joints."""
-        unit = KINDS[self.kind].unit
-        return unit.replace("rad", "m") if self._is_prismatic else unit
 
     @property
     def title(self) -> str:
@@ -68,6 +60,15 @@ class Measure:
     def worst(self) -> float | bool:
         """Value for a failed run, i.e. a run that could not be simulated to its end."""
         return KINDS[self.kind].worst
+
+    def unit(self, arm: Arm) -> str:
+        """Returns the unit of the values for the joints of an arm; "" for shares and boolean measures."""
+        unit = KINDS[self.kind].unit
+        return unit.replace("rad", "m") if np.all(arm.prismatic[self._columns(arm)]) else unit
+
+    def _columns(self, arm: Arm) -> list[int]:
+        """Returns the indices of the evaluated joints."""
+        return [arm.joint_names.index(name) for name in self.joints or arm.joint_names]
 
     def check(self, scenario: Scenario) -> None:
         """Checks that the measure is valid for a scenario.
@@ -103,11 +104,8 @@ class Measure:
     def _check_unit(self, scenario: Scenario) -> None:
         """Checks that a measure in rad or m evaluates joints of one type."""
         arm = scenario.mounted_arm
-        names = {kind: [n for n, p in zip(arm.joint_names, arm.prismatic, strict=True) if p == kind] for kind in (0, 1)}
-        evaluated = self.joints or arm.joint_names
-        types = {kind for kind, own in names.items() if set(own) & set(evaluated)}
-        self._is_prismatic = types == {1}
-        if len(types) > 1 and KINDS[self.kind].unit.startswith("rad"):
+        if len(set(arm.prismatic[self._columns(arm)])) > 1 and KINDS[self.kind].unit.startswith("rad"):
+            names = [[n for n, p in zip(arm.joint_names, arm.prismatic, strict=True) if p == kind] for kind in (0, 1)]
             raise StudyError(
                 f"{self.column} is the largest value of all joints, but {arm.name} has joints in rad and in m. Give "
                 f"joints of one type: [{', '.join(names[0])}] or [{', '.join(names[1])}]"
@@ -116,7 +114,7 @@ class Measure:
     def __call__(self, scenario: Scenario, simulation: Simulation) -> float | bool:
         """Computes the measure of a run: the worst value over the evaluated joints."""
         arm = scenario.mounted_arm
-        columns = [arm.joint_names.index(name) for name in self.joints or arm.joint_names]
+        columns = self._columns(arm)
         times, poses = scenario.knots()
         arrival, desired = _arrival(scenario), simulation.desired
         evaluated = simulation.time >= (arrival - 1e-9 if desired is None else 0.0)

@@ -62,11 +62,11 @@ def _draw_distribution(ax: Axes, measure: Measure, study: Study, rows: Mapping[i
         style: dict[str, Any] = {"color": SERIES[i % len(SERIES)], "linestyle": ("-", "--", "-.", ":")[i % 4]}
         # Infinite values are not drawn, so the line ends below 100 %.
         ax.step(values[finite], share[finite], where="post", marker=".", markersize=4, label=variation.name, **style)
-    if measure.unit and smallest > 0:
+    if (unit := measure.unit(study.arm)) and smallest > 0:
         ax.set_xscale("log")
     quantity = measure.kind.replace("_", " ")
     ax.set(
         ylim=(-3, 103),
         ylabel="cumulative share of runs [%]",
-        xlabel=f"{quantity} [{measure.unit}]" if measure.unit else "effort / effort limit [1]",
+        xlabel=f"{quantity} [{unit}]" if unit else "effort / effort limit [1]",
     )

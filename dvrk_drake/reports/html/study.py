@@ -98,9 +98,12 @@ def _distribution_plot(measure: Measure, study: Study, rows: Mapping[int, Row]) 
             name=variation.name,
             hovertemplate="%{x:.4g}, %{y:.1f} % of the runs<br>case %{customdata[0]}, pose %{customdata[1]}",
         )
-    unit = f"[{measure.unit}]" if measure.unit else "as a share of the limit"
-    is_log = bool(measure.unit) and 0 < smallest < np.inf
-    figure.update_xaxes(title=f"{measure.column} {unit}", type="log" if is_log else "linear")
+    unit = measure.unit(study.arm)
+    is_log = bool(unit) and 0 < smallest < np.inf
+    figure.update_xaxes(
+        title=f"{measure.column} {f'[{unit}]' if unit else 'as a share of the limit'}",
+        type="log" if is_log else "linear",
+    )
     figure.update_yaxes(title="cumulative share of runs [%]", range=[-3, 103])
     text = f"{measure.column}: cumulative distribution over the runs"
     if infinite:

@@ -11,8 +11,9 @@ from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import check_recording, with_power
 from dvrk_drake.analysis.identification import identify
-from dvrk_drake.analysis.signals.motion_faults import source_fault, time_fault
+from dvrk_drake.analysis.signals.motion_faults import jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.validation import predict
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
@@ -79,8 +80,17 @@ def test_static_poses_with_times_have_no_fault():
     raster = np.tile(q[:1], (200, 1))
     raster[:, 0] = np.linspace(-0.5, 0.5, 200)
     assert motion_fault(Recording(q=raster, t=60.0 * np.arange(200)), ARM) is None
-    fault = motion_fault(Recording(q=raster, t=10.0 * np.arange(200)), ARM)
-    assert "If the arm was at rest in each row, remove the column t" in fault.advice
+    slow = Recording(q=raster, t=10.0 * np.arange(200))
+    for source, advice in (
+        ("column", "remove the column t."),
+        ("array", "omit the array t."),
+        ("messages", "write a table with dvrk-drake convert, and remove its column t."),
+        ("rate", "omit --rate (rate= in Python)."),
+    ):
+        fault = motion_fault(replace(slow, times_from=source), ARM)
+        assert fault.advice.endswith(f"If the arm was at rest in each row, {advice}")
+    fault = motion_fault(replace(slow, times_from="column", qd=np.gradient(raster, 10.0, axis=0)), ARM)
+    assert fault is None or fault.advice.endswith("remove the columns t and qd.")
 
 
 def test_accepts_49_9_hz_and_lost_rows():
@@ -132,6 +142,64 @@ def test_a_wrapped_angle_is_named(in_motors):
     assert refusal.kind == "wrapped angle" and refusal.what.startswith("q7 jumps by a multiple of 2 pi in ")
     # Poses may differ by 2 pi, and a joint may turn by 2 pi in a gap.
     assert motion_fault(replace(wrapped, t=None, qd=None), ARM) is None
+
+
+def joined(rate):
+    """Returns two parts of a motion in one file, with continuous times. The second part begins at row 601."""
+    parts = motion(rate, 1800 / rate)
+    return replace(parts.select(np.r_[0:600, 900:1800]), t=np.arange(1500) / rate, lines=np.arange(1500) + 2)
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
+def test_jumps_between_joined_recordings_are_named(rate):
+    recording = joined(rate)
+    (refusal,) = check_recording(recording, ARM).refusals
+    step = np.max(np.abs(recording.q[600] - recording.q[599]))
+    assert (refusal.kind, refusal.where) == (
+        "jump",
+        "q",
+    ) and f"by {step:.2g} rad at motion.csv, line 602" in refusal.what
+    assert "Write joined recordings to one file each; identify accepts several files." in refusal.advice
+    for call in (lambda: identify(recording, ARM), lambda: predict(IdentifiedModel.from_arm(ARM), recording)):
+        with pytest.raises(
+            RecordingError, match=r"jumps by .* at motion\.csv, line 602\. Usual causes: recordings joined"
+        ):
+            call()
+    # The motion during a gap is unknown.
+    gap = replace(recording, t=recording.t + np.where(np.arange(1500) < 600, 0.0, 0.3 + 6 / rate))
+    assert jump_fault(gap, ARM) is None
+
+
+def test_a_wrong_row_is_a_jump():
+    whole = motion()
+    q = whole.q.copy()
+    q[[300, 700], 4] += 0.4
+    fault = jump_fault(replace(whole, q=q), ARM)
+    assert fault.what.startswith("q5 jumps by 0.4")
+    assert fault.what.endswith(" rad at motion.csv, row 301; positions jump at 4 rows: 301, 302, 701, 702")
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
+def test_real_steps_are_no_jumps(rate):
+    """Lost rows up to a gap, repeated rows, quantised positions, and a motion that begins suddenly."""
+    whole = motion(rate, 1800 / rate)
+    lost = whole.select(np.delete(np.arange(1800), np.r_[300:304, 900:904]))
+    late = whole.select(np.maximum.accumulate(np.where(np.arange(1800) % 6 == 0, np.arange(1800), 0)))
+    coarse = np.where(np.arange(7) == 2, np.round(whole.q / 0.008) * 0.008, whole.q)
+    starts = replace(whole, q=np.where(np.arange(1800)[:, None] < 900, whole.q[900], whole.q))
+    for recording in (whole, lost, replace(lost, t=whole.t[:1792]), replace(late, t=whole.t), starts):
+        assert jump_fault(recording, ARM) is None
+    assert jump_fault(replace(whole, q=coarse), ARM) is None
+
+
+def test_unrecorded_motions_between_poses_are_no_jumps():
+    poses = ARM.sample_poses(20, np.random.default_rng(2), 0.1)
+    poses[:, 6] = 0.0  # Its range exceeds 2 pi.
+    tau = holding_torques(ARM, poses)
+    at_rest = Recording(np.repeat(poses, 150, axis=0), np.repeat(tau, 150, axis=0), t=np.arange(3000) / 100)
+    assert jump_fault(at_rest, ARM) is not None
+    assert "jump" not in [finding.kind for finding in check_recording(at_rest, ARM).findings]
+    assert len(find_poses(at_rest, ARM).recording) == 20
 
 
 def test_drops_rows_without_power():

@@ -12,6 +12,7 @@ from recordings import csv_block
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic, motion_problem
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
+from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.validation import predict
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -152,6 +153,22 @@ def test_friction_that_depends_on_load_and_position_is_found():
     ours = predict_motion(result.model, recorded(truth, motion, 0.0, generator))
     (fitted,) = result.motions
     assert np.all(np.std(ours[fitted.grid.inner] - fitted.predicted, axis=0) < 0.01 * np.std(fitted.measured, axis=0))
+
+
+def test_friction_without_information_is_not_estimated(case):
+    """The prior of a drive that is at rest, or whose effort was not measured, hardly bounds its friction."""
+    arm, _, recording, _ = case
+    actuators = recording.in_actuator_coordinates(arm)
+    at_rest, unmeasured = np.arange(arm.num_joints) == 0, np.arange(arm.num_joints) == arm.num_joints - 1
+    q, tau = np.where(at_rest, 0.1, actuators.q), np.where(unmeasured, 0.0, actuators.measured_effort())
+    changed = dataclasses.replace(actuators, q=q, qd=None, tau=tau)
+    problem = motion_problem([motion_grid(changed, arm, default_settings(arm))], [tau], [None])
+    assert np.all(problem.columns.acting) and len(problem.candidates)
+    kinds = {(effect.coordinate, effect.kind) for effect in problem.columns.effects}
+    first, second, last = (f"actuator.{arm.joint_names[i]}" for i in (0, 1, -1))
+    assert (first, "viscous") not in kinds and {(first, "offset"), (second, "viscous")} <= kinds
+    assert last not in {coordinate for coordinate, _ in kinds}
+    assert problem.num_mandatory + len(problem.candidates) == problem.num_effects == problem.columns.rows.shape[0]
 
 
 def test_loads_of_a_subset_are_those_of_the_motion(case):

@@ -283,6 +283,9 @@ def test_identifies_joints_beside_an_unmeasured_one(days):
     assert np.all(errors[:6] < 0.15) and np.isnan(errors[6])
     assert [joint.name for joint in result.model.joints if joint.feedforward_scale == 0] == ["jaw"]
     assert {"gaps", "no effort"} <= {finding.kind for finding in result.warnings}
+    # The efforts of the wrist yaw's and of the jaw's motor are not known, but neither exceeds what both can produce.
+    tau = result.model.dynamic_model.effort(*(getattr(motion.grid, name) for name in ("q", "v", "vd")))
+    assert np.all(np.abs(tau) < 2 * ARM.effort_limits)
     validation = dvrk.validate(result.model, whole)
     assert validation.verdicts["jaw"] == "off" and validation.relative_errors["wrist_pitch"] < 0.15
     np.testing.assert_allclose(dvrk.validate(result.model, cut).predicted, motion.predicted, rtol=0, atol=1e-3)

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
-from dvrk_drake.analysis.signals.repetition import find_period, repeatability_floor
+from dvrk_drake.analysis.signals.repetition import find_period, motion_floor, repeatability_floor
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.recordings.recording import Recording
 
 pytestmark = pytest.mark.numeric
 
@@ -42,6 +45,20 @@ def test_repeatability_floor_equals_the_noise_share(noise):
     np.testing.assert_allclose(floor, noise / rms, rtol=0.05, atol=1e-9)
     tau[:, 1] = 0.0
     assert np.isnan(repeatability_floor(tau, RATE, 5.0, RATE)[1])
+
+
+def test_lost_rows_do_not_change_the_repeatability():
+    arm, t = load_arm("psm"), np.arange(1000) / 50
+    phase = 2 * np.pi / 5 * t[:, None] * np.array([1, 2, 1, 3, 2, 1, 3]) + np.arange(7)
+    noise = np.random.default_rng(6).normal(size=phase.shape)
+    q = (arm.position_lower + arm.position_upper) / 2 + 0.2 * (arm.position_upper - arm.position_lower) * np.sin(phase)
+    whole = Recording(q, arm.effort_limits * (0.2 * np.cos(phase) + 0.002 * noise), t=t, coordinates="actuator")
+    floors = []
+    for recording in (whole, whole.select(np.delete(np.arange(1000), [300, 666]))):
+        grid = motion_grid(recording, arm, default_settings(arm))
+        floors.append(motion_floor(recording.tau, grid, 5.0))
+    # Two interpolated rows hardly change an RMS value of 1000 rows.
+    np.testing.assert_allclose(floors[1], floors[0], rtol=0.1, atol=1e-6)
 
 
 @pytest.mark.parametrize("period", [5.0, None])

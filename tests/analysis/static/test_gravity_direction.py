@@ -66,11 +66,20 @@ def test_forgotten_tilt_is_reported_and_estimated(tmp_path, capsys):
     assert low < 30 < high and low < tilt < high and "--gravity estimate" in str(warning)
     write_recording(recording, path := str(tmp_path / "poses.csv"))
     model = tmp_path / "model.yaml"
+    result.save(model)
+    export = ["export", "--model", str(model), "--gc-tolerance", "9", "--dvrk-kinematic-gc"]
+    assert main([*export, str(tmp_path / "gc.json")]) == 0
+    assert (
+        "the base of the recorded arm seems to be tilted, but the model assumes that it is not (gravity estimated"
+        in (capsys.readouterr().err)
+    )
     words = ["identify", path, "--arm", "psm", "--locked", *(f"{name}=0" for name in LOCKED), "--output", str(model)]
-    assert main([*words, "--gravity", "estimate"]) == 0
+    assert main([*words, "--gravity", "estimate", "--overwrite"]) == 0
     output = capsys.readouterr()
     assert "base seems to be tilted" not in output.err
     assert "Gravity in the base frame, estimated from the poses: (" in " ".join(output.out.split())
+    assert main([*export, str(tmp_path / "other.json")]) == 0
+    assert "tilted" not in capsys.readouterr().err
     loaded = dvrk.IdentifiedModel.load(model)
     np.testing.assert_allclose(loaded.arm.gravity, TILTED, atol=9.81 * np.deg2rad(3.0))
     assert dvrk.validate(loaded, poses(TILTED, seed=7)).verdict == "good"

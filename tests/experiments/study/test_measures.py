@@ -129,8 +129,8 @@ def test_distances_in_rad_and_m_are_not_compared(kind):
     unit = KINDS[kind].unit
     for joints, expected in ((["pitch", "roll"], unit), (["insertion"], unit.replace("rad", "m"))):
         measure = Measure(kind, joints=joints)
+        assert measure.unit(scenario.mounted_arm) == expected
         measure.check(scenario)
-        assert measure.unit == expected
     for joints in ([], ["pitch", "insertion"]):
         with pytest.raises(StudyError, match=rf"{kind} is .* joints in rad and in m\. Give joints of .* \[insertion\]"):
             Measure(kind, joints=joints).check(scenario)
