@@ -9,7 +9,7 @@ Hz. All other joints are locked at zero. Each model is evaluated on the other re
 Errors are |tau - tau_hat| / |tau| of each actuator. Both efforts are low-pass filtered with a zero-phase Butterworth
 filter (17 Hz, order 6), and 100 rows at each end are omitted. Methods:
 
-    identify       model of `dvrk-drake identify`, from one recording
+    identify       model of `dvrk-drake identify`, from one recording or from all others
     least squares  ordinary least squares over the full regressor of the arm with viscous friction, smoothed Coulomb
                    friction, offset, spring and rotor inertia of each joint, from one recording or from all others
 """
@@ -102,8 +102,10 @@ def main() -> None:
                     results.append((name, source, target, method, relative_errors(recording, predicted)))
             if len(others) > 1:
                 x = least_squares([columns[file] for file in others], [efforts[file] for file in others])
-                errors = relative_errors(recording, columns[target] @ x)
-                results.append((name, "all others", target, "least squares", errors))
+                model = dvrk.identify([recordings[file] for file in others], arm).model
+                rows = {"identify": dvrk.predict(model, recording).tau, "least squares": columns[target] @ x}
+                for method, predicted in rows.items():
+                    results.append((name, "all others", target, method, relative_errors(recording, predicted)))
         for arm_name, source, target, method, errors in results:
             if arm_name == name:
                 table.add_row(source, target, method, *(f"{e:.1f}" for e in errors), f"{errors.mean():.1f}")

@@ -223,7 +223,7 @@ class ChannelFit:
         weights = self._independent / (0.1**2 * efforts)
         for _ in range(4):
             x = NonNegativeFit(total.weighted(weights) + prior, precision, non_negative, np.arange(size)).solve()
-            errors = np.maximum(total.squared_errors(x), MIN_ERROR**2 * efforts)
+            errors = np.maximum(total.squared_errors(x)[0], MIN_ERROR**2 * efforts)
             weights = self._independent / errors
         at_rest = tau[:, self.resting]
         constants = np.sum((at_rest - np.mean(at_rest, axis=0)) ** 2, axis=0)

@@ -46,7 +46,7 @@ class EffectSelection:
 
     @property
     def weights(self) -> NDArray[np.float64]:
-        """Weights (n,) of the squared errors of the actuators."""
+        """Weights (s, n) of the squared errors of the actuators in each of s recordings."""
         return self.selection.weights
 
     def consistent(self) -> tuple[EffectSelection, ConsistentFit]:
@@ -119,7 +119,7 @@ def cross_validate(
     tilt_efforts = problem.columns.tilts @ (problem.columns.base @ phi)
     columns = (problem.actuator_columns(i, used, tilt_efforts) for i in range(len(problem.efforts)))
     size, b = problem.rigid.shape[2] + len(used) + tilts, problem.rigid.shape[2]
-    equations = NormalEquations.of(columns, size, problem.columns.tau, problem.fold, problem.edge)
+    equations = NormalEquations.of(columns, size, problem.columns.tau, problem.fold, problem.edge, problem.recording)
     predicted = np.empty_like(problem.columns.tau)
     for (first, count), (effects, weights, tilt) in zip(groups, results, strict=True):
         progress(0.4 + 0.6 * first / equations.folds)

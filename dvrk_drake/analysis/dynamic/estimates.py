@@ -134,7 +134,8 @@ def parameter_covariance(
 
         A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
 
-    where P is the Hessian of the priors, and X_i are the columns and w_i the weight of actuator i. The block of P for
+    where P is the Hessian of the priors, and X_i are the columns and w_i the weight of actuator i in one recording,
+    summed over the actuators and the recordings. The block of P for
     the rigid-body parameters is multiplied by `_deviation_scale` in the second factor. Omega_i (r, r) is
     the covariance matrix of the errors of actuator i at the rows. It is estimated from the residuals. Therefore, slowly
     varying errors, for example of the friction model, count as few measurements. Errors that repeat in every period
@@ -156,12 +157,13 @@ def parameter_covariance(
     A = _inverse(fit.information + fit.prior_precision)
     to_base = problem.to_base(len(fit.effects))
     middle = np.zeros((len(to_base),) * 2)
-    columns = [problem.actuator_columns(i, fit.effects) for i in range(len(fit.weights))]
+    columns = [problem.actuator_columns(i, fit.effects) for i in range(residuals.shape[1])]
     held_out = _held_out_residuals(problem, fit, residuals, columns, to_base)
     for motion in series:
         step = max(1, int(motion.rate / (2 * cut_off * _OVERSAMPLING)))
         rows = slice(motion.rows.start, motion.rows.stop, step)
-        for i, (weight, (own, X)) in enumerate(zip(fit.weights, columns, strict=True)):
+        weights = fit.weights[problem.recording[motion.rows.start]]
+        for i, (weight, (own, X)) in enumerate(zip(weights, columns, strict=True)):
             covariance = error_covariance(residuals[rows, i], held_out[rows, i], motion.rate / step, motion.period)
             middle[own[:, None], own] += (weight * step) ** 2 * (
                 X[rows].T @ scipy.linalg.matmul_toeplitz(covariance, X[rows])
@@ -225,7 +227,7 @@ def _held_out_residuals(
     for fold in range(int(problem.fold.max()) + 1):
         rows = np.flatnonzero(problem.fold == fold)
         sums = NormalEquations.of(((own, X[rows]) for own, X in columns), len(to_base), residuals[rows]).total
-        own_sums = sums.weighted(fit.weights)
+        own_sums = sums.weighted(fit.weights[problem.recording[rows[0]]])
         step = to_free @ (_inverse(known - to_free.T @ own_sums[:-1, :-1] @ to_free) @ (to_free.T @ own_sums[:-1, -1]))
         held_out[rows] += np.column_stack([X[rows] @ step[own] for own, X in columns])
     return held_out

@@ -20,14 +20,14 @@ OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
 
 @dataclass(frozen=True, eq=False)
 class SquareSums:
-    """Products [X tau]'[X tau] of every actuator, summed over a set of rows.
+    """Products [X tau]'[X tau] of every actuator, summed over a set of rows of each recording.
 
     X (r, k) contains the regressor columns, and tau (r,) contains the efforts of the actuator at these rows.
 
     Attributes:
         size: Number k + 1 of columns. The last column is the measured effort.
         own: Indices (c,) of the nonzero columns of each actuator, including the column of the effort.
-        blocks: Sums of products (c, c) of these columns, for each actuator.
+        blocks: Sums of products (s, c, c) of these columns in each of s recordings, for each actuator.
     """
 
     size: int
@@ -35,21 +35,22 @@ class SquareSums:
     blocks: tuple[NDArray[np.float64], ...]
 
     def weighted(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the weighted sum (k + 1, k + 1) of the products of all actuators, for weights (n,)."""
+        """Returns the weighted sum (k + 1, k + 1) of the products of all actuators, for weights (s, n) or (n,)."""
         sums = np.zeros((self.size, self.size))
-        for weight, own, block in zip(weights, self.own, self.blocks, strict=True):
-            sums[own[:, None], own] += weight * block
+        for weight, own, block in zip(np.atleast_2d(weights).T, self.own, self.blocks, strict=True):
+            sums[own[:, None], own] += np.tensordot(weight, block, axes=1)
         return sums
 
     def squared_errors(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the sums of squared residuals (n,) of the actuators for unknowns x (k,)."""
+        """Returns the sums of squared residuals (s, n) of the actuators in each recording for unknowns x (k,)."""
         combination = np.append(-x, 1.0)
         coefficients = [combination[own] for own in self.own]
-        return np.array([max(c @ block @ c, 0.0) for c, block in zip(coefficients, self.blocks, strict=True)])
+        return np.maximum(np.transpose([block @ c @ c for c, block in zip(coefficients, self.blocks, strict=True)]), 0)
 
     def dense(self) -> NDArray[np.float64]:
-        """Returns the products (n, k + 1, k + 1) as a dense array."""
-        return np.array([self.weighted(unit) for unit in np.eye(len(self.own))])
+        """Returns the products (n, k + 1, k + 1) over all recordings as a dense array."""
+        units = np.eye(len(self.own))
+        return np.array([self.weighted(np.tile(unit, (len(self.blocks[0]), 1))) for unit in units])
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +62,13 @@ class NormalEquations:
         own: Indices of the nonzero columns of each actuator, see `SquareSums`.
         products: Products (folds, 3, c, c) of each actuator. The second index selects the start, the middle or the end
             of a fold.
+        member: Matrix (s, folds), 1.0 if the fold belongs to the recording, otherwise 0.
     """
 
     size: int
     own: tuple[NDArray[np.int_], ...]
     products: tuple[NDArray[np.float64], ...]
+    member: NDArray[np.float64]
 
     @classmethod
     def of(
@@ -75,6 +78,7 @@ class NormalEquations:
         tau: NDArray[np.float64],
         fold: NDArray[np.int_] | None = None,
         edge: NDArray[np.bool_] | None = None,
+        recording: NDArray[np.int_] | None = None,
     ) -> NormalEquations:
         """Accumulates the products of all rows.
 
@@ -82,10 +86,13 @@ class NormalEquations:
             columns: Indices and values of the nonzero columns, for each of the n actuators.
             size: Number k of regressor columns.
             tau: Measured efforts (r, n).
-            fold: Index (r,) of the fold of each row. If None, all rows are in one fold.
+            fold: Index (r,) of the fold of each row. If None, each recording is a fold.
             edge: Masks (r, 2) of the rows at the start and at the end of their fold. If None, no row is marked.
+            recording: Index (r,) of the recording of each row. If None, all rows are in one recording. A fold has rows
+                of one recording only.
         """
-        fold = np.zeros(len(tau), dtype=int) if fold is None else fold
+        recording = np.zeros(len(tau), dtype=int) if recording is None else recording
+        fold = recording if fold is None else fold
         edge = np.zeros((len(tau), 2), dtype=bool) if edge is None else edge
         folds = int(fold.max()) + 1
         part = np.where(edge[:, 0], 0, np.where(edge[:, 1], 2, 1)) + 3 * fold
@@ -97,7 +104,9 @@ class NormalEquations:
             rows = (full[start:end] for start, end in itertools.pairwise(ends))
             products.append(np.array([x.T @ x for x in rows]).reshape(folds, 3, len(own) + 1, -1))
             owns.append(np.append(own, size))
-        return cls(size + 1, tuple(owns), tuple(products))
+        member = np.zeros((int(recording.max()) + 1, folds))
+        member[recording, fold] = 1.0
+        return cls(size + 1, tuple(owns), tuple(products), member)
 
     @property
     def folds(self) -> int:
@@ -116,34 +125,39 @@ class NormalEquations:
 
         The rows next to these folds, at the edges of the neighbouring folds, are also excluded.
         """
-        products = tuple(p[self.others(first, count)] for p in self.products)
+        others = self.others(first, count)
+        products = tuple(p[others] for p in self.products)
         for p in products:
             p[0, 0] = 0.0
             p[-1, 2] = 0.0
-        return NormalEquations(self.size, self.own, products)
+        return NormalEquations(self.size, self.own, products, self.member[:, others])
 
     @cached_property
     def total(self) -> SquareSums:
-        """Sums over all rows of the motion."""
-        return self._sums(p.sum(axis=(0, 1)) for p in self.products)
+        """Sums over all rows."""
+        return self._sums(np.ones((self.folds, 3)))
 
     def of_fold(self, fold: int, count: int = 1) -> SquareSums:
         """Returns the sums over the rows of `count` adjacent folds that start with `fold`."""
-        folds = np.arange(fold, fold + count) % self.folds
-        return self._sums(p[folds].sum(axis=(0, 1)) for p in self.products)
+        kept = np.zeros((self.folds, 3))
+        kept[np.arange(fold, fold + count) % self.folds] = 1.0
+        return self._sums(kept)
 
     def without_fold(self, fold: int, count: int = 1) -> SquareSums:
         """Returns the sums over all rows except those of `count` adjacent folds that start with `fold`.
 
         The rows next to these folds, at the edges of the neighbouring folds, are also excluded.
         """
-        before, after = (fold - 1) % self.folds, (fold + count) % self.folds
-        excluded = self.of_fold(fold, count).blocks
-        blocks = zip(self.total.blocks, excluded, self.products, strict=True)
-        return self._sums(total - held_out - p[before, 2] - p[after, 0] for total, held_out, p in blocks)
+        kept = np.ones((self.folds, 3))
+        kept[np.arange(fold, fold + count) % self.folds] = 0.0
+        kept[(fold - 1) % self.folds, 2] = kept[(fold + count) % self.folds, 0] = 0.0
+        return self._sums(kept)
 
-    def _sums(self, blocks: Iterable[NDArray[np.float64]]) -> SquareSums:
-        return SquareSums(self.size, self.own, tuple(blocks))
+    def _sums(self, kept: NDArray[np.float64]) -> SquareSums:
+        """Returns the sums over the parts of folds for which `kept` (folds, 3) is 1.0."""
+        parts = (self.member[:, :, None] * kept).reshape(len(self.member), -1)
+        sums = ((parts @ p.reshape(parts.shape[1], -1)).reshape(-1, *p.shape[2:]) for p in self.products)
+        return SquareSums(self.size, self.own, tuple(sums))
 
 
 class NonNegativeFit:

@@ -161,7 +161,7 @@ class DynamicProblem:
             phi: Rigid-body parameters (p,), for the products of tilt and link parameters in the efforts. If the base
                 may tilt, the two components of the tilt are unknowns after the effects. If `phi` is None, the tilt is
                 constant.
-            folds: If False, all rows are in one fold. This is sufficient for fits to the whole motion.
+            folds: If False, each motion is one fold. This is sufficient for fits to all rows.
         """
         base, tilts = self.columns.base, len(self.columns.tilts) if phi is not None else 0
         residual = self.columns.tau - self.rigid @ (base @ self.prior)
@@ -173,11 +173,13 @@ class DynamicProblem:
             self._own_columns(i, self.rigid[:, i] @ directions, np.arange(self.num_effects), tilt_efforts)
             for i in range(len(self.efforts))
         )
-        fold, edge = (self.fold, self.edge) if folds else (np.zeros_like(self.fold), None)
+        fold, edge = (self.fold, self.edge) if folds else (self.recording, None)
         precision = [np.ones(num_rigid), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
         non_negative = [effect.dissipative for effect in self.columns.effects]
         return StepwiseSelection(
-            equations=NormalEquations.of(columns, num_rigid + self.num_effects + tilts, residual, fold, edge),
+            equations=NormalEquations.of(
+                columns, num_rigid + self.num_effects + tilts, residual, fold, edge, self.recording
+            ),
             efforts=np.array([np.sum(self.columns.tau[fold == f] ** 2, axis=0) for f in range(fold.max() + 1)]),
             rows=np.bincount(fold),
             num_rigid=num_rigid,
@@ -295,7 +297,7 @@ class DynamicProblem:
         return self.with_load(fit.x[:p], fit.effects, fit.x[p:])
 
     def consistent(self, effects: NDArray[np.int_], weights: NDArray[np.float64]) -> ConsistentFit:
-        """Returns the physically consistent fit for effect indices (e,) and actuator weights (n,).
+        """Returns the physically consistent fit for effect indices (e,) and weights (s, n) of the recordings.
 
         Raises:
             IdentificationError: The solver did not converge.
@@ -318,11 +320,11 @@ class ConsistentFit:
 
     Attributes:
         effects: Indices (e,) of the effects.
-        weights: Weights (n,) of the actuators' squared errors.
+        weights: Weights (s, n) of the actuators' squared errors in each of s recordings.
         x: Rigid-body parameters and effect coefficients (p + e,).
         lower: Lower bounds (p + e,) of x, -inf if there is none.
-        errors: Sums of squared residuals (n,) of the actuators.
-        information: Weighted sum (p + e, p + e) of X' X over the actuators.
+        errors: Sums of squared residuals (n,) of the actuators over all recordings.
+        information: Weighted sum (p + e, p + e) of X' X over the actuators and recordings.
         prior_precision: Hessian (p + e, p + e) of the Gaussian prior plus the log-det prior at x, see
             `consistent_parameters`.
     """
@@ -333,11 +335,12 @@ class ConsistentFit:
         self.lower = program.lower
         tau = problem.columns.tau
         columns = (problem.actuator_columns(i, effects) for i in range(tau.shape[1]))
-        total = NormalEquations.of(columns, problem.rigid.shape[2] + len(effects), tau).total
+        size = problem.rigid.shape[2] + len(effects)
+        total = NormalEquations.of(columns, size, tau, recording=problem.recording).total
         to_base = problem.to_base(len(effects) + 1)
         sums = to_base.T @ total.weighted(weights) @ to_base
         self.x = program.solve(sums)
-        self.errors = total.squared_errors(to_base[:-1, :-1] @ self.x)
+        self.errors = np.sum(total.squared_errors(to_base[:-1, :-1] @ self.x), axis=0)
         self.information = sums[:-1, :-1]
         self.prior_precision = np.diag(program.precision) + log_det_curvature(self.x, problem.regressor.links)
 

@@ -34,8 +34,8 @@ class StepwiseSelection:
         precision: Reciprocals (k,) of the prior variances of all unknowns.
         non_negative: Mask (k,) of the unknowns that must not be negative.
         independent: Effective number of independent rows, divided by the number of rows.
-        weights: Weights (n,) of the squared errors of the actuators, updated by `fit`. They are 0 for efforts that were
-            not measured.
+        weights: Weights (s, n) of the squared errors of the actuators in each of s recordings, updated by `fit`. They
+            are reciprocals of the error variances, and 0 for efforts that were not measured.
     """
 
     equations: NormalEquations
@@ -51,8 +51,8 @@ class StepwiseSelection:
         self._total = equations.total
         self._training = [equations.without_fold(fold) for fold in range(equations.folds)]
         self._held_out = [equations.of_fold(fold) for fold in range(equations.folds)]
-        self._efforts = np.sum(self.efforts, axis=0)
-        self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
+        self._efforts, self._rows = equations.member @ self.efforts, equations.member @ self.rows
+        self.weights = self._weights(np.full(self._efforts.shape, 0.1**2))
 
     def without(self, first: int, count: int) -> StepwiseSelection:
         """Returns the selection without `count` adjacent folds that start with `first`."""
@@ -69,16 +69,16 @@ class StepwiseSelection:
         return x
 
     def relative_error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the relative error |tau - X x| / |tau| of each actuator (n,)."""
+        """Returns the relative errors (s, n) |tau - X x| / |tau| of the actuators in each recording."""
         return np.sqrt(self._relative(self._total.squared_errors(x)))
 
     def cross_validated(self, effects: NDArray[np.int_], candidates: Sequence[int] = ()) -> tuple[float, list[float]]:
         """Returns the cross-validated relative error with `effects`, and the errors with one more effect.
 
         The second result contains one error per candidate, with this candidate as the additional effect. Each error is
-        a mean over the actuators. All fits use the current weights.
+        a mean over the actuators and the recordings. All fits use the current weights.
         """
-        squares = np.zeros((1 + len(candidates), len(self._efforts)))
+        squares = np.zeros((1 + len(candidates), *self._efforts.shape))
         added = [None, *(self.num_rigid + k for k in candidates)]
         for training, held_out in zip(self._training, self._held_out, strict=True):
             fit = self._fit_to(training.weighted(self.weights), effects, np.array(candidates, dtype=int))
@@ -145,10 +145,10 @@ class StepwiseSelection:
         return NonNegativeFit(sums, self.precision, self.non_negative, self._index(effects), new)
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the weights (n,) of the actuators for squared relative errors (n,)."""
-        variance = np.maximum(squared, MIN_ERROR**2) * self._efforts / np.sum(self.rows)
+        """Returns the weights (s, n) of the actuators for squared relative errors (s, n)."""
+        variance = np.maximum(squared, MIN_ERROR**2) * self._efforts / np.maximum(self._rows, 1)[:, None]
         return self.independent / np.where(self._efforts > 0, variance, np.inf)
 
     def _relative(self, squares: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Divides squared errors (..., n) by the squared efforts. The result is 0 if an effort was not measured."""
+        """Divides squared errors (..., s, n) by the squared efforts. The result is 0 if an effort was not measured."""
         return squares / np.where(self._efforts > 0, self._efforts, np.inf)

@@ -108,3 +108,35 @@ def test_present_effects_are_selected_and_noise_is_not():
         )
         for part in (selection, selection.without(4, 2)):
             np.testing.assert_array_equal(part.select(np.array([0]), np.arange(1, 22)), [0, 1])
+
+
+def test_recordings_are_weighted_by_their_error_variances():
+    """The estimate is that of generalized least squares for the noise of each recording and actuator."""
+    generator = np.random.default_rng(0)
+    true, noise = np.ones(3), np.array([[1.0, 0.2], [0.1, 0.6]])
+    recording = np.arange(ROWS) % FOLDS // (FOLDS // 2)
+    X = generator.normal(size=(2, ROWS, 3))
+    tau = (X @ true).T + noise[recording] * generator.normal(size=(ROWS, 2))
+    fold = np.arange(ROWS) % FOLDS
+    columns = [(np.arange(3), x) for x in X]
+    selection = StepwiseSelection(
+        equations=NormalEquations.of(columns, 3, tau, fold, recording=recording),
+        efforts=np.array([np.sum(tau[fold == f] ** 2, axis=0) for f in range(FOLDS)]),
+        rows=np.bincount(fold),
+        num_rigid=3,
+        precision=np.full(3, 1e-6),
+        non_negative=np.zeros(3, dtype=bool),
+        independent=1.0,
+    )
+    x = selection.fit(np.array([], dtype=int))
+    # The standard deviation of a standard deviation of 600 values is 3 %.
+    np.testing.assert_allclose(selection.weights**-0.5, noise, rtol=0.1, atol=0)
+    weights = selection.weights[recording].T.ravel()
+    expected = np.linalg.solve(
+        (X.reshape(-1, 3).T * weights) @ X.reshape(-1, 3), X.reshape(-1, 3).T @ (weights * tau.T.ravel())
+    )
+    np.testing.assert_allclose(x, expected, rtol=1e-4, atol=0)
+    # Without one recording, its weights are 0.
+    half = selection.without(0, FOLDS // 2)
+    half.fit(np.array([], dtype=int))
+    assert np.all(half.weights[0] == 0) and np.all(half.weights[1] > 0)

@@ -67,12 +67,17 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
         actuator_columns=lambda i, _: (np.arange(6), X[i]),
         to_base=lambda _: np.eye(6),
         fold=fold,
+        recording=np.zeros_like(fold),
         num_rigid=0,
         prior=np.zeros(0),
     )
     information = sum(weight * x.T @ x for weight, x in zip(weights, X, strict=True))
     fit = SimpleNamespace(
-        information=information, prior_precision=prior, weights=weights, effects=np.arange(0), lower=np.full(6, -np.inf)
+        information=information,
+        prior_precision=prior,
+        weights=weights[None],
+        effects=np.arange(0),
+        lower=np.full(6, -np.inf),
     )
     estimates, predicted = [], []
     for _ in range(100):
@@ -97,7 +102,7 @@ def test_uninformed_parameters_keep_the_prior_variance():
     fit = SimpleNamespace(
         information=2.0 * X.T @ X,
         prior_precision=prior,
-        weights=weights,
+        weights=weights[None],
         effects=np.arange(0),
         x=np.zeros(2),
         lower=np.full(2, -np.inf),
@@ -106,6 +111,7 @@ def test_uninformed_parameters_keep_the_prior_variance():
         actuator_columns=lambda i, _: (np.arange(2), X),
         to_base=lambda _: np.eye(2),
         fold=(T // 4).astype(int),
+        recording=np.zeros(len(T), dtype=int),
         num_rigid=0,
         prior=np.zeros(0),
     )

@@ -39,7 +39,7 @@ def test_sums_without_zero_columns_equal_the_full_sums(rows, total):
     np.testing.assert_allclose(total.weighted(WEIGHTS), np.tensordot(WEIGHTS, expected, 1), rtol=1e-12, atol=1e-9)
     x = np.random.default_rng(9).normal(size=COLUMNS)
     left = np.sum((tau - np.einsum("irk,k->ri", X, x)) ** 2, axis=0)
-    np.testing.assert_allclose(total.squared_errors(x), left, rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(total.squared_errors(x), [left], rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize("used", [np.arange(6), np.array([1, 3, 5]), np.array([0, 2, 4])])
