@@ -3,8 +3,8 @@
     python benchmarks/dynamic_recordings.py FOLDER
 
 FOLDER contains mtm_one.csv and psm_one.csv in actuator coordinates, with a header and times
-(docs/public_recordings.md). Optional files are mtm_two.csv and psm_two.csv (other motions), and psm_one_no_weight.csv
-(another day).
+(docs/public_recordings.md). Optional files are mtm_two.csv and psm_two.csv (other motions), and mtm_earlier_day.csv and
+psm_one_no_weight.csv (other days). Each model is also identified from each optional file.
 
 Errors are |tau - tau_hat| / |tau| of each actuator, without the ends of the motion. Both efforts are low-pass filtered
 with a zero-phase Butterworth filter of order 6 (5.65 Hz for the MTM, 16.96 Hz for the PSM). Rows:
@@ -15,13 +15,16 @@ with a zero-phase Butterworth filter of order 6 (5.65 Hz for the MTM, 16.96 Hz f
     ours, fit                    model identified by `dvrk-drake identify`, on the motion of the fit
     ours, cross-validated        prediction of phases of the motion that were not used for the fit
     repeatability of the motion  smallest possible error of any function of q, v and vd over all periods
-    ours on FILE                 model identified from the first motion, on another recording
-    FILE, refitted friction      the same model and recording, after refitting friction to the other half of the phases
+    FILE on OTHER                model identified from FILE, on another recording
+    FILE on OTHER, refitted      the same model and recording, after refitting friction to the other half of the phases
+
+The second table has the shares of efforts inside the 95 % prediction intervals of the same day, and of another day.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import resource
 import sys
 import time
@@ -58,15 +61,18 @@ def main() -> None:
     )
     options = parser.parse_args()
     for name, file, others in (
-        ("mtmr", "mtm_one.csv", ["mtm_two.csv"]),
+        ("mtmr", "mtm_one.csv", ["mtm_two.csv", "mtm_earlier_day.csv"]),
         ("psm", "psm_one.csv", ["psm_two.csv", "psm_one_no_weight.csv"]),
     ):
         arm = load_arm(name)
-
+        files = [own for own in (file, *others) if (options.folder / own).is_file()]
+        recordings = {own: read_public(options.folder / own, arm) for own in files}
+        models, inside = {}, {}
         begin = time.process_time()
-        model = identify_dynamic([read_public(options.folder / file, arm)], arm).model
+        models[file] = identify_dynamic([recordings[file]], arm).model
         seconds = time.process_time() - begin
-        dynamics = model.dynamics
+        models |= {own: identify_dynamic([recordings[own]], arm).model for own in files[1:]}
+        dynamics = models[file].dynamics
         assert dynamics is not None
 
         def percent(which: str, actuators: list[ActuatorStatistics] = dynamics.actuators) -> np.ndarray:
@@ -79,15 +85,16 @@ def main() -> None:
             "ours, cross-validated": percent("rms_cross_validation"),
             "repeatability of the motion": percent("rms_repeatability"),
         }
-        for other in others:
-            if (options.folder / other).is_file():
-                recording = read_public(options.folder / other, arm)
-                errors = validate_motion(model, recording).actuators
-                rows[f"ours on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
-                rows[f"{other}, refitted friction"] = 100 * cross_validated_errors(model, recording, 2)[1]
+        for own, other in itertools.permutations(files, 2):
+            errors = validate_motion(models[own], recordings[other]).actuators
+            rows[f"{own} on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
+            rows[f"{own} on {other}, refitted"] = 100 * cross_validated_errors(models[own], recordings[other], 2)[1]
+            for day, which in (("same day", "inside"), ("another day", "inside_other_day")):
+                inside[f"{own} on {other}, {day}"] = [100 * (getattr(e, which) or 0.0) for e in errors]
         headings = [*(f"J{j + 1}" for j in range(arm.num_joints)), "mean"]
-        cells = {name: [f"{value:.1f}" for value in (*values, np.mean(values))] for name, values in rows.items()}
-        print_table(f"{arm.name}: relative RMS effort error of the actuators [%]", headings, cells)
+        for what, table in (("relative RMS effort error of the actuators", rows), ("efforts inside", inside)):
+            cells = {row: [f"{value:.1f}" for value in (*values, np.mean(values))] for row, values in table.items()}
+            print_table(f"{arm.name}: {what} [%]", headings, cells)
         box = (arm.position_lower, arm.position_upper)
         q = np.random.default_rng(0).uniform(*box, (options.poses, arm.num_joints))
         least = float(np.linalg.eigvalsh(DynamicModel(arm, dynamics).mass_matrix(q)).min())

@@ -226,7 +226,7 @@ class _Fit:
     def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
         grid = motion_grid(recording, model.arm, model.section.signals)
         self.names = model.arm.joint_names
-        self.rate = grid.rate
+        self.rate, self.day_deviation = grid.rate, np.array(model.arm.identification.day_deviation)
         expected = drive_efforts(model, grid)
         self.tau = grid.filter_efforts(recording.measured_actuators(model.arm).measured_effort())
         self.measured = np.any(self.tau, axis=0)
@@ -275,8 +275,9 @@ class _Fit:
 
     def statistics(self, x: NDArray[np.float64], held_out: NDArray[np.float64]) -> list[ActuatorStatistics]:
         """Returns the statistics of the actuators for the fit x (k + n,) and its held-out residuals (r, n)."""
-        of_fit = (np.sqrt(np.mean(values**2, axis=0)) for values in (self.tau, self._residuals(x), held_out))
-        return [ActuatorStatistics(name, *map(float, own)) for name, *own in zip(self.names, *of_fit, strict=True)]
+        efforts, *errors = (np.sqrt(np.mean(x**2, axis=0)) for x in (self.tau, self._residuals(x), held_out))
+        of_fit = zip(self.names, efforts, *errors, efforts * self.day_deviation, strict=True)
+        return [ActuatorStatistics(name, *map(float, own), rms_between_days=float(day)) for name, *own, day in of_fit]
 
     def standard_errors(self, free: NDArray[np.bool_], held_out: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the standard errors (k + n,) of x, 0 for the values that are not fitted.

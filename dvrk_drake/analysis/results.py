@@ -158,9 +158,11 @@ class Prediction:
         tau: Predicted efforts (m, n), in the coordinates given to `predict` [N m, N].
         half_width: Half widths (n,) of the 95 % prediction intervals (`DynamicModel.half_width`), in the same
             coordinates [N m, N]. None for holding torques. `IdentifiedModel.interval_scope` states their day.
+        half_width_other_day: Half widths (n,) on another day (`DynamicModel.combined_half_width`) [N m, N], or None.
         warnings: Findings of `check`. `str` of a finding is one line.
     """
 
     tau: NDArray[np.float64]
     half_width: NDArray[np.float64] | None = None
+    half_width_other_day: NDArray[np.float64] | None = None
     warnings: tuple[Finding, ...] = ()

@@ -107,7 +107,8 @@ def predict(
     Returns:
         Result with efforts `tau` (m, n) [N m, N] in these coordinates, and `warnings`. For a motion and a model with
         dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification, and
-        `half_width` the half widths of their 95 % prediction intervals. Otherwise, `tau` contains holding torques.
+        `half_width` the half widths of their 95 % prediction intervals, also for another day than that of the recording
+        of the model (`half_width_other_day`). Otherwise, `tau` contains holding torques.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute
@@ -136,6 +137,6 @@ def predict(
     if (coordinates := coordinates or recording.coordinates) != "actuator":
         to_actuator = arm.transmission.matrix @ file_transmission(arm, coordinates).inverse.matrix
         tau = tau @ to_actuator
-    half_width = model.dynamic_model.combined_half_width(to_actuator.T)
+    widths = [model.dynamic_model.combined_half_width(to_actuator.T, other_day=day) for day in (False, True)]
     share(1.0)
-    return Prediction(tau, half_width if np.all(half_width > 0) else None, report.warnings)
+    return Prediction(tau, *(x if np.all(x > 0) else None for x in widths), report.warnings)

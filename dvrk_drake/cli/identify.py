@@ -269,7 +269,8 @@ def predict(
     Args:
         output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the coordinates of the recording.
             For a motion, it also contains the time t, and the columns lower1..lowern and upper1..uppern are the limits
-            of the 95 % prediction interval.
+            of the 95 % prediction interval. The columns lower_other_day1..n and upper_other_day1..n are those on
+            another day than that of the model's recording.
     """
     from dvrk_drake.recordings.writing import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
@@ -281,8 +282,9 @@ def predict(
         prediction = dvrk.predict(loaded, read, coordinates=coordinates, progress=steps)
     columns = {} if read.t is None else {"t": read.t}
     columns["tau"] = tau = prediction.tau
-    if prediction.half_width is not None:
-        columns |= {"lower": tau - prediction.half_width, "upper": tau + prediction.half_width}
+    for suffix, width in (("", prediction.half_width), ("_other_day", prediction.half_width_other_day)):
+        if width is not None:
+            columns |= {f"lower{suffix}": tau - width, f"upper{suffix}": tau + width}
     write_csv(output, columns, loaded.arm, {"coordinates": coordinates, "arm": loaded.arm.name})
     print_warnings(make_console(), prediction.warnings)
     print_written(output, f"{len(tau)} rows, {coordinates} coordinates")

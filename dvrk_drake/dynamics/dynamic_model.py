@@ -157,22 +157,30 @@ class DynamicModel:
         day. For a model of several recordings, the held-out parts are whole recordings, so the variance between their
         days is included. They are 0 for a model without this error.
         """
-        widths = {a.name: half_width(a.rms_cross_validation, None) for a in self.section.actuators}
+        return self._half_widths("rms_cross_validation")
+
+    def _half_widths(self, which: str) -> NDArray[np.float64]:
+        widths = {a.name: half_width(getattr(a, which), None) for a in self.section.actuators}
         return np.array([widths.get(name, 0.0) for name in self.arm.joint_names])
 
-    def combined_half_width(self, combinations: NDArray[np.float64]) -> NDArray[np.float64]:
+    def combined_half_width(self, combinations: NDArray[np.float64], *, other_day: bool = False) -> NDArray[np.float64]:
         """Returns the half widths (k,) of the prediction intervals of linear combinations of the actuator efforts.
 
         They are 0 if the half width of an actuator in the combination is unknown.
 
         Args:
             combinations: Coefficients (k, n), e.g. the transposed matrix of `Arm.transmission` for the joint efforts.
+            other_day: True for the intervals on another day. Their variance contains the assumed variance between days
+                (`ActuatorStatistics.rms_between_days`), which is independent for each actuator.
         """
         correlation = self.section.error_correlation
         scaled = combinations * self.half_width
-        squares = scaled @ (np.eye(len(self.half_width)) if correlation is None else np.array(correlation))
+        products = scaled @ (np.eye(len(self.half_width)) if correlation is None else np.array(correlation))
+        squares = np.sum(products * scaled, axis=1)
+        if other_day:
+            squares += combinations**2 @ self._half_widths("rms_between_days") ** 2
         is_known = np.all((combinations == 0) | (self.half_width > 0), axis=1)
-        return np.where(is_known, np.sqrt(np.maximum(np.sum(squares * scaled, axis=1), 0.0)), 0.0)
+        return np.where(is_known, np.sqrt(np.maximum(squares, 0.0)), 0.0)
 
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """Returns the actuator efforts (m, n) [N m, N] without effects for a joint motion (m, n)."""

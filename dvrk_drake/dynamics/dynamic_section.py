@@ -78,6 +78,8 @@ class ActuatorStatistics:
 
     `rms_cross_validation` is the RMS prediction error on held-out phases of the motion, or on held-out segments if the
     motion is not periodic. Effects and gravity direction are estimated again without the held-out part.
+    `rms_between_days` is the assumed RMS change of the effort between days (`MotionSettings.day_deviation`), 0 if it is
+    unknown.
     `rms_repeatability` is the RMS difference of the effort between periods, divided by sqrt(2). This value is 0 if the
     motion does not repeat.
     """
@@ -87,6 +89,7 @@ class ActuatorStatistics:
     rms_fit: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_cross_validation: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_repeatability: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_between_days: float = field(default=0.0, metadata=RMS_EFFORTS)
 
 
 @dataclass

@@ -364,11 +364,19 @@ class IdentifiedModel(_Identified):
 
     @property
     def interval_scope(self) -> str:
-        """Sentence on the recordings, and therefore the days, whose errors the 95 % prediction intervals contain."""
+        """Sentences on the recordings, and therefore the days, whose errors the 95 % prediction intervals contain."""
         recordings = self.provenance.method.partition(_RECALIBRATED)[2] or self.provenance.recording or "one recording"
-        return (
+        text = (
             f"The 95 % prediction intervals contain only the errors within and between the recordings of the model "
-            f"({recordings}). They are valid for similar motions on the same days. On another day, recalibrate."
+            f"({recordings}). They are valid for similar motions on the same days. On another day, recalibrate"
+        )
+        actuators = [] if self.dynamics is None else self.dynamics.actuators
+        if not any(a.rms_between_days for a in actuators):
+            return f"{text}."
+        shares = ", ".join(f"{100 * a.rms_between_days / a.rms_effort if a.rms_effort else 0.0:.0f}" for a in actuators)
+        return (
+            f"{text}, or use the wider intervals for another day. Their assumption: the efforts change between days by "
+            f"{shares} % of the RMS efforts (standard deviations, from two days of one arm of this type)."
         )
 
     def recalibrated(self, dynamics: DynamicSection, recording: str) -> "IdentifiedModel":

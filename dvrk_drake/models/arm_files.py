@@ -208,7 +208,7 @@ def _view_settings(path: Path, mechanism: ViewSettings, instrument: ViewSettings
 def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:
     """Returns the settings of mechanism and instrument. The default is a cut-off frequency of 20 Hz and no delay."""
     both: dict[str, list[float]] = {}
-    for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
+    for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0), ("day_deviation", 0.0)):
         both[which] = []
         for part in (mechanism, instrument):
             values = getattr(part.motion, which)

@@ -80,6 +80,8 @@ class MotionSettings(Shared):
             friction" and "position^2 friction" (in proportion to |x| and x^2).
         presliding_travels: Travels before sliding of the presliding friction elements, as multiples of the standard
             deviation of the position along the coordinate. Used only in a mechanism file.
+        day_deviation: Standard deviations of the changes of the efforts between days, as shares of the RMS effort [1].
+            They widen the prediction intervals on another day than that of the recording. 0 if unknown.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
@@ -89,6 +91,7 @@ class MotionSettings(Shared):
     presliding_travels: list[float] = field(
         default_factory=lambda: [0.003, 0.01, 0.08, 0.3, 1.0], metadata=within(1e-6, 100.0)
     )
+    day_deviation: list[float] = field(default_factory=list, metadata=within(0.0, 10.0))
 
 
 @dataclass

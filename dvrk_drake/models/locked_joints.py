@@ -144,6 +144,7 @@ def _locked(arm: Arm, positions: tuple[tuple[str, float], ...]) -> Arm:
             settings,
             acceleration_cut_off=[settings.acceleration_cut_off[j] for j in free],
             effort_delay=[settings.effort_delay[j] for j in free],
+            day_deviation=[settings.day_deviation[j] for j in free],
             known_effects={name: kinds for name, kinds in settings.known_effects.items() if name in kept},
         ),
         effects=_effects(arm.effects, kept, names),

@@ -20,7 +20,7 @@ UNITS = {
     "t": ("s", "s"),
     **dict.fromkeys(("q", "pose"), ("rad", "m")),
     "qd": ("rad/s", "m/s"),
-    **dict.fromkeys(("tau", "lower", "upper", "friction"), ("N m", "N")),
+    **dict.fromkeys(("tau", "lower", "upper", "lower_other_day", "upper_other_day", "friction"), ("N m", "N")),
 }
 
 

@@ -413,20 +413,23 @@ def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -
 def _print_motion_validation(console: Console, validation: DynamicValidation, verbose: bool) -> None:
     name = Path(validation.recording.source).name or "recording"
     title = f"{validation.model.arm.name}, motion of {name}: RMS effort and error [N m; N]"
-    table = make_table(title, "", "measured", "error", "ratio", "repeatability", "inside", "verdict")
+    table = make_table(title, "", "measured", "error", "ratio", "repeatability", "inside", "other day", "verdict")
     table.columns[-1].justify = "left"
     for a in validation.actuators:
-        shares = ("" if x is None else percent(x) for x in (a.relative_error, a.repeatability, a.inside))
+        shares = (
+            "" if x is None else percent(x) for x in (a.relative_error, a.repeatability, a.inside, a.inside_other_day)
+        )
         style = _STYLES.get(a.verdict, "")
         table.add_row(a.name, f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *shares, a.verdict, style=style)
-    table.add_row("mean", "", "", percent(validation.mean_relative_error), "", "", "")
+    table.add_row("mean", "", "", percent(validation.mean_relative_error), "", "", "", "")
     console.print(table)
     console.print()
     if not verbose:
         return
     print_note(
         console,
-        f"inside: share of the measured efforts inside the prediction interval. {validation.model.interval_scope}",
+        "inside: share of the measured efforts inside the prediction interval of the same day. other day: inside the "
+        f"interval of another day. {validation.model.interval_scope}",
     )
     print_note(console, f"{rule_text()} Low-pass filter: {validation.cut_off:g} Hz.")
     table = make_table("Largest shares of the squared error", "", "share", "cause", "share", "cause")

@@ -66,6 +66,7 @@ def test_friction_and_offsets_of_another_day_are_estimated(name):
     # The statistics and intervals of the new model are those of the fit that it contains.
     for a, own in zip(result.actuators, result.model.dynamics.actuators, strict=True):
         assert own.rms_cross_validation == pytest.approx(a.after * own.rms_effort, abs=1e-12)
+        assert own.rms_between_days > 0
     similar = validate_motion(result.model, motion(truth, generator, seconds=16.0))
     assert all(a.inside > 0.9 for a in similar.actuators)
     truly = {(e.coordinate, e.kind): e.coefficient for e in truth.section.effects}

@@ -288,9 +288,10 @@ def _section(
     repeating = [floor for floor in floors if np.all(np.isfinite(floor))]
     floor = np.sqrt(np.mean(np.square(repeating), axis=0)) if repeating else np.zeros(arm.num_joints)
     of_held_out = np.sqrt(np.mean(held_out**2, axis=0))
+    statistics = size, np.sqrt(fit.errors / rows), of_held_out, floor, size * arm.identification.day_deviation
     actuators = [
         ActuatorStatistics(name, *map(float, numbers))
-        for name, *numbers in zip(arm.joint_names, size, np.sqrt(fit.errors / rows), of_held_out, floor, strict=True)
+        for name, *numbers in zip(arm.joint_names, *statistics, strict=True)
     ]
     gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
     gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)

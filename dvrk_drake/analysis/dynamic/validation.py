@@ -77,6 +77,7 @@ class ActuatorError:
         coverage: Share of the range between the limits that the motion covers, see `verdict.coverage` [1].
         inside: Share of the efforts inside the 95 % prediction interval (`DynamicModel.half_width`) [1], or None if the
             model has no interval.
+        inside_other_day: The same for the interval on another day (`DynamicModel.combined_half_width`) [1].
     """
 
     name: str
@@ -88,6 +89,7 @@ class ActuatorError:
     verdict: Verdict
     coverage: float
     inside: float | None = None
+    inside_other_day: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -189,14 +191,15 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         floor = [float(x) if np.isfinite(x) else None for x in motion_floor(tau, grid, period)]
     vd = grid.efforts_at_rows(arm.transmission.velocity(grid.vd))[grid.inner]
     covered = coverage(arm, np.ptp(grid.q, axis=0), "actuator")
-    widths = dynamics.combined_half_width(grid.channels)
+    widths = np.array([dynamics.combined_half_width(grid.channels, other_day=day) for day in (False, True)])
     actuators = []
     for i, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, "actuator"), strict=True)):
         shares = error_shares(measured[:, i] - predicted[:, i], i, a, v[:, i], vd, t, period)
         judged = tolerance, float(covered[i]), model.joints[i].feedforward_scale > 0
         error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], *judged)
-        if np.any(measured[:, i]) and widths[i]:
-            error = replace(error, inside=float(np.mean(np.abs(measured[:, i] - predicted[:, i]) <= widths[i])))
+        if np.any(measured[:, i]) and np.all(widths[:, i]):
+            within = np.mean(np.abs(measured[:, i] - predicted[:, i])[:, None] <= widths[:, i], axis=0).tolist()
+            error = replace(error, inside=within[0], inside_other_day=within[1])
         actuators.append(error)
     return DynamicValidation(
         model=model,

@@ -1,5 +1,6 @@
 """Dynamic identification of simulated arms with known parameters, from motion to model file to prediction."""
 
+import copy
 import dataclasses
 from collections import Counter
 from io import StringIO
@@ -85,6 +86,23 @@ def test_limits_of_the_interval_are_printed_in_joint_coordinates(case):
     of_joints = np.std(arm.transmission.pull_back_effort(errors), axis=0)
     np.testing.assert_allclose(prediction.half_width, of_joints, rtol=0.03, atol=1e-6)
     assert predict(result.model, Recording(q=recording.q[:3])).half_width is None
+
+
+def test_other_day_intervals_contain_the_change_between_days(case):
+    """The change between days is independent for each actuator, and the text states its assumed size."""
+    arm, _, recording, result = case
+    model, prediction = result.model, predict(result.model, recording.in_joint_coordinates(arm))
+    days = np.array([a.rms_between_days for a in model.dynamics.actuators])
+    efforts = np.array([a.rms_effort for a in model.dynamics.actuators])
+    np.testing.assert_allclose(days, efforts * arm.identification.day_deviation, rtol=1e-9, atol=0)
+    added = np.sqrt(prediction.half_width_other_day**2 - prediction.half_width**2)
+    of_joints = np.abs(arm.transmission.matrix.T) ** 2 @ days**2
+    np.testing.assert_allclose(added, 1.96 * np.sqrt(of_joints), rtol=1e-3, atol=0)
+    assert all(a.inside <= a.inside_other_day for a in validate_motion(model, recording).actuators)
+    assert f"{100 * arm.identification.day_deviation[0]:.0f}" in model.interval_scope
+    for actuator in (without := copy.deepcopy(model)).dynamics.actuators:
+        actuator.rms_between_days = 0.0
+    assert without.interval_scope.endswith("recalibrate.")
 
 
 def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
@@ -254,7 +272,7 @@ def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsy
     for name in ("with.csv", "without.csv"):
         output = str(tmp_path / f"of_{name}")
         assert main(["predict", paths[name], "--model", paths["model.yaml"], "--output", output]) == 0
-        predicted.append(csv_block(output, "tau", "lower", "upper"))
+        predicted.append(csv_block(output, "tau", "lower", "upper", "lower_other_day", "upper_other_day"))
         printed = capsys.readouterr().out
         assert "always 0" not in printed and result.model.interval_scope in printed
     np.testing.assert_allclose(*predicted, rtol=0, atol=1e-12 * np.abs(predicted).max())
