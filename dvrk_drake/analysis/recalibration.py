@@ -275,9 +275,12 @@ class _Fit:
 
     def statistics(self, x: NDArray[np.float64], held_out: NDArray[np.float64]) -> list[ActuatorStatistics]:
         """Returns the statistics of the actuators for the fit x (k + n,) and its held-out residuals (r, n)."""
-        efforts, *errors = (np.sqrt(np.mean(x**2, axis=0)) for x in (self.tau, self._residuals(x), held_out))
-        of_fit = zip(self.names, efforts, *errors, efforts * self.day_deviation, strict=True)
-        return [ActuatorStatistics(name, *map(float, own), rms_between_days=float(day)) for name, *own, day in of_fit]
+        rms = [np.sqrt(np.mean(values**2, axis=0)) for values in (self.tau, self._residuals(x), held_out)]
+        of_fit = zip(self.names, *rms, rms[0] * self.day_deviation, strict=True)
+        return [
+            ActuatorStatistics(name, float(effort), float(fit), float(error), rms_between_days=float(day))
+            for name, effort, fit, error, day in of_fit
+        ]
 
     def standard_errors(self, free: NDArray[np.bool_], held_out: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the standard errors (k + n,) of x, 0 for the values that are not fitted.

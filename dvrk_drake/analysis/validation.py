@@ -138,5 +138,6 @@ def predict(
         to_actuator = arm.transmission.matrix @ file_transmission(arm, coordinates).inverse.matrix
         tau = tau @ to_actuator
     widths = [model.dynamic_model.combined_half_width(to_actuator.T, other_day=day) for day in (False, True)]
+    same_day, other_day = (width if np.all(width > 0) else None for width in widths)
     share(1.0)
-    return Prediction(tau, *(x if np.all(x > 0) else None for x in widths), report.warnings)
+    return Prediction(tau, same_day, other_day, report.warnings)
