@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, MultibodyForces, SpatialInertia
@@ -143,13 +144,13 @@ def set_arm_positions(
     plant.SetPositions(context, q_plant)
 
 
-def link_positions(arm: Arm, q: ArrayLike) -> dict[str, NDArray[np.float64]]:
-    """Returns the position (3,) [m] of each link origin in the world frame, at the pose q (n,) [rad, m]."""
+def link_poses(arm: Arm, q: ArrayLike) -> dict[str, RigidTransform]:
+    """Returns the pose X_WL of each link in the world frame, at the pose q (n,) [rad, m]."""
     plant = shared_plant(arm)
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, q)
     bodies = map(plant.get_body, map(BodyIndex, range(plant.num_bodies())))
-    return {body.name(): body.EvalPoseInWorld(context).translation() for body in bodies}
+    return {body.name(): body.EvalPoseInWorld(context) for body in bodies}
 
 
 def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:

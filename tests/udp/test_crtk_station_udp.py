@@ -29,7 +29,7 @@ def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
     path = tmp_path / "station.yaml"
     path.write_text(yaml.safe_dump({"arm": "mtml", "ros_driver": {"guard": guard}}))
     config = load_station_config(path)
-    with start_simulated_arm("mtml", "MTML", 1000.0) as arm:
+    with start_simulated_arm("mtml", "MTML", 500.0) as arm:
         for word, homed in (("enable", False), ("home", True)):
             arm.state_command(word)
             assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)
@@ -60,7 +60,7 @@ def test_later_station_of_a_process_replaces_an_earlier_one(tmp_path, monkeypatc
     path = tmp_path / "station.yaml"
     path.write_text(yaml.safe_dump({"arm": "mtml", "ros_driver": {}}))
     config, simulators = load_station_config(path), []
-    with start_simulated_arm("mtml", "MTML", 1000.0) as arm:
+    with start_simulated_arm("mtml", "MTML", 500.0) as arm:
         for word, homed in (("enable", False), ("home", True)):
             arm.state_command(word)
             assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)

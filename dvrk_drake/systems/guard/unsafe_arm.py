@@ -7,9 +7,10 @@ from functools import cache
 
 import numpy as np
 
+from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import is_package_arm, load_arm
-from dvrk_drake.models.plant import link_positions
+from dvrk_drake.models.plant import link_poses
 
 #: Accepted differences between an arm and the arm of this package with the same name, in `unsafe_difference`.
 #: Largest ratio of effort limits: the motors are the same, but an amplifier may be configured for a larger current.
@@ -22,19 +23,29 @@ _MAX_COUPLING_DIFFERENCE = 0.25
 #: Largest distance of a position limit beyond that of this package, as a share of the range of the joint. In a larger
 #: distance, the guard would not detect a wrong unit or zero position (`GuardLimits.implausible_pose`).
 _MAX_EXTENSION = 0.25
-#: Largest displacement of the origin of a link [m]. The kinematics of two arms differ by millimetres.
-_MAX_DISPLACEMENT = 0.02
+#: Largest displacement of the origin of a link [m] and largest rotation of a link [rad]. The kinematics of two arms
+#: differ by millimetres and milliradians. An inverted joint axis rotates a link by twice the joint position.
+_MAX_DISPLACEMENT, _MAX_ROTATION = 0.02, 0.1
+#: Largest difference of the gravity efforts, as a share of the effort limits. Identified links of the MTM and the PSM
+#: differ from those of this package by less.
+_MAX_GRAVITY_DIFFERENCE = 0.25
+#: Largest ratio of the diagonal elements of the mass matrices. The gains of the safe state follow from this matrix.
+_MAX_INERTIA_RATIO = 4.0
+#: Number of random poses at which links, gravity and inertia are compared.
+_NUM_POSES = 5
 
 
 @cache
 def unsafe_difference(arm: Arm) -> str:
     """Returns a message on the first dangerous difference from the arm of this package with the same name, or "".
 
-    A guard with these limits, gains or couplings would not protect that arm. An arm with another name is not compared.
+    A guard with these limits, gains or couplings would not protect that arm. The name may end with a number, as PSM1.
+    An arm with another name is not compared.
     """
-    if not is_package_arm(arm):
+    name = "".join(filter(str.isalnum, arm.name)).rstrip("0123456789").lower()
+    if not is_package_arm(name):
         return ""
-    known = load_arm(arm.name.lower())
+    known = load_arm(name)
     return next(filter(None, _unsafe_differences(arm, known)), "") if arm is not known else ""
 
 
@@ -71,16 +82,58 @@ def _unsafe_differences(arm: Arm, known: Arm) -> Iterator[str]:
             yield f"the coupled limit {name} is missing; {allowed}"
         elif limits[name][0] < lower - extension or limits[name][1] > upper + extension:
             yield f"the position limits of {name} are {limits[name][0]:.4g}..{limits[name][1]:.4g}; {allowed}"
-    yield from _displaced_links(arm, known, hint)
+    yield from _wrong_coupled_limits(arm, known, hint)
+    yield from _different_mechanics(arm, known, hint)
 
 
-def _displaced_links(arm: Arm, known: Arm, hint: str) -> Iterator[str]:
-    """Yields messages on links with a dangerous displacement in the middle of the position limits of `known`."""
-    middle = dict(zip(known.joint_names, 0.5 * (known.position_lower + known.position_upper), strict=True))
-    own, reference = (link_positions(a, [middle.get(name, 0.0) for name in a.joint_names]) for a in (arm, known))
-    for name in own.keys() & reference.keys():
-        if (distance := float(np.linalg.norm(own[name] - reference[name]))) > _MAX_DISPLACEMENT:
+def _wrong_coupled_limits(arm: Arm, known: Arm, hint: str) -> Iterator[str]:
+    coefficients = {limit.name: limit.coefficients for limit in arm.coupled_limits}
+    for limit in known.coupled_limits:
+        tolerance = _MAX_COUPLING_DIFFERENCE * max(map(abs, limit.coefficients.values()))
+        own = coefficients.get(limit.name, {})
+        for name in sorted(own.keys() | limit.coefficients.keys()):
+            value, reference = own.get(name, 0.0), limit.coefficients.get(name, 0.0)
+            if abs(value - reference) > tolerance:
+                yield (
+                    f"the coefficient of joint {name} in the coupled limit {limit.name} is {value:.4g}; allowed: "
+                    f"{reference:.4g} +- {tolerance:.2g}, as for {hint}"
+                )
+
+
+def _different_mechanics(arm: Arm, known: Arm, hint: str) -> Iterator[str]:
+    """Yields messages on links, gravity efforts and inertias that differ dangerously at random poses of `known`.
+
+    Both arms are compared with the same gravity vector, because an arm may be mounted in any orientation.
+    """
+    if set(arm.joint_names) != set(known.joint_names):
+        return
+    order = [known.joint_names.index(name) for name in arm.joint_names]
+    own_model, model = (
+        ControlModel(IdentifiedModel.from_arm(a)) for a in (arm, known.with_gravity(arm.gravity.tolist()))
+    )
+    for known_pose in known.sample_poses(_NUM_POSES, np.random.default_rng(0)):
+        q = np.ascontiguousarray(known_pose[order])
+        own, reference = link_poses(arm, q), link_poses(known, known_pose)
+        at = f"at the pose ({', '.join(f'{x:.3g}' for x in q)}); allowed: up to"
+        for name in filter(reference.__contains__, own):
+            X = reference[name].InvertAndCompose(own[name])
+            if (distance := float(np.linalg.norm(X.translation()))) > _MAX_DISPLACEMENT:
+                yield f"link {name} is displaced by {distance:.3g} m {at} {_MAX_DISPLACEMENT:g} m from {hint}"
+            if (angle := X.rotation().ToAngleAxis().angle()) > _MAX_ROTATION:
+                yield f"link {name} is rotated by {angle:.3g} rad {at} {_MAX_ROTATION:g} rad from {hint}"
+        difference = own_model.gravity_effort(q) - model.gravity_effort(known_pose)[order]
+        share = np.abs(difference) / known.effort_limits[order]
+        if share.max() > _MAX_GRAVITY_DIFFERENCE:
+            j = int(share.argmax())
             yield (
-                f"link {name} is displaced by {distance:.3g} m at the pose in the middle of the position limits; "
-                f"allowed: up to {_MAX_DISPLACEMENT:g} m from {hint}"
+                f"the gravity effort of {arm.joint_names[j]} differs by {difference[j]:.3g} {at} "
+                f"{_MAX_GRAVITY_DIFFERENCE * known.effort_limits[order][j]:.3g} from {hint}"
+            )
+        own_inertia, inertia = np.diag(own_model.mass_matrix(q)), np.diag(model.mass_matrix(known_pose))[order]
+        ratios = own_inertia / inertia
+        j = int(np.abs(np.log(np.maximum(ratios, 1e-300))).argmax())
+        if not 1 / _MAX_INERTIA_RATIO <= ratios[j] <= _MAX_INERTIA_RATIO:
+            yield (
+                f"the inertia at {arm.joint_names[j]} is {own_inertia[j]:.3g}; allowed: "
+                f"{1 / _MAX_INERTIA_RATIO:g}..{_MAX_INERTIA_RATIO:g} times {inertia[j]:.3g}, as for {hint}"
             )

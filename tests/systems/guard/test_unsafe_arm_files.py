@@ -88,7 +88,45 @@ def test_displaced_link_is_refused(tmp_path):
     x, *others = numbers.split()
     moved = f"{head}>{float(x) - 2.79} {' '.join(others)}"
     message = unsafe_difference(mtml(tmp_path, sdf=[(text[begin:end], text[begin:start] + moved)]))
-    assert "is displaced by 2.79 m at the pose in the middle of the position limits; allowed: up to 0.02 m" in message
+    assert "is displaced by 2.79 m at the pose (" in message and "); allowed: up to 0.02 m from the arm MTML" in message
+
+
+MECHANICS = {
+    "coupled limit": (
+        "mechanism",
+        ("{shoulder_pitch: 1.0, elbow_pitch: 1.0}\n    lower", "{shoulder_pitch: 0.1, elbow_pitch: 1.0}\n    lower"),
+        "the coefficient of joint shoulder_pitch in the coupled limit parallelogram is 0.1; allowed: 1 +- 0.25, as for",
+    ),
+    "inverted axis": (
+        "sdf",
+        ("<xyz>-1 0 0</xyz>", "<xyz>1 0 0</xyz>"),
+        "the gravity effort of shoulder_pitch differs by ",
+    ),
+    "linkage": ("sdf", ('joint="elbow_pitch" multiplier="1"', 'joint="elbow_pitch" multiplier="1.4"'), "link "),
+    "gear ratio": ("sdf", (">63.41<", ">634.1<"), "the inertia at outer_yaw is "),
+}
+
+
+@pytest.mark.parametrize("danger", MECHANICS)
+def test_different_mechanics_are_refused(danger, tmp_path):
+    part, change, message = MECHANICS[danger]
+    difference = unsafe_difference(mtml(tmp_path, **{part: [change]}))
+    assert difference.startswith(message) and difference.endswith(HINT.partition("as for ")[2])
+
+
+def test_heavy_links_are_refused(tmp_path):
+    """With this mass of the forearm, the guard would compensate another gravity effort."""
+    begin = SDF.read_text().index('<link name="forearm_link"')
+    start = SDF.read_text().index("<mass>", begin)
+    text = SDF.read_text()[begin : start + 6]
+    difference = unsafe_difference(mtml(tmp_path, sdf=[(text, text + "1")]))
+    assert difference.startswith("the gravity effort of ") and "; allowed: up to " in difference
+
+
+@pytest.mark.parametrize("name", ["'MTML '", "MTML2", "mtml"])
+def test_arms_with_a_similar_name_are_compared(name, tmp_path):
+    changes, message = DANGERS["gain"]
+    assert unsafe_difference(mtml(tmp_path, mechanism=changes, name=name)).startswith(message)
 
 
 @pytest.mark.parametrize(
