@@ -31,8 +31,8 @@ _MAX_DISPLACEMENT, _MAX_ROTATION = 0.02, 0.1
 _MAX_GRAVITY_DIFFERENCE = 0.25
 #: Largest ratio of the diagonal elements of the mass matrices. The gains of the safe state follow from this matrix.
 _MAX_INERTIA_RATIO = 4.0
-#: Number of random poses at which links, gravity and inertia are compared.
-_NUM_POSES = 5
+#: Number of random poses at which links, gravity and inertia are compared. Some gravity efforts are large at few poses.
+_NUM_POSES = 20
 
 
 @cache

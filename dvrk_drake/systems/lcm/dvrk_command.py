@@ -143,9 +143,9 @@ class DvrkCommandReceiver(LeafSystem):
     - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose with zero
       velocity.
     - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
-      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`, limited in rate
-      as a commanded effort. If `position_control_effort` is not finite, the gravity effort of the model is used
-      instead.
+      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If this effort
+      is not finite, the gravity effort of the model is used instead. Outside the state EFFORT, the efforts are limited
+      in rate as commanded efforts.
     - `guard`: the CommandGuard, read-only.
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
@@ -243,20 +243,22 @@ class DvrkCommandReceiver(LeafSystem):
         output.SetFromVector(np.concatenate([guarded.position, guarded.velocity]))
 
     def _calc_effort(self, context: Context, output: BasicVector) -> None:
-        guarded = self.GetGuard(context).output
+        guard = self.GetGuard(context)
+        guarded = guard.output
         if guarded.control_mode == lcmt_dvrk_command.OFF:
             output.SetZero()
-        elif guarded.control_mode == lcmt_dvrk_command.EFFORT:
-            gravity = self._gravity.Eval(context) if self._gravity.HasValue(context) else 0.0
-            output.SetFromVector(np.clip(guarded.effort + gravity, -self._effort_limits, self._effort_limits))
+            return
+        if guarded.control_mode == lcmt_dvrk_command.EFFORT:
+            effort = guarded.effort + (self._gravity.Eval(context) if self._gravity.HasValue(context) else 0.0)
         else:
             effort = self._position_control.Eval(context)
             # The effort of the position controller is not finite while measurements are missing for a few periods.
-            effort = effort if is_finite(effort.tolist()) else self.GetGuard(context).gravity_effort
-            last = context.get_discrete_state(self._last_effort).value()
-            if is_finite(last.tolist()):
-                effort = self.GetGuard(context).limits.limit_effort_rate(effort, last, self._clock.period)
-            output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
+            effort = effort if is_finite(effort.tolist()) else guard.gravity_effort
+        last = context.get_discrete_state(self._last_effort).value()
+        # In EFFORT, the guard limits the rate, except that of the soft walls and of the speed limit.
+        if guard.state != lcmt_dvrk_status.STATE_EFFORT and is_finite(last.tolist()):
+            effort = guard.limits.limit_effort_rate(effort, last, self._clock.period)
+        output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
 
     def _calc_guard(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self.GetGuard(context))

@@ -103,6 +103,11 @@ MECHANICS = {
         "the gravity effort of shoulder_pitch differs by ",
     ),
     "linkage": ("sdf", ('joint="elbow_pitch" multiplier="1"', 'joint="elbow_pitch" multiplier="1.4"'), "link "),
+    "links that are not mirrored": (
+        "arm",
+        (ARM[ARM.index("mirrored_links:") : ARM.index("position_limits:")], ""),
+        "the gravity effort of wrist_platform differs by ",
+    ),
     "gear ratio": ("sdf", (">63.41<", ">634.1<"), "the inertia at outer_yaw is "),
 }
 

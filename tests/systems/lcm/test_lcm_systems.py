@@ -88,6 +88,15 @@ def test_effort_of_the_position_controller_is_limited_in_rate():
     np.testing.assert_allclose(efforts[:10], 1.0, atol=1e-12)
     np.testing.assert_allclose(steps[10:48], -0.05, atol=1e-12)
     np.testing.assert_allclose(efforts[-1], -1.0, atol=1e-12)
+    # The safe state of a fault starts from the measured effort, which may be late. Here it is 0.
+    guard = context.get_mutable_abstract_state(0).get_mutable_value()
+    guard.report_fault("the joint oscillates", Status.FAULT_OSCILLATION)
+    efforts = []
+    for k in range(60, 120):
+        efforts.append(receiver.GetOutputPort("effort").Eval(context) / limit)
+        simulator.AdvanceTo(1e-3 * k)
+    assert receiver.GetGuard(context).output.control_mode == Command.EFFORT
+    assert np.abs(np.diff(efforts, axis=0)).max() <= 0.05 + 1e-12 and np.abs(efforts[-1]).max() < 0.6
 
 
 def test_the_status_echoes_the_last_accepted_command():
