@@ -82,7 +82,7 @@ def test_effort_of_the_position_controller_is_limited_in_rate():
     for k in range(60):
         control.GetMutableData().set_value((-1.0 if k >= 10 else 2.0) * limit)
         simulator.AdvanceTo(1e-3 * k)
-        efforts.append(receiver.GetOutputPort("effort").Eval(context) / limit)
+        efforts.append(context.get_discrete_state(0).value() / limit)
     steps = np.diff(efforts, axis=0)
     # The effort changes by its limit within 20 ms.
     np.testing.assert_allclose(efforts[:10], 1.0, atol=1e-12)
@@ -93,7 +93,7 @@ def test_effort_of_the_position_controller_is_limited_in_rate():
     guard.report_fault("the joint oscillates", Status.FAULT_OSCILLATION)
     efforts = []
     for k in range(60, 120):
-        efforts.append(receiver.GetOutputPort("effort").Eval(context) / limit)
+        efforts.append(context.get_discrete_state(0).value() / limit)
         simulator.AdvanceTo(1e-3 * k)
     assert receiver.GetGuard(context).output.control_mode == Command.EFFORT
     assert np.abs(np.diff(efforts, axis=0)).max() <= 0.05 + 1e-12 and np.abs(efforts[-1]).max() < 0.6
