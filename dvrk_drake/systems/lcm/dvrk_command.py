@@ -109,6 +109,13 @@ class DvrkCommandSender(LeafSystem):
         return lcmt_dvrk_command.POSITION if self._desired.HasValue(context) else lcmt_dvrk_command.HOLD
 
 
+#: Shortest time [s] in which an effort grows from zero to its limit, outside the state EFFORT. The gains of the
+#: position controller are stable up to a delay of 8 ms, so the crossover frequency is below pi/2 / 8 ms = 196 rad/s. An
+#: effort with this frequency and the amplitude of the limit changes by the limit within 5 ms. With a longer time, large
+#: motions would be unstable.
+_RISE_TIME = 0.004
+
+
 class DvrkCommandReceiver(LeafSystem):
     """Receives commands for one arm, checks them with a guard, and outputs the resulting efforts and targets.
 
@@ -144,8 +151,8 @@ class DvrkCommandReceiver(LeafSystem):
       velocity.
     - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
       output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If this effort
-      is not finite, the gravity effort of the model is used instead. Outside the state EFFORT, the efforts are limited
-      in rate as commanded efforts.
+      is not finite, the gravity effort of the model is used instead. Outside the state EFFORT, an effort
+      changes by at most its limit within 4 ms.
     - `guard`: the CommandGuard, read-only.
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
@@ -257,7 +264,8 @@ class DvrkCommandReceiver(LeafSystem):
         last = context.get_discrete_state(self._last_effort).value()
         # In EFFORT, the guard limits the rate, except that of the soft walls and of the speed limit.
         if guard.state != lcmt_dvrk_status.STATE_EFFORT and is_finite(last.tolist()):
-            effort = guard.limits.limit_effort_rate(effort, last, self._clock.period)
+            step = self._effort_limits * self._clock.period / _RISE_TIME
+            effort = np.clip(effort, last - step, last + step)
         output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
 
     def _calc_guard(self, context: Context, output: AbstractValue) -> None:
