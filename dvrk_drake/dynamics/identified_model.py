@@ -376,7 +376,7 @@ class IdentifiedModel(_Identified):
         shares = ", ".join(f"{100 * a.rms_between_days / a.rms_effort if a.rms_effort else 0.0:.0f}" for a in actuators)
         return (
             f"{text}, or use the wider intervals for another day. Their assumption: the efforts change between days by "
-            f"{shares} % of the RMS efforts (standard deviations, from two days of one arm of this type)."
+            f"{shares} % of the RMS efforts (standard deviations in the arm's files)."
         )
 
     def recalibrated(self, dynamics: DynamicSection, recording: str) -> "IdentifiedModel":
