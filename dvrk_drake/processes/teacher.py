@@ -95,12 +95,9 @@ class Teacher:
         q = np.array(status.position)
         at_rest = self._detector.is_at_rest(time, q)
         requested = self._requested()
-        if self._writing is not None:
-            if not self._writing.done():
-                return
-            self._writing.result()
-            self._writing = None
-            self._report(f"pose {len(self.poses)} recorded")
+        if self._writing is not None and not self._writing.done():
+            return
+        self._finish_writing()
         if not self._controller.ramped:
             return
         arm = self._controller.arm
@@ -115,8 +112,20 @@ class Teacher:
         self._writing = self._writer.submit(save_poses, self.poses, arm, self._path)
 
     def close(self) -> None:
-        """Waits until the file is written."""
+        """Waits until the file is written.
+
+        Raises:
+            DvrkDrakeError: The file cannot be written.
+        """
         self._writer.shutdown()
+        self._finish_writing()
+
+    def _finish_writing(self) -> None:
+        """Reports the last pose once it is in the file."""
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            writing.result()
+            self._report(f"pose {len(self.poses)} recorded")
 
     @staticmethod
     def _refusal(arm: Arm, q: np.ndarray, known: int | None) -> str:

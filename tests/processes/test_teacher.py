@@ -85,6 +85,18 @@ def test_unwritable_pose_file_is_an_error(tmp_path):
         hand.at(near_poses()[0], 0.1, enter=True)
 
 
+def test_last_pose_is_reported_at_the_end(tmp_path):
+    """The operator may end the command while the file is written."""
+    hand, broken = (Hand(tmp_path / folder / "p.yaml") for folder in (".", "missing"))
+    for one in (hand, broken):
+        one.at(near_poses()[0], 0.01, enter=True)
+        assert one.lines == []
+    hand.teacher.close()
+    assert hand.lines == ["pose 1 recorded"]
+    with pytest.raises(DvrkDrakeError, match="cannot be written"):
+        broken.teacher.close()
+
+
 def test_enter_key_does_not_block():
     reading, writing = os.pipe()
     with os.fdopen(reading) as stream:
