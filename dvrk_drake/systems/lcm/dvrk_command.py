@@ -151,8 +151,8 @@ class DvrkCommandReceiver(LeafSystem):
       velocity.
     - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
       output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If this effort
-      is not finite, the gravity effort of the model is used instead. Outside the state EFFORT, an effort
-      changes by at most its limit within 4 ms.
+      is not finite, the gravity effort of the model is used instead. Outside the state EFFORT, an effort changes by at
+      most its limit within 4 ms.
     - `guard`: the CommandGuard, read-only.
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
