@@ -26,8 +26,8 @@ _MAX_EXTENSION = 0.25
 #: Largest displacement of the origin of a link [m] and largest rotation of a link [rad]. The kinematics of two arms
 #: differ by millimetres and milliradians. An inverted joint axis rotates a link by twice the joint position.
 _MAX_DISPLACEMENT, _MAX_ROTATION = 0.02, 0.1
-#: Largest difference of the gravity efforts, as a share of the effort limits. Identified links of an MTM differ from the
-#: estimates of this package by up to 1.3 (wrist pitch). The guard finds smaller errors when efforts start.
+#: Largest difference of the gravity efforts, as a share of the effort limits. Identified links of an MTM differ from
+#: the estimates of this package by up to 1.3 (wrist pitch). The guard finds smaller errors when efforts start.
 _MAX_GRAVITY_DIFFERENCE = 2.0
 #: Largest ratio of the diagonal elements of the mass matrices, from which the gains of the safe state follow. For the
 #: identified links and rotors of an MTM, the ratios are 0.25 to 3.1.
