@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, app
-from dvrk_drake.cli.support import interrupt_ends_process, mounted, print_warning, quiet_drake, warn_of_weaker_settings
+from dvrk_drake.cli.support import interrupt_ends_process, mounted, print_warning, quiet_drake, warn_of_driver
 from dvrk_drake.errors import ControllerError
 
 
@@ -59,7 +59,7 @@ def bridge(
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
     configuration.model = model or configuration.model
-    warn_of_weaker_settings(configuration.guard)
+    warn_of_driver(configuration)
     with interrupt_ends_process():
         connected = mounted(load_arm(arm), gravity)
         url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()

@@ -15,7 +15,7 @@ from dvrk_drake.cli.support import (
     mounted,
     print_warning,
     quiet_drake,
-    warn_of_weaker_settings,
+    warn_of_driver,
 )
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def arm(
         return
     configuration = DvrkDriver() if driver is None else load_driver(driver)
     configuration.key_file = key or configuration.key_file
-    warn_of_weaker_settings(configuration.guard)
+    warn_of_driver(configuration)
     start = start_pose(simulated_arm, pose, simulated_effects)
     url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
     print(f"starting the simulated {simulated_arm.name}", flush=True)

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.lcm_messages import MessageKey
-    from dvrk_drake.systems.guard.settings import GuardSettings
+    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 
 def import_interruptibly() -> None:
@@ -247,10 +247,12 @@ def print_warning(text: str) -> None:
     print(f"dvrk-drake: warning: {text}", file=sys.stderr, flush=True)
 
 
-def warn_of_weaker_settings(guard: GuardSettings) -> None:
-    """Prints a line if settings of a command guard protect the arm less than their defaults."""
-    if weaker := guard.weaker_than_default():
+def warn_of_driver(driver: DvrkDriver) -> None:
+    """Prints a line each on weaker guard settings than the defaults, and on an arm that compensates gravity itself."""
+    if weaker := driver.guard.weaker_than_default():
         print_warning(f"the guard protects the arm less than with its default settings: {weaker}")
+    if driver.gravity_compensation:
+        print_warning("the arm adds its own gravity compensation to commanded efforts (gravity_compensation: true)")
 
 
 def write_json(path: str, content: object) -> None:

@@ -108,12 +108,25 @@ class CompensationComparison(Reportable):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the file."""
-        if not self.other_side:
-            return ()
-        return (
-            "the mirror image of the model fits better than the model. The file probably belongs to an arm of the "
-            f"other side (left or right), not to {self.model.arm.name}. Check ARM_NAME and the serial number",
-        )
+        warnings = []
+        if self.other_side:
+            warnings.append(
+                "the mirror image of the model fits better than the model. The file probably belongs to an arm of the "
+                f"other side (left or right), not to {self.model.arm.name}. Check ARM_NAME and the serial number"
+            )
+        limits = self.model.arm.effort_limits
+        clips = [max(abs(joint.clip_lower), abs(joint.clip_upper)) for joint in self.joints]
+        weak = [
+            f"{joint.name} {clip:.3g} N m (effort limit {limit:.3g} N m)"
+            for joint, clip, limit in zip(self.joints, clips, limits, strict=True)
+            if clip > limit
+        ]
+        if weak:
+            warnings.append(
+                f"torque limits of the file are above the effort limits of the joints, so they do not protect the arm: "
+                f"{', '.join(weak)}. Correct safe_lower_torque_limit and safe_upper_torque_limit"
+            )
+        return tuple(warnings)
 
     def as_dict(self) -> dict:
         """Returns the comparison as a dictionary for JSON, with None instead of NaN."""

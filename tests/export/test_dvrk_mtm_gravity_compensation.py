@@ -388,6 +388,10 @@ def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path, monkeypatc
     clean = compare_compensation(file, model)
     assert all(j.clipped == j.opposed == j.runaway == 0 for j in clean.joints)
     assert max(j.rms_outside for j in clean.joints) < 1e-12
+    assert clean.warnings == ()
+    unlimited = dataclasses.replace(file, torque_lower=file.torque_lower - 2.0 * (np.arange(7) == 3))
+    (warning,) = compare_compensation(unlimited, model).warnings
+    assert "do not protect the arm: wrist_platform " in warning and "(effort limit 0.309 N m)" in warning
 
     altered = dataclasses.replace(file)
     for which in (altered.positive, altered.negative):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from guard_bench import Bench, N
 
-from dvrk_drake.cli.support import warn_of_weaker_settings
+from dvrk_drake.cli.support import warn_of_driver
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -15,6 +15,7 @@ from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStrea
 from dvrk_drake.systems.guard.measurement import Measurement
 from dvrk_drake.systems.guard.settings import _WEAKER_IF_SMALLER as WEAKER_IF_SMALLER
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
 # Measurements
@@ -401,7 +402,11 @@ def test_weaker_settings_are_in_the_status_and_printed(capsys):
     assert status.weaker_settings == "expiry is 0.1 (default: 0.05)"
     live = LiveStatusMaker(5, status).make(status, 1.0, 0)
     assert live.problem == "guard settings weaker than the defaults: expiry is 0.1 (default: 0.05)"
-    for weaker in (settings, GuardSettings()):
-        warn_of_weaker_settings(weaker)
-    text = "the guard protects the arm less than with its default settings: expiry is 0.1 (default: 0.05)"
-    assert capsys.readouterr().err == f"dvrk-drake: warning: {text}\n"
+    for driver in (DvrkDriver(guard=settings), DvrkDriver(), DvrkDriver(gravity_compensation=True)):
+        warn_of_driver(driver)
+    assert capsys.readouterr().err.splitlines() == [
+        "dvrk-drake: warning: the guard protects the arm less than with its default settings: "
+        "expiry is 0.1 (default: 0.05)",
+        "dvrk-drake: warning: the arm adds its own gravity compensation to commanded efforts "
+        "(gravity_compensation: true)",
+    ]
