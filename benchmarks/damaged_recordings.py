@@ -37,6 +37,7 @@ import numpy as np
 from dvrk_drake.analysis.check.recording_check import check_with_channels
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
@@ -79,7 +80,7 @@ def undamaged(folder: Path, name: str) -> tuple[Recording, Arm, set[tuple[str, s
     """Returns the recording, its arm, the findings of its check as (kind, where), and all damages."""
     arm = load_arm(MOTIONS[name])
     recording = read_recording(folder / f"{name}.csv", arm, "actuator")
-    usual = {(finding.kind, finding.where) for finding in check_with_channels(recording, arm).findings}
+    usual = {(finding.kind, finding.where) for finding in check_with_channels(Observations(recording, arm)).findings}
     return recording, arm, usual, list(damages(recording, arm))
 
 
@@ -87,26 +88,28 @@ def undamaged(folder: Path, name: str) -> tuple[Recording, Arm, set[tuple[str, s
 def errors_of_undamaged(folder: Path, name: str) -> np.ndarray:
     """Returns the relative errors (n,) of a model identified from the undamaged recording, on the same recording."""
     recording, arm, *_ = undamaged(folder, name)
-    return relative_errors(identify_dynamic([recording], arm).model, recording)
+    return relative_errors(identify_dynamic([Observations(recording, arm)]).model, recording)
 
 
 def relative_errors(model: IdentifiedModel, recording: Recording) -> np.ndarray:
     """Returns the relative errors (n,) of the actuators' efforts."""
-    return np.array([a.relative_error for a in validate_motion(model, recording).actuators])
+    return np.array(
+        [a.relative_error for a in validate_motion(model, Observations.for_model(recording, model)).actuators]
+    )
 
 
 def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
     """Returns kind, channels, outcome and detail of one damage."""
     recording, arm, usual, all_damages = undamaged(folder, name)
     kind, channels, damaged = all_damages[number]
-    findings = check_with_channels(damaged, arm).findings
+    findings = check_with_channels(Observations(damaged, arm)).findings
     new = [finding for finding in findings if (finding.kind, finding.where) not in usual]
     for severity, what in (("refusal", "refused"), ("warning", "warned")):
         if found := [f for f in new if f.severity == severity]:
             where = "recording" if found[0].where == recording.source else found[0].where
             return kind, channels, what, f"{where}: {found[0].kind}"
     try:
-        model = identify_dynamic([damaged], arm).model
+        model = identify_dynamic([Observations(damaged, arm)]).model
     except IdentificationError as error:
         return kind, channels, "refused", f"identify: {error}"
     assert model.dynamics is not None
@@ -132,7 +135,7 @@ def main() -> None:
     options = parser.parse_args()
     for name, arm_name in MOTIONS.items():
         arm = load_arm(arm_name)
-        report = check_with_channels(read_recording(options.folder / f"{name}.csv", arm, "actuator"), arm)
+        report = check_with_channels(Observations(read_recording(options.folder / f"{name}.csv", arm, "actuator"), arm))
         bad = [str(f) for f in report.findings if f.kind in CHANNEL_KINDS]
         print(f"{name}, undamaged: {'; '.join(bad) or 'no findings about the channels'}", flush=True)
     for name in options.name:

@@ -36,6 +36,7 @@ from timing import print_table
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.recalibration import cross_validated_errors
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
@@ -69,9 +70,9 @@ def main() -> None:
         recordings = {own: read_public(options.folder / own, arm) for own in files}
         models, inside = {}, {}
         begin = time.process_time()
-        models[file] = identify_dynamic([recordings[file]], arm).model
+        models[file] = identify_dynamic([Observations(recordings[file], arm)]).model
         seconds = time.process_time() - begin
-        models |= {own: identify_dynamic([recordings[own]], arm).model for own in files[1:]}
+        models |= {own: identify_dynamic([Observations(recordings[own], arm)]).model for own in files[1:]}
         dynamics = models[file].dynamics
         assert dynamics is not None
 
@@ -86,9 +87,11 @@ def main() -> None:
             "repeatability of the motion": percent("rms_repeatability"),
         }
         for own, other in itertools.permutations(files, 2):
-            errors = validate_motion(models[own], recordings[other]).actuators
+            errors = validate_motion(models[own], Observations.for_model(recordings[other], models[own])).actuators
             rows[f"{own} on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
-            rows[f"{own} on {other}, refitted"] = 100 * cross_validated_errors(models[own], recordings[other], 2)[1]
+            rows[f"{own} on {other}, refitted"] = (
+                100 * cross_validated_errors(models[own], Observations.for_model(recordings[other], models[own]), 2)[1]
+            )
             for day, which in (("same day", "inside"), ("another day", "inside_other_day")):
                 inside[f"{own} on {other}, {day}"] = [100 * (getattr(e, which) or 0.0) for e in errors]
         headings = [*(f"J{j + 1}" for j in range(arm.num_joints)), "mean"]
@@ -110,7 +113,7 @@ def read_public(path: Path, arm: Arm) -> Recording:
         recording = read_recording(path, arm, "wpi")
     except RecordingError as error:
         sys.exit(str(error))
-    refusals = [f for f in check_recording(recording, arm).findings if f.severity == "refusal"]
+    refusals = [f for f in check_recording(Observations(recording, arm)).findings if f.severity == "refusal"]
     if refusals:
         sys.exit(
             f"{path}: {refusals[0].where}: {refusals[0].what}. This benchmark requires the coordinates of the public "

@@ -31,7 +31,7 @@ from dvrk_drake.analysis.excitation.design import design_excitation
 from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.models.arm import Arm
 
@@ -50,7 +50,7 @@ PERIODS = {"MTMR": 11.67, "PSM": 6.48}
 def published(folder: Path, arm: Arm) -> tuple[np.ndarray, ...]:
     """Returns t, q, v and vd of the positions of the public motion, for `SECONDS` at 1 kHz."""
     recording = dvrk.read_recording(folder / f"{arm.name[:3].lower()}_one.csv", arm, coordinates="wpi")
-    grid = motion_grid(recording, arm, default_settings(arm))
+    grid = Observations(recording, arm).grid
     t = np.arange(round(SECONDS * RATE)) / RATE
     at = np.minimum(t, grid.t[-1] - grid.t[0])
     signals = (np.column_stack([np.interp(at, grid.t - grid.t[0], x) for x in s.T]) for s in (grid.q, grid.v, grid.vd))
@@ -99,8 +99,11 @@ def simulated_arm(
     true_values = to_base @ truth.parameters[: to_base.shape[1]]
     results = {}
     for which, motion in motions.items():
-        model = identify_dynamic([recorded(truth, motion, NOISE, rng)], arm).model
-        found = [[a.relative_error for a in validate_motion(model, test).actuators] for test in unseen]
+        model = identify_dynamic([Observations(recorded(truth, motion, NOISE, rng), arm)]).model
+        found = [
+            [a.relative_error for a in validate_motion(model, Observations.for_model(test, model)).actuators]
+            for test in unseen
+        ]
         deviations = to_base @ model.dynamic_model.parameters[: to_base.shape[1]] - true_values
         within = np.sum(np.abs(deviations) <= 0.1 * np.abs(true_values))
         results[which] = np.append(np.mean(found, axis=0), within)

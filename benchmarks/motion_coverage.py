@@ -19,8 +19,7 @@ import numpy as np
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem
 from dvrk_drake.analysis.dynamic.estimates import ResidualSeries, parameter_covariance
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import period_of
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
@@ -78,9 +77,9 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     motion = fourier_motion(arm, generator, 10.0, 20.0, RATE)
     truth = true_dynamics(arm, generator, friction_everywhere(arm, motion), spread)
     recording = recorded(truth, motion, noise, generator)
-    grid = motion_grid(recording, arm, default_settings(arm))
-    tau, period = recording.in_actuator_coordinates(arm).measured_effort(), period_of(grid)
-    problem = motion_problem([grid], [tau], [period], truth.effects)
+    observations = Observations(recording, arm)
+    grid, period = observations.grid, observations.period
+    problem = motion_problem([observations], truth.effects)
     chosen = np.arange(len(truth.effects))
     selection = problem.selection()
     selection.fit(chosen)

@@ -16,8 +16,8 @@ import numpy as np
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem
 from dvrk_drake.analysis.dynamic.effect_selection import NUM_HELD_OUT_FOLDS, select_effects
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import FOLDS, period_of
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import FOLDS
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 
@@ -36,9 +36,7 @@ def main() -> None:
     options = parser.parse_args()
     arm = load_arm(options.arm)
     recording = read_recording(options.motion, arm, options.coordinates)
-    grid = motion_grid(recording, arm, default_settings(arm))
-    tau = recording.in_actuator_coordinates(arm).measured_effort()
-    problem = motion_problem([grid], [tau], [period_of(grid)])
+    problem = motion_problem([Observations(recording, arm)])
     squares = np.zeros(arm.num_joints)
     print("relative RMS effort error of each actuator and mean [%], 6-fold cross-validation over the phase")
     for first in range(0, FOLDS, NUM_HELD_OUT_FOLDS):

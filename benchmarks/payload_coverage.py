@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.payload.payload import estimate_payload
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
@@ -35,7 +36,12 @@ def main() -> int:
         errors, sizes = [], []
         for seed in range(options.seeds):
             model, reference, loaded = two_days(name, link, mass, position, seed)
-            (payload,) = estimate_payload(reference, loaded, model, [link])
+            (payload,) = estimate_payload(
+                Observations(reference, model.arm, model.section.signals),
+                Observations(loaded, model.arm, model.section.signals),
+                model,
+                [link],
+            )
             known = np.append(True, payload.body.determined)
             difference = np.append(payload.body.mass - mass, payload.body.position - position)[known]
             spread = np.append(payload.mass_error, payload.position_error)[known]

@@ -21,10 +21,10 @@ import numpy as np
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
 from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -50,18 +50,30 @@ def main() -> int:
     def read(name: str) -> Recording:
         return read_recording(options.folder / f"{name}.csv", arm, "wpi")
 
-    models = {name: identify_dynamic([read(name)], arm).model for name in ("psm_one_no_weight", "psm_one")}
+    models = {
+        name: identify_dynamic([Observations(read(name), arm)]).model for name in ("psm_one_no_weight", "psm_one")
+    }
     for reference, model in models.items():
         for name, link, mass, position in WEIGHTS:
             for known, what in ((read(reference), f"reference {reference}"), (None, f"model of {reference}")):
-                (payload,) = estimate_payload(known, read(name), model.dynamic_model, [link])
+                (payload,) = estimate_payload(
+                    Observations(known, model.dynamic_model.arm, model.dynamic_model.section.signals),
+                    Observations(read(name), model.dynamic_model.arm, model.dynamic_model.section.signals),
+                    model.dynamic_model,
+                    [link],
+                )
                 _print_payload(arm, read(name), what, name, payload, mass, np.array(position))
     # To the recording of the other day, which has no payload, add the torque of an exactly known payload.
     for reference, other in (("psm_one_no_weight", "psm_one"), ("psm_one", "psm_one_no_weight")):
         model = models[reference].dynamic_model
         for _, link, mass, position in WEIGHTS:
             loaded = _with_payload(read(other), model, link, mass, np.array(position))
-            (payload,) = estimate_payload(read(reference), loaded, model, [link])
+            (payload,) = estimate_payload(
+                Observations(read(reference), model.arm, model.section.signals),
+                Observations(loaded, model.arm, model.section.signals),
+                model,
+                [link],
+            )
             name = f"{other} with the torque of {1000 * mass:.0f} g added"
             _print_payload(arm, loaded, f"reference {reference}", name, payload, mass, np.array(position))
     _print_seconds(models["psm_one"], read("psm_one_no_weight"))
@@ -73,7 +85,7 @@ def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: fl
     """Returns the recording plus the efforts of a point mass on a link."""
     arm = model.arm
     recording = recording.in_actuator_coordinates(arm)
-    grid = motion_grid(recording, arm, model.section.signals)
+    grid = Observations(recording, arm, model.section.signals).grid
     k = [link.link for link in model.regressor.links].index(link)
     Y = model.regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
     added = Y @ point_mass_parameters(mass, position) @ arm.transmission.inverse.matrix
@@ -92,7 +104,7 @@ def _print_payload(
             estimate = f"{100 * payload.position_in_base[axis]:+.1f} +- {100 * payload.position_error[axis]:.1f} cm"
         print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (position + offset)[axis]:+.1f})")
     regressor = DynamicRegressor(arm)
-    grid = motion_grid(recording, arm, default_settings(arm))
+    grid = Observations(recording, arm).grid
     k = [link.link for link in regressor.links].index(payload.link)
     Y = regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
     # Subtract the means, which are not identifiable separately from the offset of the drive.
@@ -108,14 +120,16 @@ def _print_seconds(model: IdentifiedModel, whole: Recording) -> None:
     evaluation = _rows(whole, slice(len(whole) // 3, None))
 
     def percent(which: IdentifiedModel) -> str:
-        validation = validate_motion(which, evaluation)
+        validation = validate_motion(which, Observations.for_model(evaluation, which))
         return "  ".join(f"{100 * (a.relative_error or 0):5.1f}" for a in validation.actuators)
 
     print("\nrelative RMS effort error of each actuator [%], by the duration of the recording for refitting friction")
     print(f"before    {percent(model)}")
     for seconds in SECONDS:
         assert whole.t is not None
-        result = refit_friction(model, _rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))))
+        result = refit_friction(
+            model, Observations.for_model(_rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))), model)
+        )
         not_refitted = [a.name for a in result.actuators if not a.kept]
         print(f"{seconds:5.1f} s   {percent(result.model)}   not refitted: {', '.join(not_refitted) or 'none'}")
 
@@ -125,13 +139,18 @@ def _print_phases(model: IdentifiedModel, whole: Recording) -> None:
     first, second = (_rows(whole, rows) for rows in (slice(0, len(whole) // 2), slice(len(whole) // 2, None)))
 
     def errors(which: IdentifiedModel) -> list[float]:
-        return [a.relative_error or 0.0 for a in validate_motion(which, second).actuators]
+        return [
+            a.relative_error or 0.0 for a in validate_motion(which, Observations.for_model(second, which)).actuators
+        ]
 
-    before, after = cross_validated_errors(model, whole, 2)
+    before, after = cross_validated_errors(model, Observations.for_model(whole, model), 2)
     print("\nrelative RMS effort error of each actuator and mean [%]")
     for name, values in (
         ("same phases, second half of the time: before", errors(model)),
-        ("same phases, refitted to the first half of the time", errors(refit_friction(model, first).model)),
+        (
+            "same phases, refitted to the first half of the time",
+            errors(refit_friction(model, Observations.for_model(first, model)).model),
+        ),
         ("other phases: before", list(before)),
         ("other phases, each half refitted to the other half", list(after)),
     ):

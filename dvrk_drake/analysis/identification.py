@@ -12,7 +12,7 @@ from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
-from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT, MAX_HALF_WIDTH, GravityDirection
 from dvrk_drake.analysis.static.gravity_direction import estimate_gravity as gravity_direction
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
@@ -95,12 +95,12 @@ def identify(
             return _identify_several(recording, arm, progress)
         (recording,) = recording
     recording, dropped = with_power(recording, arm)
-    poses = find_poses(recording, arm, low_speed_segments)
-    report = require_usable(poses.recording, arm, progress, channels=True)
+    poses = Observations(recording, arm).poses(with_low_speed_segments=low_speed_segments)
+    report = require_usable(poses.observations, progress, channels=True)
     share = step_progress(progress, "identifying")
     try:
         if poses.moves:
-            motion = identify_dynamic([poses.recording], arm, share)
+            motion = identify_dynamic([poses.observations], share)
             return replace(motion, warnings=(*dropped, *report.warnings, *_unexplained(motion)))
         direction = None if poses.measured is not None else gravity_direction(poses.recording, arm)
         if estimate_gravity:
@@ -151,14 +151,14 @@ def _tilt_warning(direction: GravityDirection, source: str) -> tuple[Finding, ..
 def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progress | None) -> DynamicIdentification:
     if not recordings:
         raise RecordingError("no recordings were given; a model requires at least one")
-    motions: list[tuple[str, Recording]] = []
-    static: list[tuple[str, Recording]] = []
+    motions: list[tuple[str, Observations]] = []
+    static: list[tuple[str, Observations]] = []
     warnings: list[Finding] = []
     for i, whole in enumerate(recordings):
         recording, dropped = with_power(whole, arm)
         name = recording.source or f"recording {i + 1}"
         warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in dropped]
-        found = find_poses(recording, arm)
+        found = Observations(recording, arm).poses()
         if not found.moves and (static or (i == len(recordings) - 1 and not motions)):
             also = f", and so does {static[0][0]}" if static else ""
             raise RecordingError(
@@ -166,20 +166,22 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
                 "be combined only if all of them, or all but one, are motions"
             )
         for other_name, other in motions if found.moves else ():
-            if _num_common_rows(recording, other) > MAX_COMMON_ROWS * min(len(recording), len(other)):
+            if _num_common_rows(recording, other.recording) > MAX_COMMON_ROWS * min(
+                len(recording), len(other.recording)
+            ):
                 raise RecordingError(
                     f"{name}: contains the same efforts as {other_name}; give different recordings, because each of "
                     "them is predicted from the others"
                 )
-        (motions if found.moves else static).append((name, found.recording))
-    for name, recording in motions + static:
-        report = require_usable(recording, arm, progress, channels=True)
+        (motions if found.moves else static).append((name, found.observations))
+    for name, observations in motions + static:
+        report = require_usable(observations, progress, channels=True)
         warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in report.warnings]
     share = step_progress(progress, "identifying")
     try:
-        result = identify_dynamic([motion for _, motion in motions], arm, lambda done: share(0.95 * done))
-        for _, recording in static:
-            poses = identify_static(recording, arm)
+        result = identify_dynamic([motion for _, motion in motions], lambda done: share(0.95 * done))
+        for _, observations in static:
+            poses = identify_static(observations.recording, arm)
             model = with_effects_at_rest(result.model, poses)
             result = replace(result, model=model, note=_note(model, len(poses.recording)))
         share(1.0)

@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.results import ModelResult
-from dvrk_drake.analysis.signals.drive_efforts import (
+from dvrk_drake.analysis.observations.drive_efforts import (
     FRICTION_PARTS,
     FrictionPart,
     drive_efforts,
     refuse_opposite_efforts,
 )
-from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.repetition import correlation_of, period_of, phase_folds
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import correlation_of, phase_folds
+from dvrk_drake.analysis.results import ModelResult
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -127,15 +128,16 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
     """
     dynamics = model.dynamic_model
     recording, dropped = with_power(recording, dynamics.arm)
-    report = require_usable(recording, dynamics.arm, progress)
+    observations = Observations.for_model(recording, model)
+    report = require_usable(observations, progress)
     share = step_progress(progress, "refitting friction")
     share(0.0)
-    result = refit_friction(model, recording)
+    result = refit_friction(model, observations)
     share(1.0)
     return replace(result, warnings=(*dropped, *report.warnings))
 
 
-def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
+def refit_friction(model: IdentifiedModel, observations: Observations) -> Recalibration:
     """Fits factors of the dry and viscous friction at every coordinate, and a change of the offset of every actuator.
 
     Rigid bodies, springs and cables do not change. The errors are cross-validated over `FOLDS` folds of the motion. If
@@ -148,7 +150,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
             both directions, or the model error remains too large.
         ModelError: The model has no dynamics.
     """
-    fit = _Fit(model.dynamic_model, recording)
+    recording, fit = observations.recording, _Fit(model.dynamic_model, observations)
     excited = fit.excited
     if not np.any(excited):
         raise RecordingError(
@@ -202,7 +204,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
 
 
 def cross_validated_errors(
-    model: IdentifiedModel, recording: Recording, folds: int
+    model: IdentifiedModel, observations: Observations, folds: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns the relative errors (n,) of the model, and the cross-validated errors (n,) after a refit of friction.
 
@@ -213,7 +215,7 @@ def cross_validated_errors(
         RecordingError: The recording is not a motion of this arm.
         ModelError: The model has no dynamics.
     """
-    fit = _Fit(model.dynamic_model, recording, folds)
+    fit = _Fit(model.dynamic_model, observations, folds)
     return fit.error(fit.unchanged), fit.relative(fit.held_out_residuals(fit.excited))
 
 
@@ -223,8 +225,8 @@ class _Fit:
     The prior means are the values of the model.
     """
 
-    def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
-        grid = motion_grid(recording, model.arm, model.section.signals)
+    def __init__(self, model: DynamicModel, observations: Observations, folds: int = FOLDS) -> None:
+        grid, recording = observations.grid, observations.recording
         self.names = model.arm.joint_names
         self.rate, self.day_deviation = grid.rate, np.array(model.arm.identification.day_deviation)
         expected = drive_efforts(model, grid)
@@ -237,7 +239,7 @@ class _Fit:
         self._loads = np.array([rows[coordinate] != 0 for coordinate, _ in self.keys])
         self.expected = expected.total()
         self._folds = folds
-        self._fold, self._edge = phase_folds(grid, period_of(grid), folds)
+        self._fold, self._edge = phase_folds(grid, observations.period, folds)
         self.excited = _moves_in_both_directions(model, grid) & self.measured
         self.unchanged = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
         size = np.where(self.measured, np.sqrt(np.mean(self.tau**2, axis=0)), 1.0)

@@ -9,8 +9,8 @@ import numpy as np
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation, predict_motion, validate_motion
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.results import Prediction
-from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.analysis.static.validation import StaticValidation, predict_static, validate_static
 from dvrk_drake.analysis.verdict import unexplained_effort
@@ -56,13 +56,13 @@ def validate(
     """
     arm = model.arm
     recording, dropped = with_power(recording, arm)
-    poses = find_poses(recording, arm, low_speed_segments)
-    report = require_usable(poses.recording, arm, progress)
+    poses = Observations.for_model(recording, model).poses(with_low_speed_segments=low_speed_segments)
+    report = require_usable(poses.observations, progress)
     share = step_progress(progress, "validating")
     share(0.0)
     validation: StaticValidation | DynamicValidation
     if poses.moves and model.dynamics is not None:
-        validation = validate_motion(model, poses.recording)
+        validation = validate_motion(model, poses.observations)
         errors = validation.relative_errors
         found = unexplained_effort({name: errors[name] for name, v in validation.verdicts.items() if v == "do not use"})
     else:
@@ -123,16 +123,17 @@ def predict(
         (3, 7)
     """
     arm = model.arm
-    # `find_poses` and `require_usable` require efforts, so zeros replace missing efforts.
+    # The checks require efforts, so zeros replace missing efforts.
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
-    moves = find_poses(measured, arm).moves
+    observations = Observations.for_model(measured, model)
+    moves = observations.poses().moves
     if model.dynamics is None or not moves:
         step_progress(progress, "predicting")(0.0)
         return Prediction(predict_static(model, recording, coordinates))
-    report = require_usable(measured, arm, progress, ignored_kind="no effort" if recording.tau is None else "")
+    report = require_usable(observations, progress, ignored_kind="no effort" if recording.tau is None else "")
     share = step_progress(progress, "predicting")
     share(0.0)
-    tau = predict_motion(model, recording)
+    tau = predict_motion(model, observations)
     to_actuator = np.eye(arm.num_joints)
     if (coordinates := coordinates or recording.coordinates) != "actuator":
         to_actuator = arm.transmission.matrix @ file_transmission(arm, coordinates).inverse.matrix

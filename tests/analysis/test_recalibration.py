@@ -9,8 +9,9 @@ from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.observations.drive_efforts import FRICTION_PARTS
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
-from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -43,13 +44,18 @@ def motion(truth, generator, seconds=10.0, seed=5):
 
 
 def errors(model, recording):
-    return np.array([actuator.relative_error for actuator in validate_motion(model, recording).actuators])
+    return np.array(
+        [
+            actuator.relative_error
+            for actuator in validate_motion(model, Observations.for_model(recording, model)).actuators
+        ]
+    )
 
 
 @pytest.mark.parametrize("name", ["psm", "mtmr"])
 def test_friction_and_offsets_of_another_day_are_estimated(name):
     model, truth, generator = days(name)
-    result = refit_friction(model, motion(truth, generator))
+    result = refit_friction(model, Observations.for_model(motion(truth, generator), model))
     other = motion(truth, generator, seconds=16.0, seed=6)
     before, after = errors(model, other), errors(result.model, other)
     # The friction of the second day has the same shape as that of the first, so the residual is little more than noise.
@@ -67,7 +73,9 @@ def test_friction_and_offsets_of_another_day_are_estimated(name):
     for a, own in zip(result.actuators, result.model.dynamics.actuators, strict=True):
         assert own.rms_cross_validation == pytest.approx(a.after * own.rms_effort, abs=1e-12)
         assert own.rms_between_days > 0
-    similar = validate_motion(result.model, motion(truth, generator, seconds=16.0))
+    similar = validate_motion(
+        result.model, Observations.for_model(motion(truth, generator, seconds=16.0), result.model)
+    )
     assert all(a.inside > 0.9 for a in similar.actuators)
     truly = {(e.coordinate, e.kind): e.coefficient for e in truth.section.effects}
     refitted = result.model.dynamics.effects
@@ -91,7 +99,10 @@ def test_asymmetric_friction_is_refitted():
         if e.coordinate != first
     ]
     truth = DynamicModel(model.arm, dataclasses.replace(section, effects=today))
-    result = refit_friction(dataclasses.replace(model, dynamics=section), motion(truth, generator))
+    result = refit_friction(
+        dataclasses.replace(model, dynamics=section),
+        Observations.for_model(motion(truth, generator), dataclasses.replace(model, dynamics=section)),
+    )
     (refitted,) = [e for e in result.model.dynamics.effects if e.kind == "presliding forward"]
     assert refitted.coefficient == pytest.approx(1.4 * forward[0].coefficient, rel=0.1, abs=1e-6)
     for a in result.actuators:
@@ -100,7 +111,7 @@ def test_asymmetric_friction_is_refitted():
 
 def test_rigid_bodies_and_holding_torques_are_unchanged():
     model, truth, generator = days("psm")
-    result = refit_friction(model, motion(truth, generator))
+    result = refit_friction(model, Observations.for_model(motion(truth, generator), model))
     new, arm = result.model, model.arm
     assert new.dynamics.links == model.dynamics.links and new.dynamics.rotors == model.dynamics.rotors
     assert new.base_parameters == model.base_parameters
@@ -116,7 +127,7 @@ def test_rigid_bodies_and_holding_torques_are_unchanged():
 def test_errors_do_not_increase_on_the_same_day():
     model, _, generator = days("psm")
     same = model.dynamic_model
-    result = refit_friction(model, motion(same, generator))
+    result = refit_friction(model, Observations.for_model(motion(same, generator), model))
     other = motion(same, generator, seconds=16.0, seed=6)
     np.testing.assert_allclose(errors(result.model, other), errors(model, other), atol=NOISE / 10)
     assert all(a.dry == pytest.approx(1, abs=0.1) and a.viscous == pytest.approx(1, abs=0.1) for a in result.actuators)
@@ -126,7 +137,7 @@ def test_joint_at_rest_is_unchanged():
     model, truth, generator = days("psm")
     t, q, v, vd = fourier_motion(truth.arm, np.random.default_rng(5), 8.0, 10.0, 1000.0)
     q[:, 0], v[:, 0], vd[:, 0] = q[0, 0], 0.0, 0.0
-    result = refit_friction(model, recorded(truth, (t, q, v, vd), NOISE, generator))
+    result = refit_friction(model, Observations.for_model(recorded(truth, (t, q, v, vd), NOISE, generator), model))
     yaw = result.actuators[0]
     assert (yaw.kept, yaw.reason, yaw.dry, yaw.offset) == (False, "no motion in both directions", 1.0, 0.0)
     assert all(a.kept for a in result.actuators[1:])
@@ -140,7 +151,7 @@ def test_motion_in_one_direction_is_rejected():
     start, v = truth.arm.sample_poses(1, generator, margin=0.4)[0], truth.arm.per_joint(0.06, 0.006)
     slow = (t, start + t[:, None] * v, np.tile(v, (len(t), 1)), np.zeros((len(t), 7)))
     with pytest.raises(RecordingError, match="no actuator moves in both directions"):
-        refit_friction(model, recorded(truth, slow, 0.0, generator))
+        refit_friction(model, Observations.for_model(recorded(truth, slow, 0.0, generator), model))
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [("psm", "mtmr"), ("mtmr", "psm")])
@@ -148,7 +159,7 @@ def test_another_arm_is_rejected(ours, theirs):
     model, *_ = days(ours)
     _, truth, generator = days(theirs)
     with pytest.raises(RecordingError, match=r"Check the arm|outside|limits"):
-        refit_friction(model, motion(truth, generator))
+        refit_friction(model, Observations.for_model(motion(truth, generator), model))
 
 
 def test_unrelated_efforts_are_rejected():
@@ -159,7 +170,7 @@ def test_unrelated_efforts_are_rejected():
     with pytest.raises(
         RecordingError, match=r"noise.csv: the mean relative error .* Check the arm and the coordinates"
     ):
-        refit_friction(model, other)
+        refit_friction(model, Observations.for_model(other, model))
 
 
 @pytest.mark.parametrize(("name", "seconds"), [("psm", 6.0), ("mtmr", 8.0)])
@@ -170,8 +181,8 @@ def test_wrong_sign_is_rejected_in_short_recordings(name, seconds):
         tau = recording.tau.copy()
         tau[:, j] *= -1
         with pytest.raises(RecordingError, match=rf"opposite to the efforts of the model: {joint} \(correlation -"):
-            refit_friction(model, dataclasses.replace(recording, tau=tau))
-    assert refit_friction(model, recording).seconds > 0
+            refit_friction(model, Observations.for_model(dataclasses.replace(recording, tau=tau), model))
+    assert refit_friction(model, Observations.for_model(recording, model)).seconds > 0
 
 
 def test_error_after_is_from_held_out_parts():
@@ -181,7 +192,7 @@ def test_error_after_is_from_held_out_parts():
     tau = recording.tau.copy()
     first = recording.t < 2.5
     tau[first, 3] += 2 * np.std(tau[:, 3]) * np.sign(recording.qd[first, 3])
-    result = refit_friction(model, dataclasses.replace(recording, tau=tau))
+    result = refit_friction(model, Observations.for_model(dataclasses.replace(recording, tau=tau), model))
     other = motion(truth, generator, seconds=16.0, seed=6)
     before, after = errors(model, other), errors(result.model, other)
     assert np.all(after[[0, 1, 2, 4, 5, 6]] < before[[0, 1, 2, 4, 5, 6]] + NOISE / 10)
@@ -192,13 +203,13 @@ def test_refit_is_validated_on_held_out_phases():
     """Friction that differs in one half of the phases does not improve the prediction of the other half."""
     model, truth, generator = days("psm")
     recording = motion(truth, generator, seconds=16.0)
-    before, after = cross_validated_errors(model, recording, 2)
+    before, after = cross_validated_errors(model, Observations.for_model(recording, model), 2)
     np.testing.assert_allclose(before, errors(model, recording), atol=1e-9)
     assert np.mean(after) < 0.5 * np.mean(before)
     half = (np.asarray(recording.t) - 1.0) % 8.0 < 4.0  # phases are counted from where the filters end
     old = motion(model.dynamic_model, np.random.default_rng(0), seconds=16.0)
     mixed = dataclasses.replace(old, tau=np.where(half[:, None], recording.tau, old.tau))
-    before, after = cross_validated_errors(model, mixed, 2)
+    before, after = cross_validated_errors(model, Observations.for_model(mixed, model), 2)
     # Each refit estimates friction that the other half does not have.
     assert np.mean(after) > np.mean(before)
 

@@ -12,6 +12,7 @@ from forked import public_folder, run_unprivileged
 from recordings import HEADER, Q_NAMES, ROW, SIX, TAU_NAMES, random_recording, six_joint_arm, write_text
 
 from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings import csv_rows
@@ -211,7 +212,9 @@ def test_an_empty_recording_is_refused_with_one_line():
     empty = Recording(q=np.empty((0, 7)), tau=np.empty((0, 7)))
     with pytest.raises(RecordingError, match=r"^recording has no rows$"):
         empty.check_fits(load_arm("mtml"))
-    assert [finding.what for finding in check_recording(empty, load_arm("mtml")).refusals] == ["has no rows"]
+    assert [finding.what for finding in check_recording(Observations(empty, load_arm("mtml"))).refusals] == [
+        "has no rows"
+    ]
 
 
 def test_limits_of_an_arm_with_only_prismatic_joints_are_checked():

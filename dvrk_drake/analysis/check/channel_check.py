@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.excluded_measurements import find_excluded
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
@@ -50,7 +51,7 @@ MAX_SEGMENT_DURATION, MAX_SEGMENTS = 120.0, 4
 LIMIT_MARGIN = 0.02, 0.002
 
 
-def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
+def check_channels(observations: Observations) -> list[Finding]:
     """Tests hypotheses about errors in the channels of a recording, and reports the likely errors.
 
     Channel i of a recording consists of its columns qi, qdi and taui. The hypotheses are:
@@ -68,8 +69,7 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     is reported if it occurs in at least half of the segments.
 
     Args:
-        recording: Motion or poses at rest, with efforts, in joint or actuator coordinates.
-        arm: Arm that was recorded.
+        observations: Motion or poses at rest, with efforts.
 
     Returns:
         One refusal for exchanged or inverted channels (for an inverted effort in poses at rest, a warning). Otherwise,
@@ -79,32 +79,34 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     Raises:
         RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too coarsely.
     """
-    if not recording.motion(arm):
-        poses = _usable_poses(recording, arm)
+    arm = observations.arm
+    if not observations.recording.motion(arm):
+        poses = _usable_poses(observations.recording, arm)
         if len(poses) < MIN_POSES:
             return []
-        fit = ChannelFit(poses, arm)
+        fit = ChannelFit(Observations(poses, arm))
         found = _best_hypothesis([[*_hypotheses(fit), *_scales_at_rest(fit)]], at_rest=True)
         # The spring torque of a cable may exceed the gravity torque of a light wrist. The effort then opposes gravity.
         return [replace(f, severity="warning") if f.kind == "effort sign" else f for f in found]
     hypotheses, scales_and_offsets = [], []
-    for segment in _segments(recording.longest_segment()):
-        if segment.motion(arm):
-            fit = ChannelFit(segment, arm)
+    for segment in _segments(observations.longest):
+        if segment.recording.motion(arm):
+            fit = ChannelFit(segment)
             hypotheses.append(_hypotheses(fit))
             scales_and_offsets.append([] if _best_hypothesis(hypotheses[-1:]) else [*_scales(fit), *_offsets(fit)])
     return _best_hypothesis(hypotheses) or _merge_segments(scales_and_offsets, arm)
 
 
-def _segments(recording: Recording) -> list[Recording]:
+def _segments(observations: Observations) -> list[Observations]:
     """Returns at most `MAX_SEGMENTS` equal segments of a motion, each at most `MAX_SEGMENT_DURATION` long."""
+    recording = observations.recording
     t = recording.t
     if t is None or t[-1] - t[0] <= MAX_SEGMENT_DURATION:
-        return [recording]
+        return [observations]
     edges = np.linspace(t[0], t[-1], int(np.ceil((t[-1] - t[0]) / MAX_SEGMENT_DURATION)) + 1)
     segments = np.split(np.arange(len(t)), np.searchsorted(t, edges[1:-1]))
     chosen = np.unique(np.linspace(0, len(segments) - 1, min(len(segments), MAX_SEGMENTS)).round().astype(int))
-    return [recording.select(segments[k]) for k in chosen]
+    return [Observations(recording.select(segments[k]), observations.arm) for k in chosen]
 
 
 def _hypotheses(fit: ChannelFit) -> list[Finding]:
@@ -254,8 +256,9 @@ def _gain_of(other: Recording, fit: ChannelFit) -> float:
 
     If the recording is in actuator coordinates, the true times of the rows are those of `fit`.
     """
-    clock = fit.clock if fit.recording.coordinates == "actuator" else None
-    return ChannelFit(other, fit.arm, clock).log_likelihood - fit.log_likelihood
+    is_motion_of_actuators = fit.moves and fit.recording.coordinates == "actuator"
+    clocks = fit.observations.clocks if is_motion_of_actuators else None
+    return ChannelFit(Observations(other, fit.arm, clocks=clocks)).log_likelihood - fit.log_likelihood
 
 
 def _scales(fit: ChannelFit) -> Iterator[Finding]:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
 from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
-from dvrk_drake.analysis.signals.low_pass import low_pass, resample
-from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import period_of
-from dvrk_drake.analysis.signals.true_time import TrueTime
+from dvrk_drake.analysis.observations.low_pass import low_pass, resample
+from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -21,7 +20,7 @@ from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.recordings.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED
 
 #: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of the size of each
 #: parameter or coefficient.
@@ -62,9 +61,8 @@ class ChannelFit:
     and offsets only.
 
     Attributes:
-        recording: Recording that is fitted.
-        arm: Arm that was recorded.
-        clock: True times of the rows of a motion, None for poses at rest.
+        observations: Recording that is fitted.
+        recording, arm: Recording and arm of the observations.
         moves: True for a motion, False for poses at rest.
         used: Indices (k,) of the actuators that move and have an effort. The model is fitted to these efforts.
         resting: Indices (l,) of the actuators that have an effort and do not move. These efforts are modelled as
@@ -72,38 +70,33 @@ class ChannelFit:
         log_likelihood: Log-likelihood of the unmodified recording, up to a constant.
     """
 
-    def __init__(self, recording: Recording, arm: Arm, clock: TrueTime | None = None) -> None:
+    def __init__(self, observations: Observations) -> None:
         """Computes the columns of the model and fits them.
-
-        Args:
-            recording: Recording to fit.
-            arm: Arm that was recorded.
-            clock: Result of `true_time` for the recording in actuator coordinates, if available.
 
         Raises:
             RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too
                 coarsely.
         """
-        self.recording, self.arm, self.clock = recording, arm, clock
+        self.observations = observations
+        recording, arm = self.recording, self.arm = observations.recording, observations.arm
         self._to_joint = arm.transmission.inverse
         self._regressor, self._tilted, self._base = _regressors(arm)
         self.moves = bool(recording.motion(arm))
         if self.moves:
-            grid = motion_grid(recording, arm, default_settings(arm), clock)
-            self.clock = grid.clock
+            grid = observations.grid
             self._cut_off = min(arm.identification.effort_cut_off, 0.4 * grid.rate)
             self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
             self._q, self._v, self._vd = grid.q, grid.v, grid.vd
             self._tau = self._sampled_efforts(grid)
             duration = float(grid.t[-1] - grid.t[0]) - 2 * ENDS
-            independent = 2 * self._cut_off * min(duration, period_of(grid) or duration)
+            independent = 2 * self._cut_off * min(duration, observations.period or duration)
             moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
         else:
             recording.check_fits(arm)
             self._half_step = 1
             self._q = recording.in_joint_coordinates(arm).q
             self._v = self._vd = np.zeros_like(self._q)
-            self._tau = recording.in_actuator_coordinates(arm).measured_effort()
+            self._tau = observations.tau
             independent = min(len(recording), MAX_INDEPENDENT_POSES)
             moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*MIN_RANGE)
         self._independent = min(independent, MAX_INDEPENDENT)
@@ -151,7 +144,7 @@ class ChannelFit:
         return ratios
 
     def _sampled_efforts(self, grid: MotionGrid) -> NDArray[np.float64]:
-        tau = self.recording.in_actuator_coordinates(self.arm).measured_effort()
+        tau = self.observations.tau
         # A repeated row has the time of the previous row.
         times, rows = np.unique(grid.row_times, return_index=True)
         return self._sampled(resample(times, low_pass(tau, grid.rate, self._cut_off)[rows], grid.t))

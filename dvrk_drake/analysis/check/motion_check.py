@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
-from dvrk_drake.analysis.signals.effort_lag import LAG_STEP, MAX_LAG, EffortLag, effort_lag
-from dvrk_drake.analysis.signals.low_pass import resample
-from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionSignals, motion_signals
-from dvrk_drake.analysis.signals.noise import cut_offs, narrow_band, spectra
-from dvrk_drake.analysis.signals.repetition import find_period, repeatability_floor
-from dvrk_drake.analysis.signals.true_time import (
+from dvrk_drake.analysis.observations.effort_lag import LAG_STEP, MAX_LAG, EffortLag, effort_lag
+from dvrk_drake.analysis.observations.low_pass import resample
+from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionSignals, motion_signals
+from dvrk_drake.analysis.observations.noise import cut_offs, narrow_band, spectra
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import find_period, repeatability_floor
+from dvrk_drake.analysis.observations.true_time import (
     TrueTime,
     VelocityAgreement,
     distinct_rows,
     repeated_block,
     repeated_rows,
-    true_time,
     velocity_agreement,
 )
 from dvrk_drake.models.arm import Arm
@@ -42,20 +42,21 @@ MIN_CORRELATION = 0.95
 MIN_DURATION = 10.0
 
 
-def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tuple[RecordingReport, list[Finding]]:
+def check_motion(report: RecordingReport, observations: Observations) -> tuple[RecordingReport, list[Finding]]:
     """Checks a motion.
 
     Args:
         report: Report to which the statistics of the motion are added.
-        recording: Motion with increasing t, in joint or actuator coordinates.
-        arm: Arm that was recorded.
+        observations: Motion with increasing t.
 
     Returns:
         Report with the statistics of the motion, and the findings.
     """
+    recording, arm = observations.recording, observations.arm
     interval = float(np.median(np.diff(np.asarray(recording.t))))
+    # The channels that were measured are those of the whole motion.
     actuators = recording.measured_actuators(arm).longest_segment()
-    clock = true_time(actuators)
+    (clock,) = observations.longest.clocks
     t = np.asarray(actuators.t)
     duration, rate = float(t[-1] - t[0]), 1 / interval
     findings = [*_times(clock), *_gap_findings(recording)]
@@ -68,7 +69,7 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
         )
         advice = f"Record at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
-    signals = motion_signals(actuators, 20.0, rate=min(rate, GRID_RATE))
+    signals = motion_signals(actuators, clock, 20.0, rate=min(rate, GRID_RATE))
     moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
     agreement = _agreement(actuators, clock, signals)
     lags = effort_lag(signals, moving)

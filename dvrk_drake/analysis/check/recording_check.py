@@ -11,10 +11,9 @@ from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
 from dvrk_drake.analysis.check.pose_check import check_poses
-from dvrk_drake.analysis.signals.motion_faults import MotionFault, jump_fault, source_fault, time_fault
-from dvrk_drake.analysis.signals.motion_grid import MIN_SEGMENT, default_settings, motion_grid
-from dvrk_drake.analysis.signals.static_segments import find_poses, static_poses
-from dvrk_drake.analysis.signals.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
+from dvrk_drake.analysis.observations.motion_grid import MIN_SEGMENT
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
@@ -42,17 +41,16 @@ TIME_TOLERANCE = 0.05
 _ORDER: dict[Severity, int] = {"refusal": 0, "warning": 1, "note": 2}
 
 
-def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
+def check_recording(observations: Observations) -> RecordingReport:
     """Checks poses or a motion, without the tests of `check_channels`.
 
     Limits are checked in joint coordinates. Sensors, motors and friction are checked in actuator coordinates. Problems
     of the recording are returned as findings. They are never raised as errors.
 
     Args:
-        recording: Recording without preprocessing, in joint or actuator coordinates.
-        arm: Arm that was recorded.
+        observations: Recording without preprocessing.
     """
-    source = recording.source or "recording"
+    recording, arm, source = observations.recording, observations.arm, observations.source
     report = RecordingReport(source, arm.name, "motion" if recording.is_motion else "poses", len(recording))
     findings = [Finding("note", "reading", source, note.removesuffix("."), "") for note in recording.notes]
     if arm.locked_joints:
@@ -61,7 +59,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         findings.append(Finding("note", "locked joints", ", ".join(arm.locked_joints), what, advice))
     try:
         joints = recording.in_joint_coordinates(arm)
-        if fault := source_fault(recording, arm) or _jump(recording, arm):
+        if fault := observations.source_fault or observations.jump:
             return replace(report, findings=(Finding("refusal", *fault), *findings))
         recording.check_fits(arm)
         tau = joints.measured_effort()
@@ -75,24 +73,17 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm, report.kind)
     if report.kind == "motion":
         findings += repeated_row_findings(recording.in_actuator_coordinates(arm))
-    time = _time(recording, arm, report.kind)
+    time = _time(observations, report.kind)
     findings += time
     report = replace(report, joints=joint_signals)
     if any(finding.severity == "refusal" for finding in time):
         report = replace(report, kind="motion")
     elif report.kind == "motion":
-        report, more = check_motion(report, recording, arm)
+        report, more = check_motion(report, observations)
         findings += more
     else:
         findings += check_poses(recording, arm)
     return replace(report, findings=tuple(sorted(findings, key=lambda finding: _ORDER[finding.severity])))
-
-
-def _jump(recording: Recording, arm: Arm) -> MotionFault | None:
-    """Returns a jump of the positions, or None if static poses are used, between which the arm may move unrecorded."""
-    fault = jump_fault(recording, arm)
-    poses = static_poses(recording, arm) if fault else None
-    return None if poses is not None and len(poses) >= MIN_POSES else fault
 
 
 def _joint_signals(joints: Recording, arm: Arm) -> tuple[JointSignals, ...]:
@@ -226,8 +217,9 @@ def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
     return float(np.sum(lengths[lengths >= FLAT_ROWS]) / len(values))
 
 
-def _time(recording: Recording, arm: Arm, kind: str) -> list[Finding]:
+def _time(observations: Observations, kind: str) -> list[Finding]:
     """Returns findings for missing times, times that do not increase, and times that disagree with q and qd."""
+    recording = observations.recording
     t, qd = recording.t, recording.qd
     if t is None:
         if qd is not None and np.max(np.sqrt(np.mean(qd**2, axis=0))) > REST_SPEED[0]:
@@ -249,7 +241,7 @@ def _time(recording: Recording, arm: Arm, kind: str) -> list[Finding]:
         rows, times, _ = distinct_rows(recording)
         factor = time_factor(times, recording.q[rows], recording.qd[rows])
     if factor is None or abs(factor - 1) < TIME_TOLERANCE:
-        return [Finding("refusal", *fault)] if (fault := time_fault(recording, arm)) else []
+        return [Finding("refusal", *fault)] if (fault := observations.fault) else []
     units = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
     unit = next((name for size, name in units.items() if abs(factor / size - 1) < 0.1), "")
     cause = f"t may be in {unit}" if unit else "usual causes: a wrong rate, or qd in another unit"
@@ -294,12 +286,13 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     share = step_progress(progress, "checking the recording")
     share(0.0)
     recording, dropped = with_power(recording, arm)
-    report = check_with_channels(recording, arm)
+    observations = Observations(recording, arm)
+    report = check_with_channels(observations)
     report = replace(report, findings=(*report.refusals, *dropped, *report.findings[len(report.refusals) :]))
     share(1.0)
     if report.refusals:
         return report
-    refusals = _refusals_of_identify(recording, arm)
+    refusals = _refusals_of_identify(observations)
     # A refusal of identify makes the warning of too few poses redundant.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
@@ -352,8 +345,7 @@ def with_power(recording: Recording, arm: Arm) -> tuple[Recording, tuple[Finding
 
 
 def require_usable(
-    recording: Recording,
-    arm: Arm,
+    observations: Observations,
     progress: Progress | None = None,
     *,
     channels: bool = False,
@@ -362,8 +354,7 @@ def require_usable(
     """Checks a recording and raises an error if it is not usable.
 
     Args:
-        recording: Recording, see `check_recording`.
-        arm: Arm that was recorded.
+        observations: Recording, see `check_recording`.
         progress: Callback that receives the name of the step ("checking the recording") and the finished share of the
             step (0 to 1).
         channels: True to check the channels too, see `check_with_channels`.
@@ -378,7 +369,7 @@ def require_usable(
     """
     report_share = step_progress(progress, "checking the recording")
     report_share(0.0)
-    report = (check_with_channels if channels else check_recording)(recording, arm)
+    report = (check_with_channels if channels else check_recording)(observations)
     report_share(1.0)
     kept = tuple(finding for finding in report.findings if finding.kind != ignored_kind)
     report = replace(report, findings=kept)
@@ -389,21 +380,22 @@ def require_usable(
     return report
 
 
-def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
+def check_with_channels(observations: Observations) -> RecordingReport:
     """Checks a recording with `check_recording`, then its channels with `check_channels`.
 
     The channels are not checked if `check_recording` reports a refusal, unless all refusals are efforts with a wrong
     sign. Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels
     therefore replaces the refusals for wrong signs.
     """
+    recording, arm = observations.recording, observations.arm
     if recording.coordinates == "wpi" and recording.q.shape[1] == arm.num_joints:
-        recording = recording.in_joint_coordinates(arm)
-    report = check_recording(recording, arm)
+        observations = Observations(recording.in_joint_coordinates(arm), arm, observations.settings)
+    report = check_recording(observations)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]
     if others or (report.kind == "motion" and not recording.motion(arm)):
         return report
     try:
-        found = check_channels(recording, arm)
+        found = check_channels(observations)
     except RecordingError:
         return report  # The motion is too short, or its rate too low, for a fit. identify rejects it for that reason.
     if any(finding.severity == "refusal" for finding in found):
@@ -415,15 +407,16 @@ def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     return replace(report, findings=tuple(sorted((*report.findings, *found), key=lambda f: order[f.severity])))
 
 
-def _refusals_of_identify(recording: Recording, arm: Arm) -> tuple[Finding, ...]:
+def _refusals_of_identify(observations: Observations) -> tuple[Finding, ...]:
+    recording, arm = observations.recording, observations.arm
     try:
-        found = find_poses(recording, arm)
+        found = observations.poses()
         if found.moves:
-            motion_grid(recording, arm, default_settings(arm))
+            _ = observations.grid
             return ()
         usable_poses(found.recording, arm)
     except (RecordingError, IdentificationError) as error:
-        what, advice = _what_and_advice(error, recording.source or "recording")
+        what, advice = _what_and_advice(error, observations.source)
         return (Finding("refusal", "identify refuses", "identify", f"rejects the recording: {what}", advice),)
     # If static poses were extracted from a motion, only these poses are used for identification.
-    return () if found.recording is recording else check_recording(found.recording, arm).refusals
+    return () if found.recording is recording else check_recording(found.observations).refusals

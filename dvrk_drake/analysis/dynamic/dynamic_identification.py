@@ -25,15 +25,15 @@ from dvrk_drake.analysis.dynamic.estimates import (
     parameter_covariance,
 )
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
-from dvrk_drake.analysis.results import Identification
-from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import (
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import (
     FOLDS,
     correlation_of,
     motion_floor,
-    period_of,
     phase_folds,
 )
+from dvrk_drake.analysis.results import Identification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
@@ -103,9 +103,9 @@ class DynamicIdentification(Identification):
 
 
 def identify_dynamic(
-    recordings: Sequence[Recording], arm: Arm, progress: Callable[[float], object] = lambda _: None
+    observations: Sequence[Observations], progress: Callable[[float], object] = lambda _: None
 ) -> DynamicIdentification:
-    """Identifies the dynamics of `arm` from one or more motions.
+    """Identifies the dynamics of an arm from one or more motions.
 
     Measured efforts and regressor columns are filtered with the same low-pass filter. The model includes the mandatory
     effects of `drive_effects`. These are an offset of every actuator, friction along every drive coordinate, and the
@@ -120,8 +120,7 @@ def identify_dynamic(
     recordings (`RecordingEffect`), and the model contains their means.
 
     Args:
-        recordings: Motions with t and tau, in joint or actuator coordinates.
-        arm: Arm that was recorded.
+        observations: Motions of the arm, with efforts.
         progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
@@ -129,12 +128,9 @@ def identify_dynamic(
         IdentificationError: The solver for consistent parameters did not converge, or the cross-validated RMS error of
             a moving actuator exceeds the RMS effort of this actuator.
     """
-    settings = default_settings(arm)
-    grids = thinned([motion_grid(recording, arm, settings) for recording in recordings])
-    tau = [recording.in_actuator_coordinates(arm).measured_effort() for recording in recordings]
-    progress(0.05)
-    periods = [period_of(grid) for grid in grids]
-    problem = motion_problem(grids, tau, periods)
+    arm, settings = observations[0].arm, observations[0].settings
+    recordings = [own.recording for own in observations]
+    problem = motion_problem(observations)
     progress(0.2)
     selection = select_effects(problem, lambda share: progress(0.2 + 0.3 * share))
     selection, fit = selection.consistent()
@@ -145,20 +141,20 @@ def identify_dynamic(
     parts = [np.flatnonzero(problem.recording == i) for i in range(len(recordings))]
     rows = [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
     motions = tuple(
-        FittedMotion(recording, grid, period, measured[own], predicted[own], held_out[own])
-        for recording, grid, period, own in zip(recordings, grids, periods, rows, strict=True)
+        FittedMotion(observed.recording, grid, observed.period, measured[own], predicted[own], held_out[own])
+        for observed, grid, own in zip(observations, problem.grids, rows, strict=True)
     )
     for motion in motions:
         _refuse_worse_than_zero(motion)
     series = []
-    for own, grid, period in zip(rows, grids, periods, strict=True):
-        first = own.start
-        for segment, _, _ in grid.each_segment():
-            series.append(ResidualSeries(slice(first, first + len(segment.inner_rows)), grid.rate / grid.step, period))
+    for own, motion in zip(rows, motions, strict=True):
+        first, rate = own.start, motion.grid.rate / motion.grid.step
+        for segment, _, _ in motion.grid.each_segment():
+            series.append(ResidualSeries(slice(first, first + len(segment.inner_rows)), rate, motion.period))
             first += len(segment.inner_rows)
     covariance = parameter_covariance(problem, fit, measured - predicted, settings.effort_cut_off, series)
     estimates = DynamicEstimates(problem, fit, covariance)
-    floors = [_repeatability(own, motion) for own, motion in zip(tau, motions, strict=True)]
+    floors = [_repeatability(own.tau, motion) for own, motion in zip(observations, motions, strict=True)]
     section = _section(problem, effects, fit, covariance, measured - held_out, floors)
     section.links = estimates.links()
     section.base_parameters, section.correlations = estimates.base_parameters()
@@ -196,26 +192,22 @@ def _refuse_worse_than_zero(motion: FittedMotion) -> None:
 
 
 def motion_problem(
-    grids: Sequence[MotionGrid],
-    tau: Sequence[NDArray[np.float64]],
-    periods: Sequence[float | None],
-    effects: Sequence[ActuatorEffect] | None = None,
+    observations: Sequence[Observations], effects: Sequence[ActuatorEffect] | None = None
 ) -> DynamicProblem:
     """Returns the least-squares problem of one or more motions of an arm.
 
     Args:
-        grids: Resampled motions.
-        tau: Measured efforts (m, n) of the actuators at the rows of each recording [N m, N].
-        periods: Periods of the motions [s], None for a motion that does not repeat.
+        observations: Motions of the arm, with efforts. Long motions are thinned out (`thinned`).
         effects: Effects of the model, all of which are mandatory. If None, the effects of `drive_effects` are mandatory
             and those of `optional_effects` are candidates, without effects that do not act on a measured effort.
     """
-    arm = grids[0].arm
+    arm, grids = observations[0].arm, thinned([own.grid for own in observations])
     mandatory = effects if effects is not None else drive_effects(arm, grids)
     candidates = [] if effects is not None else optional_effects(arm, grids)
     regressor = DynamicRegressor(arm)
     columns = [
-        dynamic_columns(grid, own, regressor, [*mandatory, *candidates]) for grid, own in zip(grids, tau, strict=True)
+        dynamic_columns(grid, own.tau, regressor, [*mandatory, *candidates])
+        for grid, own in zip(grids, observations, strict=True)
     ]
     whole = DynamicColumns.of_recordings(columns)
     num_mandatory = len(mandatory)
@@ -226,17 +218,17 @@ def motion_problem(
         whole = whole.with_effects(acting)
     num_folds = max(FOLDS // len(grids), MIN_FOLDS)
     folds, edges = zip(
-        *(phase_folds(grid, period, num_folds) for grid, period in zip(grids, periods, strict=True)), strict=True
+        *(phase_folds(grid, own.period, num_folds) for grid, own in zip(grids, observations, strict=True)), strict=True
     )
     # A low-pass filtered effort has two independent values per period of the cut-off frequency. Repetitions of the
     # motion do not add independent values.
     independent = 0.0
-    for grid, own, period in zip(grids, columns, periods, strict=True):
+    for grid, own, observed in zip(grids, columns, observations, strict=True):
         duration = len(own.tau) * grid.step / grid.rate
-        independent += 2 * grid.settings.effort_cut_off * min(duration, period or duration)
+        independent += 2 * grid.settings.effort_cut_off * min(duration, observed.period or duration)
     num_rows = [len(own.tau) for own in columns]
     return DynamicProblem(
-        grids=tuple(grids),
+        grids=grids,
         kept=np.ones(sum(num_rows), dtype=bool),
         recording=np.repeat(np.arange(len(grids)), num_rows),
         columns=whole,

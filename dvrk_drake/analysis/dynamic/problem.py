@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
-from dvrk_drake.analysis.signals.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import rotor_links

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import motion_floor
 from dvrk_drake.analysis.results import Validation
-from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.repetition import motion_floor, period_of
 from dvrk_drake.analysis.verdict import Tolerance, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
-from dvrk_drake.recordings.recording import GAP, MIN_GAP, Recording
+from dvrk_drake.recordings.recording import GAP, MIN_GAP
 
 #: Width of the smoothed sign function of the friction-like error, as a share of the RMS velocity.
 _FRICTION_WIDTH = 0.1
@@ -156,19 +157,18 @@ class DynamicValidation(Validation):
         ]
 
 
-def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
+def predict_motion(model: IdentifiedModel, observations: Observations) -> NDArray[np.float64]:
     """Returns the predicted efforts (m, n) of the actuators at all rows of a motion, after the low-pass filter.
 
     Raises:
         RecordingError: The recording does not match the arm, or is not a motion.
         ModelError: The model has no dynamics.
     """
-    dynamics = model.dynamic_model
-    grid = motion_grid(recording, model.arm, dynamics.section.signals)
+    grid = observations.grid
     return grid.low_passed(_efforts(model, grid))
 
 
-def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicValidation:
+def validate_motion(model: IdentifiedModel, observations: Observations) -> DynamicValidation:
     """Compares predicted and measured efforts of a motion, in actuator coordinates.
 
     The relative error of an actuator is |tau_f - tau_hat| / |tau_f|, with the measured effort tau_f and the predicted
@@ -181,11 +181,9 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     """
     dynamics = model.dynamic_model
     arm = model.arm
-    tau = recording.in_actuator_coordinates(arm).measured_effort()
-    grid = motion_grid(recording, arm, dynamics.section.signals)
+    tau, grid, period = observations.tau, observations.grid, observations.period
     measured, predicted = (grid.filter_efforts(x @ grid.channels.T) for x in (tau, _efforts(model, grid)))
     t, a, v = grid.actuator_motion()
-    period = period_of(grid)
     floor: list[float | None] = [None] * arm.num_joints
     if period is not None:
         floor = [float(x) if np.isfinite(x) else None for x in motion_floor(tau, grid, period)]
@@ -203,7 +201,7 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         actuators.append(error)
     return DynamicValidation(
         model=model,
-        recording=recording,
+        recording=observations.recording,
         actuators=actuators,
         cut_off=grid.settings.effort_cut_off,
         t=t,

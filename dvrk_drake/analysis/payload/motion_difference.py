@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
-from dvrk_drake.analysis.signals.drive_efforts import DriveEfforts, drive_efforts, refuse_opposite_efforts
-from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.repetition import SAME_MOTION, period_of
+from dvrk_drake.analysis.observations.drive_efforts import DriveEfforts, drive_efforts, refuse_opposite_efforts
+from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import SAME_MOTION
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.effects_schema import half_width
-from dvrk_drake.recordings.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ class MotionDifference:
     deviation: NDArray[np.float64]
 
 
-def motion_difference(reference: Recording | None, other: Recording, model: DynamicModel) -> MotionDifference:
+def motion_difference(reference: Observations | None, loaded: Observations, model: DynamicModel) -> MotionDifference:
     """Subtracts the efforts of a reference from those of a recording, after alignment in time.
 
     Of a recording with gaps, the longest segment between gaps is used.
@@ -133,21 +133,21 @@ def motion_difference(reference: Recording | None, other: Recording, model: Dyna
     """
     signals = model.section.signals
     settings = replace(signals, effort_cut_off=min(CUT_OFF, signals.effort_cut_off))
-    other = other.longest_segment()
-    grid = motion_grid(other, model.arm, settings)
+    loaded = loaded.longest
+    grid = replace(loaded.grid, settings=settings)
     expected = drive_efforts(model, grid)
-    tau, change = _efforts(other, grid, expected, model)
-    period, changes = period_of(grid), _changes(model, grid, expected)
+    tau, change = _efforts(loaded, grid, expected)
+    period, changes = loaded.period, _changes(model, grid, expected)
     # An error of the model, or a change of the arm since its identification, also depends on the position.
     expected_change = DRIFT * np.sqrt(np.mean(tau**2, axis=0))
     if reference is None:
         rows, shift = np.ones(len(change), bool), 0.0
         expected_change = np.hypot(expected_change, model.half_width / half_width(1.0, None))
     else:
-        reference = reference.longest_segment()
-        reference_grid = motion_grid(reference, model.arm, settings)
-        shift = _shift(reference_grid, grid, period, other)
-        _, reference_residual = _efforts(reference, reference_grid, drive_efforts(model, reference_grid), model)
+        reference = reference.longest
+        reference_grid = replace(reference.grid, settings=settings)
+        shift = _shift(reference_grid, grid, period, loaded.source)
+        _, reference_residual = _efforts(reference, reference_grid, drive_efforts(model, reference_grid))
         t, reference_t = grid.row_times[grid.inner] + shift, reference_grid.row_times[reference_grid.inner]
         rows = (t >= reference_t[0]) & (t <= reference_t[-1])
         change = change[rows] - _interpolate(reference_t, reference_residual, t[rows])
@@ -159,11 +159,11 @@ def motion_difference(reference: Recording | None, other: Recording, model: Dyna
 
 
 def _efforts(
-    recording: Recording, grid: MotionGrid, expected: DriveEfforts, model: DynamicModel
+    observations: Observations, grid: MotionGrid, expected: DriveEfforts
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns the measured efforts (r, n) and the residuals (r, n) of the model, after low-pass filtering."""
-    tau = grid.filter_efforts(recording.in_actuator_coordinates(model.arm).measured_effort())
-    refuse_opposite_efforts(recording, model.arm.joint_names, tau, expected.total())
+    tau = grid.filter_efforts(observations.tau)
+    refuse_opposite_efforts(observations.recording, observations.arm.joint_names, tau, expected.total())
     return tau, tau - expected.total()
 
 
@@ -199,7 +199,7 @@ def _interpolate(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[
     return np.asarray(PchipInterpolator(t[different], x[different], axis=0)(times), dtype=float)
 
 
-def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recording: Recording) -> float:
+def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, source: str) -> float:
     """Returns the time shift [s] that minimises the mean squared difference of the positions.
 
     The positions of each joint are divided by their standard deviation.
@@ -222,7 +222,7 @@ def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recor
     best = min(range(coarse - step, coarse + step + 1), key=distance)
     if not distance(best) < SAME_MOTION**2:
         raise RecordingError(
-            f"{recording.source or 'recording'}: the motion differs from the reference. After alignment in time, the "
+            f"{source}: the motion differs from the reference. After alignment in time, the "
             f"positions differ by {100 * np.sqrt(distance(best)):.0f} % of their standard deviation; at most "
             f"{100 * SAME_MOTION:.0f} % is allowed."
         )

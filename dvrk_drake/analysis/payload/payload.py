@@ -13,9 +13,10 @@ from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import phase_folds
 from dvrk_drake.analysis.payload.motion_difference import MotionDifference, Whitening, motion_difference
 from dvrk_drake.analysis.payload.point_mass import PointMass, PointMassProblem
-from dvrk_drake.analysis.signals.repetition import phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -126,8 +127,8 @@ class Payload:
 
 
 def estimate_payload(
-    reference: Recording | None,
-    loaded: Recording,
+    reference: Observations | None,
+    loaded: Observations,
     model: DynamicModel,
     links: Sequence[str] | None = None,
     progress: Callable[[float], object] = lambda _: None,
@@ -169,9 +170,9 @@ def estimate_payload(
     difference = motion_difference(reference, loaded, model)
     progress(0.2)
     grid = difference.grid
-    if np.sqrt(np.mean(difference.tau**2)) < MIN_DIFFERENCE * np.sqrt(np.mean(loaded.measured_effort() ** 2)):
+    if np.sqrt(np.mean(difference.tau**2)) < MIN_DIFFERENCE * np.sqrt(np.mean(loaded.recording.measured_effort() ** 2)):
         other = "the model" if reference is None else "the reference. Use two different recordings of the motion"
-        raise RecordingError(f"{loaded.source or 'recording'}: the efforts equal the efforts of {other}.")
+        raise RecordingError(f"{loaded.source}: the efforts equal the efforts of {other}.")
     Y = regressor.regressor(grid.q, grid.v, grid.vd)
     J_inverse = model.arm.transmission.inverse.matrix
     estimates = []
@@ -267,11 +268,12 @@ def payload(
             "payload. Give a model of the arm without the payload."
         )
     warnings: tuple[Finding, ...] = ()
-    recordings = []
+    observations: list[Observations] = []
     for given in (loaded,) if reference is None else (reference, loaded):
         recording, findings = with_power(given, arm)
-        recordings.append(recording)
-        report = require_usable(recording, arm, progress)
+        own = Observations(recording, arm) if isinstance(model, Arm) else Observations.for_model(recording, model)
+        observations.append(own)
+        report = require_usable(own, progress)
         if recording.tau is not None and np.any(unmeasured := recording.unmeasured):
             names = ", ".join(f"tau{j + 1}" for j in np.flatnonzero(unmeasured))
             raise RecordingError(
@@ -280,11 +282,13 @@ def payload(
             )
         warnings += tuple(replace(finding, where=f"{report.source}: {finding.where}") for finding in findings)
         warnings += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
-    *references, loaded = recordings
+    *references, with_payload = observations
     if isinstance(model, Arm):
-        model = identify_dynamic(references, arm, step_progress(progress, "identifying")).model
-    reference = references[0] if references else None
-    estimates = estimate_payload(reference, loaded, model.dynamic_model, progress=step_progress(progress, "estimating"))
+        model = identify_dynamic(references, step_progress(progress, "identifying")).model
+    share = step_progress(progress, "estimating")
+    estimates = estimate_payload(
+        references[0] if references else None, with_payload, model.dynamic_model, progress=share
+    )
     result = estimates[0] if link is None else next(p for p in estimates if p.link == link)
     warnings = (*better_link_warnings(result, estimates), *warnings)
     return PayloadIdentification(result, estimates, model, warnings, link, bool(references))

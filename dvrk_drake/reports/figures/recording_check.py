@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import RecordingReport
-from dvrk_drake.analysis.signals.noise import spectra
+from dvrk_drake.analysis.observations.noise import spectra
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.figures.colours import LIMIT, MEASURED, REFERENCE

@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, FittedMotion
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation
-from dvrk_drake.analysis.signals.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.reports.html.binned import ComparedEfforts, binned_residuals
 from dvrk_drake.reports.html.labels import effort_unit, joint_label, length_unit
 from dvrk_drake.reports.html.plot_style import COLOURS, line, transparent

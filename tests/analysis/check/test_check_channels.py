@@ -8,7 +8,8 @@ from check_findings import ARMS, changed, found
 from synthetic_motion import RATE, clean_motion
 
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.models.arm_files import load_arm
 
 pytestmark = pytest.mark.slow
@@ -21,7 +22,7 @@ def test_detects_a_wrong_velocity_gain_or_lag(gain, lag):
     kinds = found(late, "mtmr")
     # Only the first four joints of an MTM share motors, so actuator 6 drives one joint.
     assert [f.joints for f in kinds["velocity disagrees"]] == [(5,)]
-    report = check_recording(late, load_arm("mtmr"))
+    report = check_recording(Observations(late, load_arm("mtmr")))
     assert report.joints[5].velocity_gain == pytest.approx(gain, rel=5e-3)
     assert report.joints[5].velocity_lag == pytest.approx(lag, abs=3e-4)
 
@@ -34,7 +35,7 @@ def test_detects_velocities_that_are_always_zero():
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("lag", [0.010, -0.010, 0.020])
 def test_detects_the_lag_of_efforts(name, lag):
-    report = check_recording(clean_motion(name, effort_lag=lag), load_arm(name))
+    report = check_recording(Observations(clean_motion(name, effort_lag=lag), load_arm(name)))
     lags = [joint.effort_lag for joint in report.joints]
     assert sum(value is not None for value in lags) >= 5
     for value in lags:
@@ -67,11 +68,11 @@ def test_detects_narrow_band_noise():
 
 def test_larger_noise_lowers_the_cut_off():
     """The motion has no frequencies above 0.83 Hz. Only friction has higher frequencies."""
-    report = check_recording(clean_motion(), load_arm("psm"))
+    report = check_recording(Observations(clean_motion(), load_arm("psm")))
     louder = changed(
         clean_motion(), "tau", 0, lambda x: x + np.random.default_rng(8).normal(size=len(x)) * 0.5 * np.std(x)
     )
-    noisy = check_recording(louder, load_arm("psm"))
+    noisy = check_recording(Observations(louder, load_arm("psm")))
     assert noisy.joints[0].effort_cut_off < report.joints[0].effort_cut_off
     assert 2.0 <= noisy.joints[0].effort_cut_off < 10.0
 

@@ -7,7 +7,7 @@ import pytest
 from check_findings import ARMS, found
 from synthetic_motion import RATE, clean_motion
 
-from dvrk_drake.analysis.signals.true_time import true_time
+from dvrk_drake.analysis.observations.true_time import true_time
 from dvrk_drake.models.arm_files import load_arm
 
 pytestmark = pytest.mark.slow

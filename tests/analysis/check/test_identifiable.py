@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.check.recording_check import check, check_recording
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torques
@@ -72,8 +73,10 @@ def test_check_accepts_what_identify_accepts(tmp_path, capsys):
 
 
 def test_few_poses_are_not_refused_for_validation():
-    assert [finding.kind for finding in check_recording(poses(3), ARM).findings if finding.kind == "few poses"]
-    assert not check_recording(poses(3), ARM).refusals
+    assert [
+        finding.kind for finding in check_recording(Observations(poses(3), ARM)).findings if finding.kind == "few poses"
+    ]
+    assert not check_recording(Observations(poses(3), ARM)).refusals
 
 
 def test_static_poses_of_a_motion_are_checked_as_poses():

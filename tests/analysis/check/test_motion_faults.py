@@ -11,9 +11,8 @@ from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import check_recording, with_power
 from dvrk_drake.analysis.identification import identify
-from dvrk_drake.analysis.signals.motion_faults import jump_fault, source_fault, time_fault
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.observations.motion_faults import jump_fault, source_fault, time_fault
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.validation import predict
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
@@ -52,7 +51,7 @@ def test_names_the_unit_of_wrong_times(unit, factor, rate):
     other = replace(whole, t=(1.7e9 + whole.t) * factor).select(rows)
     fault = motion_fault(other, ARM)
     assert fault.kind == "wrong time" and f"t may be in {unit}: {rate:g} Hz" in fault.what
-    assert [f.kind for f in check_recording(other, ARM).refusals] == ["wrong time"]
+    assert [f.kind for f in check_recording(Observations(other, ARM)).refusals] == ["wrong time"]
     for call in (lambda: identify(other, ARM), lambda: predict(IdentifiedModel.from_arm(ARM), other)):
         with pytest.raises(RecordingError, match=f"t may be in {unit}"):
             call()
@@ -62,7 +61,7 @@ def test_finds_the_unit_of_times_of_one_moving_joint():
     whole = motion(velocities=True)
     still = np.where(np.arange(7) == 1, 1.0, 0.0)
     one = replace(whole, q=whole.q * still + 0.1 * (1 - still), qd=whole.qd * still, t=1e3 * whole.t)
-    (refusal,) = check_recording(one, ARM).refusals
+    (refusal,) = check_recording(Observations(one, ARM)).refusals
     assert "t may be in milliseconds: 100 Hz" in refusal.what
 
 
@@ -94,11 +93,10 @@ def test_static_poses_with_times_have_no_fault():
 
 
 def test_accepts_49_9_hz_and_lost_rows():
-    settings = default_settings(ARM)
     for recording in (motion(49.9), motion(50.0).select(np.delete(np.arange(600), [100, 400]))):
-        assert motion_grid(recording, ARM, settings).rate == pytest.approx(49.9, abs=0.11)
+        assert Observations(recording, ARM).grid.rate == pytest.approx(49.9, abs=0.11)
     with pytest.raises(RecordingError, match=r"lasts 12.0 s at 47 Hz\. A dynamic model requires .* 50 Hz"):
-        motion_grid(motion(47.0), ARM, settings)
+        _ = Observations(motion(47.0), ARM).grid
 
 
 @pytest.mark.parametrize("order", ["alternating", "random", "two of three"])
@@ -114,7 +112,7 @@ def test_two_publishers_on_one_topic_are_named(signal, order):
     other = {"q": whole.q + 0.1, "tau": -whole.tau, "half tau": 0.5 * whole.tau}[signal]
     name = "q" if signal == "q" else "tau"
     mixed = replace(whole, **{name: np.where(second, other, getattr(whole, name))})
-    (refusal,) = check_recording(mixed, ARM).refusals
+    (refusal,) = check_recording(Observations(mixed, ARM)).refusals
     assert refusal.kind == "two sources" and refusal.where == name and "two publishers on one topic" in refusal.advice
     with pytest.raises(RecordingError, match="two publishers"):
         identify(mixed, ARM)
@@ -138,7 +136,7 @@ def test_a_wrapped_angle_is_named(in_motors):
     q = recording.q.copy()
     q[:, 6] = np.where(q[:, 6] > 1.0, q[:, 6] - 2 * np.pi, q[:, 6])
     wrapped = replace(recording, q=q)
-    (refusal,) = check_recording(wrapped, ARM).refusals
+    (refusal,) = check_recording(Observations(wrapped, ARM)).refusals
     assert refusal.kind == "wrapped angle" and refusal.what.startswith("q7 jumps by a multiple of 2 pi in ")
     # Poses may differ by 2 pi, and a joint may turn by 2 pi in a gap.
     assert motion_fault(replace(wrapped, t=None, qd=None), ARM) is None
@@ -153,7 +151,7 @@ def joined(rate):
 @pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
 def test_jumps_between_joined_recordings_are_named(rate):
     recording = joined(rate)
-    (refusal,) = check_recording(recording, ARM).refusals
+    (refusal,) = check_recording(Observations(recording, ARM)).refusals
     step = np.max(np.abs(recording.q[600] - recording.q[599]))
     assert (refusal.kind, refusal.where) == (
         "jump",
@@ -198,8 +196,8 @@ def test_unrecorded_motions_between_poses_are_no_jumps():
     tau = holding_torques(ARM, poses)
     at_rest = Recording(np.repeat(poses, 150, axis=0), np.repeat(tau, 150, axis=0), t=np.arange(3000) / 100)
     assert jump_fault(at_rest, ARM) is not None
-    assert "jump" not in [finding.kind for finding in check_recording(at_rest, ARM).findings]
-    assert len(find_poses(at_rest, ARM).recording) == 20
+    assert "jump" not in [finding.kind for finding in check_recording(Observations(at_rest, ARM)).findings]
+    assert len(Observations(at_rest, ARM).poses().recording) == 20
 
 
 def test_drops_rows_without_power():
@@ -216,14 +214,14 @@ def test_drops_rows_without_power():
     assert "two publishers" in finding.advice
     off = replace(whole, tau=0 * tau)
     assert with_power(off, ARM) == (off, ())
-    assert [f.kind for f in check_recording(off, ARM).refusals] == ["no effort"]
+    assert [f.kind for f in check_recording(Observations(off, ARM)).refusals] == ["no effort"]
 
 
 def test_a_motor_that_is_switched_off_is_refused():
     whole = motion()
     tau = whole.tau.copy()
     tau[700:, 3] = 0.0
-    refusals = [f for f in check_recording(replace(whole, tau=tau), ARM).refusals if f.kind == "no power"]
+    refusals = [f for f in check_recording(Observations(replace(whole, tau=tau), ARM)).refusals if f.kind == "no power"]
     assert [f.what for f in refusals] == [
         "tau4 is exactly 0 in 500 successive rows while the joint moves, first at motion.csv, row 701"
     ]
@@ -257,11 +255,11 @@ def test_channels_use_only_measured_efforts(arm, joint):
 
 def test_filters_and_states_begin_anew_after_a_gap():
     """Each segment has the results of a recording of this segment alone."""
-    whole, settings = motion(seconds=20.0), default_settings(ARM)
+    whole = motion(seconds=20.0)
     rows = [np.arange(0, 900), np.arange(1000, 2000)]
     cut = whole.select(np.concatenate(rows))
-    grid = motion_grid(cut, ARM, settings)
-    alone = [motion_grid(whole.select(own), ARM, settings) for own in rows]
+    grid = Observations(cut, ARM).grid
+    alone = [Observations(whole.select(own), ARM).grid for own in rows]
     for name in ("t", "q", "v", "vd", "row_times"):
         np.testing.assert_allclose(
             getattr(grid, name), np.concatenate([getattr(g, name) for g in alone]), rtol=0, atol=1e-9
@@ -283,10 +281,10 @@ def test_drops_short_segments_between_gaps():
     whole = motion(seconds=20.0)
     cut = whole.select(np.r_[0:900, 1000:1100, 1200:2000])
     with pytest.raises(RecordingError, match=r"row 901: only 0.99 s of motion between two gaps of t"):
-        motion_grid(cut, ARM, default_settings(ARM))
+        _ = Observations(cut, ARM).grid
     kept, (finding,) = with_power(cut, ARM)
     assert len(kept) == 1700 and "100 of 1800 rows are in 1 segment shorter than 3 s" in finding.what
-    assert motion_grid(kept, ARM, default_settings(ARM)).inner_rows.size == 1300
+    assert Observations(kept, ARM).grid.inner_rows.size == 1300
 
 
 def test_gain_at_rest_does_not_grow_with_the_number_of_poses():
@@ -297,7 +295,7 @@ def test_gain_at_rest_does_not_grow_with_the_number_of_poses():
     for copies in (1, 3):
         q = np.tile(poses, (copies, 1)) + 1e-6 * generator.normal(size=(80 * copies, 7))
         tau = 1.3 * holding_torques(ARM, q) + 0.01 * ARM.effort_limits * np.sin(7 * q)
-        fit = ChannelFit(Recording(q, tau), ARM)
+        fit = ChannelFit(Observations(Recording(q, tau), ARM))
         gains.append(fit.gain(fit.in_actuators(np.diag(np.where(np.arange(7) == 2, -1.0, 1.0)))))
     assert gains[1] == pytest.approx(gains[0], rel=0.02)
 

@@ -13,9 +13,9 @@ from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
 from dvrk_drake.analysis.check.motion_check import _lags
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.signals.effort_lag import EffortLag
-from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.observations.effort_lag import EffortLag
+from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("name", ARMS)
 def test_clean_motion_has_only_the_period_as_finding(name):
-    report = check_recording(clean_motion(name), load_arm(name))
+    report = check_recording(Observations(clean_motion(name), load_arm(name)))
     assert [finding.kind for finding in report.findings] == ["repetition"]
     assert report.period == pytest.approx(PERIOD, abs=1e-4)
     assert report.jitter == 0.0
@@ -46,7 +46,7 @@ def test_clean_motion_has_only_the_period_as_finding(name):
 @pytest.mark.parametrize("name", ARMS)
 def test_floor_equals_the_simulated_noise(name):
     arm = load_arm(name)
-    report = check_recording(clean_motion(name), arm)
+    report = check_recording(Observations(clean_motion(name), arm))
     white = np.random.default_rng(0).normal(size=(20000, 1)) * EFFORT_NOISE
     passed = float(np.std(low_pass(white, RATE, arm.identification.effort_cut_off)))
     # The noise of coupled joints adds up in actuator coordinates. The first joint has its own motor.
@@ -56,7 +56,9 @@ def test_floor_equals_the_simulated_noise(name):
 @pytest.mark.parametrize("name", ARMS)
 def test_actuator_coordinates_have_the_same_findings(name):
     arm, recording = load_arm(name), clean_motion(name)
-    joint, actuator = (check_recording(r, arm) for r in (recording, recording.in_actuator_coordinates(arm)))
+    joint, actuator = (
+        check_recording(Observations(r, arm)) for r in (recording, recording.in_actuator_coordinates(arm))
+    )
     assert [f.kind for f in joint.findings] == [f.kind for f in actuator.findings]
     for a, b in zip(joint.joints, actuator.joints, strict=True):
         assert a.floor == pytest.approx(b.floor, rel=1e-6)
@@ -116,7 +118,7 @@ def test_poses_have_no_signals():
     recording = poses(arm)
     noise = np.random.default_rng(3).normal(size=recording.tau.shape)
     recording = replace(recording, tau=recording.tau + 1e-3 * noise)
-    report = check_recording(recording, arm)
+    report = check_recording(Observations(recording, arm))
     assert report.kind == "poses"
     assert report.findings == ()
     assert report.joints[1].effort > 0
@@ -137,9 +139,11 @@ def test_warns_of_few_poses():
 def test_warns_of_a_motion_without_times():
     motion = clean_motion("psm")
     rows = replace(motion, t=None, qd=None)
-    assert [finding.kind for finding in check_recording(rows, load_arm("psm")).warnings].count("no times") == 1
+    assert [finding.kind for finding in check_recording(Observations(rows, load_arm("psm"))).warnings].count(
+        "no times"
+    ) == 1
     apart = replace(rows, q=rows.q[::30], tau=rows.measured_effort()[::30], lines=None)
-    assert all(finding.kind != "no times" for finding in check_recording(apart, load_arm("psm")).findings)
+    assert all(finding.kind != "no times" for finding in check_recording(Observations(apart, load_arm("psm"))).findings)
 
 
 def test_refuses_another_number_of_joints():
@@ -159,7 +163,7 @@ def test_motion_without_velocities():
 def test_short_recordings_are_not_refused(rows):
     whole = clean_motion()
     short = replace(whole, q=whole.q[:rows], qd=whole.qd[:rows], tau=whole.tau[:rows], t=whole.t[:rows])
-    assert check_recording(short, load_arm("psm")).refusals == ()
+    assert check_recording(Observations(short, load_arm("psm"))).refusals == ()
 
 
 def test_arm_at_rest_without_efforts():
@@ -180,12 +184,12 @@ def test_lcm_log(tmp_path):
         status.position_commanded, status.effort_commanded = status.position, status.effort_measured
         events.append(event_bytes(LcmEvent(row, status.utime, status_channel(arm), status.encode())))
     (tmp_path / "arm.log").write_bytes(b"".join(events))
-    report = check_recording(read_recording(tmp_path / "arm.log", arm), arm)
+    report = check_recording(Observations(Observations(read_recording(tmp_path / "arm.log", arm)), arm))
     assert report.kind == "motion"
     assert [finding.kind for finding in report.findings] == ["repetition"]
     assert report.period == pytest.approx(PERIOD, abs=1e-3)
     (tmp_path / "cut.log").write_bytes(b"".join(events)[:-10])
-    report = check_recording(read_recording(tmp_path / "cut.log", arm), arm)
+    report = check_recording(Observations(Observations(read_recording(tmp_path / "cut.log", arm)), arm))
     assert {finding.kind for finding in report.findings} == {"reading", "repetition"}
 
 
@@ -224,7 +228,7 @@ def test_motion_with_decreasing_times_is_not_poses(rows):
     motion = clean_motion()
     shuffled = Recording(q=motion.q[rows], tau=motion.tau[rows], qd=motion.qd[rows], t=motion.t[rows])
     with pytest.raises(RecordingError, match="t does not increase"):
-        find_poses(shuffled, load_arm("psm"))
+        Observations(shuffled, load_arm("psm")).poses()
 
 
 def test_units_in_the_headings_of_tables_are_printed():

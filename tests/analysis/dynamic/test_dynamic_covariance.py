@@ -12,7 +12,7 @@ from dvrk_drake.analysis.dynamic.estimates import (
     error_covariance,
     parameter_covariance,
 )
-from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.observations.low_pass import low_pass
 
 pytestmark = pytest.mark.numeric
 

@@ -13,7 +13,7 @@ from recordings import csv_block
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic, motion_problem
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.validation import predict
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -48,7 +48,7 @@ def simulated(name, seed):
 @pytest.fixture(scope="module", params=["mtmr", pytest.param("psm", marks=pytest.mark.slow)])
 def case(request):
     arm, truth, recording = simulated(request.param, 0)
-    return arm, truth, recording, identify_dynamic([recording], arm)
+    return arm, truth, recording, identify_dynamic([Observations(recording, arm)])
 
 
 def test_another_motion_is_predicted_below_the_noise(case):
@@ -56,7 +56,7 @@ def test_another_motion_is_predicted_below_the_noise(case):
     other = recorded(
         truth, fourier_motion(arm, np.random.default_rng(1), 9.0, 18.0, RATE), 0.0, np.random.default_rng(5)
     )
-    validation = validate_motion(result.model, other)
+    validation = validate_motion(result.model, Observations.for_model(other, result.model))
     assert all(a.relative_error < NOISE for a in validation.actuators)
     assert validation.mean_relative_error < NOISE / 3
 
@@ -98,7 +98,10 @@ def test_other_day_intervals_contain_the_change_between_days(case):
     added = np.sqrt(prediction.half_width_other_day**2 - prediction.half_width**2)
     of_joints = np.abs(arm.transmission.matrix.T) ** 2 @ days**2
     np.testing.assert_allclose(added, 1.96 * np.sqrt(of_joints), rtol=1e-3, atol=0)
-    assert all(a.inside <= a.inside_other_day for a in validate_motion(model, recording).actuators)
+    assert all(
+        a.inside <= a.inside_other_day
+        for a in validate_motion(model, Observations.for_model(recording, model)).actuators
+    )
     assert f"{100 * arm.identification.day_deviation[0]:.0f}" in model.interval_scope
     for actuator in (without := copy.deepcopy(model)).dynamics.actuators:
         actuator.rms_between_days = 0.0
@@ -162,13 +165,13 @@ def test_friction_that_depends_on_load_and_position_is_found():
         DriveEffect("actuator.wrist_roll", "position^2 coulomb", float(f"{0.1 * v[6]:.3g}"), 5e-4),
     ]
     truth = true_dynamics(arm, generator, [*friction_everywhere(arm, motion), *added], spread=0.1)
-    result = identify_dynamic([recorded(truth, motion, 0.01, generator)], arm)
+    result = identify_dynamic([Observations(recorded(truth, motion, 0.01, generator), arm)])
     found = {(e.coordinate, e.kind): e for e in result.model.dynamics.effects}
     for effect in added:
         estimate = found[effect.coordinate, effect.kind]
         assert abs(estimate.coefficient - effect.coefficient) < 3 * estimate.standard_error + 0.1 * effect.coefficient
     # The fitted efforts are those of the model, whose loads follow from its own parameters.
-    ours = predict_motion(result.model, recorded(truth, motion, 0.0, generator))
+    ours = predict_motion(result.model, Observations.for_model(recorded(truth, motion, 0.0, generator), result.model))
     (fitted,) = result.motions
     assert np.all(np.std(ours[fitted.grid.inner] - fitted.predicted, axis=0) < 0.01 * np.std(fitted.measured, axis=0))
 
@@ -180,7 +183,7 @@ def test_friction_without_information_is_not_estimated(case):
     at_rest, unmeasured = np.arange(arm.num_joints) == 0, np.arange(arm.num_joints) == arm.num_joints - 1
     q, tau = np.where(at_rest, 0.1, actuators.q), np.where(unmeasured, 0.0, actuators.measured_effort())
     changed = dataclasses.replace(actuators, q=q, qd=None, tau=tau)
-    problem = motion_problem([motion_grid(changed, arm, default_settings(arm))], [tau], [None])
+    problem = motion_problem([Observations(changed, arm)])
     assert np.all(problem.columns.acting) and len(problem.candidates)
     kinds = {(effect.coordinate, effect.kind) for effect in problem.columns.effects}
     first, second, last = (f"actuator.{arm.joint_names[i]}" for i in (0, 1, -1))
@@ -190,10 +193,9 @@ def test_friction_without_information_is_not_estimated(case):
 
 
 def test_loads_of_a_subset_are_those_of_the_motion(case):
-    arm, _, recording, result = case
-    grid = result.motions[0].grid
+    arm, _, recording, _ = case
     effects = [ActuatorEffect(f"actuator.{arm.joint_names[1]}", "load coulomb", 0.1)]
-    problem = motion_problem([grid], [recording.in_actuator_coordinates(arm).measured_effort()], [None], effects)
+    problem = motion_problem([Observations(recording, arm)], effects)
     rows = np.arange(problem.num_rows) % 3 == 0
     loaded = problem.with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
     subset = problem.subset(rows).with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
@@ -225,7 +227,7 @@ def test_model_file_round_trip(case, tmp_path):
     result.model.save(tmp_path / "model.yaml")
     loaded = IdentifiedModel.load(tmp_path / "model.yaml")
     assert loaded.dynamics == result.model.dynamics
-    ours, theirs = (predict_motion(model, recording) for model in (loaded, result.model))
+    ours, theirs = (predict_motion(model, Observations.for_model(recording, model)) for model in (loaded, result.model))
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
     text = (tmp_path / "model.yaml").read_text()
     for old, new, message in (
@@ -290,7 +292,7 @@ def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsy
 def test_actuator_coordinates_give_the_same_dynamic_model(case):
     arm, _, recording, result = case
     mirrored = recording.in_actuator_coordinates(arm)
-    a, b = (validate_motion(result.model, r) for r in (recording, mirrored))
+    a, b = (validate_motion(result.model, Observations.for_model(r, result.model)) for r in (recording, mirrored))
     np.testing.assert_allclose(
         [x.relative_error for x in a.actuators], [x.relative_error for x in b.actuators], rtol=1e-6, atol=0
     )
@@ -312,7 +314,7 @@ def test_plants_and_conversions_are_computed_once(case, monkeypatch):
     monkeypatch.setattr(plant, "make_arm_plant", counted("plants", plant.make_arm_plant))
     monkeypatch.setattr(LinearMap.inverse, "func", counted("inverses", LinearMap.inverse.func))
     monkeypatch.setattr(Arm.effect_coordinates, "func", counted("coordinates", Arm.effect_coordinates.func))
-    identify_dynamic([dataclasses.replace(recording)], new)
+    identify_dynamic([Observations(dataclasses.replace(recording), new)])
     assert made["inverses"] == 1
     assert 1 <= made["plants"] <= 2
     assert 1 <= made["coordinates"] <= 2
@@ -324,9 +326,11 @@ def test_recordings_that_are_not_motions_are_rejected():
     arm = load_arm("mtmr")
     q = np.tile(arm.sample_poses(1, np.random.default_rng(0)), (400, 1))
     with pytest.raises(RecordingError, match="the recording has no times"):
-        identify_dynamic([Recording(q=q, tau=0 * q)], arm)
+        identify_dynamic([Observations(Recording(q=q, tau=0 * q), arm)])
     with pytest.raises(RecordingError, match=r"2\.0 s at 200 Hz. A dynamic model requires"):
-        identify_dynamic([Recording(q=q + np.arange(400)[:, None] * 1e-6, tau=0 * q, t=np.arange(400) / 200)], arm)
+        identify_dynamic(
+            [Observations(Recording(q=q + np.arange(400)[:, None] * 1e-6, tau=0 * q, t=np.arange(400) / 200), arm)]
+        )
 
 
 def test_held_out_efforts_have_the_cross_validated_error(case):

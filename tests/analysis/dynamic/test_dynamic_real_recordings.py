@@ -15,6 +15,7 @@ from recordings import csv_block
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.recalibration import refit_friction
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
@@ -81,7 +82,7 @@ def test_identified_arm_is_consistent_and_can_be_simulated(case):
 
 def test_validation_reproduces_the_fit_error(case):
     _, _, recording, model, _ = case
-    validation = validate_motion(model, recording)
+    validation = validate_motion(model, Observations.for_model(recording, model))
     # The fit is linear in the tilt, and the model omits negligible effects.
     fitted = percent(model, "rms_fit")
     np.testing.assert_allclose([100 * a.relative_error for a in validation.actuators], fitted, rtol=0.02, atol=0)
@@ -150,13 +151,15 @@ def another_day(case, shared_data):
 
 
 def errors(model, recording):
-    return np.array([a.relative_error for a in validate_motion(model, recording).actuators])
+    return np.array(
+        [a.relative_error for a in validate_motion(model, Observations.for_model(recording, model)).actuators]
+    )
 
 
 def test_rigid_body_is_valid_on_another_day(another_day):
     """Wrist cables differ between days. Gravity at the first joints does not."""
     model, other = another_day
-    validation = validate_motion(model, other)
+    validation = validate_motion(model, Observations.for_model(other, model))
     error = np.array([100 * a.relative_error for a in validation.actuators])
     assert np.all(error[:3] <= PUBLISHED["psm"][:3])
     # The wrist friction changed. It is the largest part of the error there, not position or bias.
@@ -173,7 +176,7 @@ def test_recalibration_on_a_third_improves_the_rest(another_day):
             whole, q=whole.q[rows], qd=whole.qd[rows], tau=whole.tau[rows], t=whole.t[rows], lines=None
         )
 
-    result = refit_friction(model, part(slice(None, third)))
+    result = refit_friction(model, Observations.for_model(part(slice(None, third)), model))
     before, after = errors(model, part(slice(third, None))), errors(result.model, part(slice(third, None)))
     assert np.all(before[3:] > 0.2) and np.all(after[3:] < 0.2)
     assert np.all(after < before + 0.005)

@@ -13,7 +13,7 @@ from dvrk_drake.analysis import identification
 from dvrk_drake.analysis.dynamic.dynamic_identification import thinned
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -100,7 +100,8 @@ def test_model_contains_mean_offsets_and_friction(days, result):
     generator = np.random.default_rng(9)
     errors = [
         validate_motion(
-            result.model, recorded(day(truth, effort, factor, offset), motion, 0.0, generator)
+            result.model,
+            Observations.for_model(recorded(day(truth, effort, factor, offset), motion, 0.0, generator), result.model),
         ).mean_relative_error
         for factor, offset in zip(FACTORS, OFFSETS, strict=True)
     ]
@@ -110,7 +111,7 @@ def test_model_contains_mean_offsets_and_friction(days, result):
 def test_held_out_errors_are_errors_on_another_day(days, result, alone, pair):
     _, _, recordings = days
     assert [motion.recording.source for motion in result.motions] == ["day1.csv", "day2.csv", "day3.csv"]
-    expected = validate_motion(pair[1].model, recordings[2])
+    expected = validate_motion(pair[1].model, Observations.for_model(recordings[2], pair[1].model))
     relative = [a.relative_error for a in expected.actuators]
     np.testing.assert_allclose(result.motions[2].held_out_errors, relative, rtol=0.25, atol=0.01)
     # The prediction intervals contain the change between days, so they cover the efforts of another such day.
@@ -265,7 +266,7 @@ def test_recordings_are_thinned_to_similar_rates(days):
     truth, generator = days[0], np.random.default_rng(0)
     motion = fourier_motion(ARM, generator, 10.0, 15.0, RATE)
     slow, fast = (recorded(truth, motion, 0.0, generator, rate) for rate in (100.0, 500.0))
-    grids = thinned([motion_grid(recording, ARM, default_settings(ARM)) for recording in (slow, fast)])
+    grids = thinned([Observations(recording, ARM).grid for recording in (slow, fast)])
     assert [grid.step for grid in grids] == [1, 5]
     assert abs(len(grids[0].inner_rows) - len(grids[1].inner_rows)) < 5
 

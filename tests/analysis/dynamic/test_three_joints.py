@@ -7,6 +7,7 @@ from motions import fourier_motion, true_dynamics
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -51,7 +52,7 @@ def recorded(seed, noise=NOISE):
 
 @pytest.fixture(scope="module")
 def result():
-    return identify_dynamic([recorded(1)], ARM)
+    return identify_dynamic([Observations(recorded(1), ARM)])
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def folder(tmp_path_factory):
 
 
 def test_another_motion_is_predicted_below_the_noise(result):
-    validation = validate_motion(result.model, recorded(2, noise=0.0))
+    validation = validate_motion(result.model, Observations.for_model(recorded(2, noise=0.0), result.model))
     assert all(a.relative_error < NOISE for a in validation.actuators)
 
 
@@ -89,7 +90,8 @@ def test_commands_end_to_end(folder, capsys):
     prediction = folder / "tau.csv"
     assert main(["predict", f"{folder}/two.csv", "--model", f"{folder}/model.yaml", "--output", str(prediction)]) == 0
     units = ("1 [N m]", "2 [N m]", "3 [N]")
-    efforts = [f"{name}{unit}" for name in ("tau", "lower", "upper") for unit in units]
+    intervals = ("lower", "upper", "lower_other_day", "upper_other_day")
+    efforts = [f"{name}{unit}" for name in ("tau", *intervals) for unit in units]
     assert prediction.read_text().splitlines()[0].split(",") == ["t [s]", *efforts, "coordinates", "arm"]
 
 
@@ -136,5 +138,10 @@ def test_real_recordings_of_two_arms(shared_data):
         pytest.skip(f"needs the recordings {data}")
     arm = lock_joints(load_arm("psm"), dict.fromkeys(WRIST, 0.0))
     for fitted, other, worst in (("psm1_2", "psm1_3", 0.15), ("psm2_1", "psm2_2", 0.15)):
-        model = identify_dynamic([read_recording(data / f"{fitted}.csv", arm)], arm).model
-        assert validate_motion(model, read_recording(data / f"{other}.csv", arm)).mean_relative_error < worst
+        model = identify_dynamic([Observations(read_recording(data / f"{fitted}.csv", arm), arm)]).model
+        assert (
+            validate_motion(
+                model, Observations.for_model(read_recording(data / f"{other}.csv", arm), model)
+            ).mean_relative_error
+            < worst
+        )

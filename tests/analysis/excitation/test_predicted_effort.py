@@ -14,6 +14,7 @@ from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
+from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.plant import holding_torques, inverse_dynamics
@@ -95,7 +96,7 @@ def test_second_motion_adds_more_information():
     truth = true_dynamics(arm, rng, friction_everywhere(arm, (t, *moves), 0.15))
     t = np.arange(15_000) / 1000
     repeated = replace(first.motion, repetitions=3).evaluate(t)[:3]
-    model = identify_dynamic([recorded(truth, (t, *repeated), 0.05, rng)], arm).model
+    model = identify_dynamic([Observations(recorded(truth, (t, *repeated), 0.05, rng), arm)]).model
     second = dvrk.design_excitation(arm, model=model, **options)
     information = MotionInformation(arm.with_gravity(model.arm.gravity), limits, model)
     again = state_of(first.motion, 24)

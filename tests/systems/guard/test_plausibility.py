@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, Bench, Heavy, Inert, N, Q, Weightless
 
-from dvrk_drake.analysis.signals.true_time import true_time
+from dvrk_drake.analysis.observations.true_time import true_time
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status

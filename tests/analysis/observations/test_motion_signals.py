@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.signals.drive_efforts import refuse_opposite_efforts
-from dvrk_drake.analysis.signals.effort_lag import CUT_OFF, effort_lag
-from dvrk_drake.analysis.signals.motion_grid import MotionSignals, motion_signals
-from dvrk_drake.analysis.signals.true_time import increasing_times, repeated_rows, true_time, velocity_agreement
+from dvrk_drake.analysis.observations.drive_efforts import refuse_opposite_efforts
+from dvrk_drake.analysis.observations.effort_lag import CUT_OFF, effort_lag
+from dvrk_drake.analysis.observations.motion_grid import MotionSignals, motion_signals
+from dvrk_drake.analysis.observations.true_time import increasing_times, repeated_rows, true_time, velocity_agreement
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
@@ -105,7 +105,7 @@ def test_times_that_do_not_increase_are_rejected():
 def test_signals_reproduce_the_motion(velocities):
     recording = recorded(np.arange(3000) / RATE)
     qd = {"right": recording.qd, "none": None, "of the wrong sign": -recording.qd}[velocities]
-    signals = motion_signals(replace(recording, qd=qd), 20.0)
+    signals = motion_signals(replace(recording, qd=qd), true_time(replace(recording, qd=qd)), 20.0)
     assert signals.rate == pytest.approx(400.0)
     q, v, vd = motion(signals.t)
     inner = slice(400, -400)
@@ -116,7 +116,7 @@ def test_signals_reproduce_the_motion(velocities):
     assert np.all(signals.differentiated == (velocities != "right"))
     np.testing.assert_array_equal(signals.rows, np.arange(3000))
     with pytest.raises(RecordingError, match="has no efforts"):
-        motion_signals(replace(recording, tau=None), 20.0)
+        motion_signals(replace(recording, tau=None), true_time(replace(recording, tau=None)), 20.0)
 
 
 # Efforts

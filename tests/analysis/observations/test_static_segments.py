@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from static_poses import motion_with_pauses
 
-from dvrk_drake.analysis.signals.static_segments import (
-    find_poses,
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.static_segments import (
     smooth_velocity,
     static_poses,
     stationary_runs,
@@ -69,15 +69,15 @@ def test_poses_and_short_recordings_have_no_segments():
 
 def test_poses_are_extracted_or_unchanged():
     poses, recording = moving(count=12)
-    found = find_poses(recording, ARM)
+    found = Observations(recording, ARM).poses()
     np.testing.assert_allclose(found.recording.q, poses, atol=1e-3)
     assert "found in the motion: 12" in found.note and not found.moves
-    few = find_poses(moving(count=3)[1], ARM)
+    few = Observations(moving(count=3)[1], ARM).poses()
     assert few.moves and few.measured is None and len(few.recording) > 100
-    slow = find_poses(moving(count=3)[1], ARM, with_low_speed_segments=True)
+    slow = Observations(moving(count=3)[1], ARM).poses(with_low_speed_segments=True)
     assert np.all(slow.measured.sum(axis=1) == 1) and slow.note
     table = Recording(q=poses, tau=np.zeros_like(poses))
-    assert find_poses(table, ARM).recording is table
+    assert Observations(table, ARM).poses().recording is table
 
 
 def test_motion_with_decreasing_times_is_rejected():
@@ -85,4 +85,4 @@ def test_motion_with_decreasing_times_is_rejected():
     t = recording.t.copy()
     t[150] = t[148]
     with pytest.raises(RecordingError, match="row 151: time t does not increase"):
-        find_poses(replace(recording, t=t), ARM)
+        Observations(replace(recording, t=t), ARM).poses()

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
-from dvrk_drake.analysis.signals.repetition import find_period, motion_floor, repeatability_floor
+from dvrk_drake.analysis.observations.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import find_period, motion_floor, repeatability_floor
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 
@@ -55,7 +55,7 @@ def test_lost_rows_do_not_change_the_repeatability():
     whole = Recording(q, arm.effort_limits * (0.2 * np.cos(phase) + 0.002 * noise), t=t, coordinates="actuator")
     floors = []
     for recording in (whole, whole.select(np.delete(np.arange(1000), [300, 666]))):
-        grid = motion_grid(recording, arm, default_settings(arm))
+        grid = Observations(recording, arm).grid
         floors.append(motion_floor(recording.tau, grid, 5.0))
     # Two interpolated rows hardly change an RMS value of 1000 rows.
     np.testing.assert_allclose(floors[1], floors[0], rtol=0.1, atol=1e-6)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.analysis.signals.low_pass import correlation, low_pass, resample
-from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
+from dvrk_drake.analysis.observations.low_pass import correlation, low_pass, resample
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 
 #: Largest difference D(T) of the positions of a motion that repeats after the period T, see `find_period`.
 SAME_MOTION = 0.1
@@ -120,11 +120,6 @@ def correlation_of(errors: NDArray[np.float64]) -> NDArray[np.float64]:
     correlation = unit.T @ unit
     np.fill_diagonal(correlation, 1.0)
     return np.asarray(correlation)
-
-
-def period_of(grid: MotionGrid) -> float | None:
-    """Returns the period of the motion [s] in its longest segment, or None if the motion does not repeat."""
-    return find_period(grid.arm.transmission.position(grid.longest_segment.q), GRID_RATE)
 
 
 def phase_folds(

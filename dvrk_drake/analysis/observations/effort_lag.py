@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.signals.motion_grid import MotionSignals
+from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.observations.motion_grid import MotionSignals
 
 #: Cut-off of the low-pass filter for efforts and regressor columns [Hz].
 CUT_OFF = 20.0

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.signals.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS

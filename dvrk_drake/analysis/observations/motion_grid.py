@@ -8,19 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.analysis.signals.low_pass import central_difference, low_pass, resample
-from dvrk_drake.analysis.signals.true_time import TrueTime, increasing_times, true_time, velocity_agreement
+from dvrk_drake.analysis.observations.low_pass import central_difference, low_pass, resample
+from dvrk_drake.analysis.observations.true_time import TrueTime, velocity_agreement
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
-from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import MAX_LOST, MIN_RATE, Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Rate of the time grid [Hz], high enough to resolve hysteresis when a joint reverses its direction.
 GRID_RATE = 400.0
 #: Duration that is omitted at each end because of filter transients [s].
 ENDS = 1.0
-#: Smallest accepted duration of a motion, and of each of its segments between gaps [s].
-MIN_DURATION, MIN_SEGMENT = 5.0, 3.0
+#: Smallest accepted duration of a segment of a motion between gaps [s].
+MIN_SEGMENT = 3.0
 #: Number of rows in one part of `MotionGrid.parts`.
 PART_ROWS = 10_000
 #: Additional rows at both ends of a part, in periods of the effort filter's cut-off. A filter transient decays by a
@@ -59,27 +58,31 @@ class MotionSignals:
 
 
 def motion_signals(
-    recording: Recording, acceleration_cut_off: ArrayLike, *, cut_off: float = 50.0, rate: float = GRID_RATE
+    recording: Recording,
+    clock: TrueTime,
+    acceleration_cut_off: ArrayLike,
+    *,
+    cut_off: float = 50.0,
+    rate: float = GRID_RATE,
 ) -> MotionSignals:
     """Resamples a motion at a constant rate and computes velocities and accelerations.
 
-    Rows that repeat the previous row are omitted, and the times of the other rows are corrected (`true_time`). The
-    signals are then interpolated at `rate`, and q and v are filtered at `cut_off`. The acceleration vd is the central
-    difference of v, filtered at `acceleration_cut_off`.
+    Rows that repeat the previous row are omitted. The signals are interpolated at `rate`, and q and v are filtered at
+    `cut_off`. The acceleration vd is the central difference of v, filtered at `acceleration_cut_off`.
 
     Args:
         recording: Motion with t and tau, in the coordinates of the result.
+        clock: True times of the rows of the recording.
         acceleration_cut_off: Cut-off of the zero-phase low-pass filter for vd [Hz], a scalar or one value (n,) per
             joint.
         cut_off: Cut-off of the filter for q and v [Hz].
         rate: Rate of the grid [Hz].
 
     Raises:
-        RecordingError: The recording has no efforts, or its times do not increase.
+        RecordingError: The recording has no efforts.
     """
-    clock = true_time(recording)
     tau = recording.measured_effort()[clock.rows]
-    t = _even_times(clock, rate)
+    t = even_times(clock, rate)
     q = low_pass(resample(clock.t, recording.q[clock.rows], t), rate, cut_off)
     v = central_difference(q, rate)
     agrees = np.zeros(q.shape[1], dtype=bool)
@@ -91,7 +94,8 @@ def motion_signals(
     return MotionSignals(t, q, v, vd, resample(clock.t, tau, t), clock.rows, clock.t, ~agrees)
 
 
-def _even_times(clock: TrueTime, rate: float) -> NDArray[np.float64]:
+def even_times(clock: TrueTime, rate: float) -> NDArray[np.float64]:
+    """Returns times at a constant rate [Hz], from the first to the last true time [s]."""
     return clock.t[0] + np.arange(int((clock.t[-1] - clock.t[0]) * rate) + 1) / rate
 
 
@@ -222,101 +226,3 @@ class MotionGrid:
         positions = self.efforts_at_rows(self.arm.transmission.position(self.q))
         velocities = self.efforts_at_rows(self.arm.transmission.velocity(self.v))
         return self.row_times[self.inner], positions[self.inner], velocities[self.inner]
-
-
-def default_settings(arm: Arm) -> SignalSettings:
-    """Returns the signal settings of the arm file."""
-    motion = arm.identification
-    return SignalSettings(
-        acceleration_cut_off=list(motion.acceleration_cut_off),
-        effort_cut_off=arm.identification.effort_cut_off,
-        effort_delay=list(motion.effort_delay),
-    )
-
-
-def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock: TrueTime | None = None) -> MotionGrid:
-    """Resamples a motion to the grid.
-
-    Positions are filtered and differentiated in actuator coordinates, because each actuator has its own encoder and
-    cut-off. Recorded velocities are used only to estimate the true times of the rows, see `true_time`. The segments
-    between gaps are resampled and filtered separately.
-
-    Args:
-        recording: Motion with t and efforts, in joint or actuator coordinates.
-        arm: Arm that was recorded.
-        settings: Cut-offs of the filters and delays of the efforts.
-        clock: Result of `true_time` for the recording in actuator coordinates. None: computed by this function.
-
-    Raises:
-        RecordingError: The recording does not match the arm, has no times, is too short, or its rate is too low.
-    """
-    recording.check_fits(arm)
-    channels = np.eye(arm.num_joints) if recording.tau is None else recording.measured_channels(arm)
-    recording = recording.in_actuator_coordinates(arm)
-    increasing_times(recording)
-    rows = recording.segments()
-    clocks = [clock or true_time(recording)] if len(rows) == 1 else [true_time(recording.select(own)) for own in rows]
-    _check_duration(clocks, rows, recording)
-    grids = []
-    for own, times in zip(rows, clocks, strict=True):
-        segment = recording if len(rows) == 1 else recording.select(own)
-        grids.append(_segment_grid(segment, times, arm, settings, channels))
-    if len(grids) == 1:
-        return grids[0]
-    whole = TrueTime(
-        np.concatenate([own.start + times.rows for own, times in zip(rows, clocks, strict=True)]),
-        np.concatenate([times.t for times in clocks]),
-        max(times.jitter for times in clocks),
-        any(times.reconstructed for times in clocks),
-    )
-    rate = sum(len(g.row_times) - 1 for g in grids) / sum((len(g.row_times) - 1) / g.rate for g in grids)
-    # The rates of the segments of one recording differ only by lost rows.
-    segments = tuple(replace(g, rate=rate) for g in grids)
-    t, q, v, vd, row_times = (
-        np.concatenate([getattr(g, name) for g in grids]) for name in ("t", "q", "v", "vd", "row_times")
-    )
-    return MotionGrid(arm, settings, t, q, v, vd, row_times, rate, whole, channels, segments=segments)
-
-
-def _check_duration(clocks: list[TrueTime], rows: list[slice], recording: Recording) -> None:
-    """Raises RecordingError if a motion or one of its segments between gaps is too short, or the rate is too low."""
-    durations = [float(times.t[-1] - times.t[0]) for times in clocks]
-    total = sum(durations)
-    rate = (len(recording) - len(rows)) / total if total > 0 else 0.0
-    source = recording.source or "recording"
-    if total < MIN_DURATION or rate < (1 - MAX_LOST) * MIN_RATE:
-        gaps = f", in {len(rows)} segments between gaps of t" if len(rows) > 1 else ""
-        raise RecordingError(
-            f"{source}: the motion lasts {total:.1f} s at {rate:.3g} Hz{gaps}. A dynamic model requires at least "
-            f"{MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
-        )
-    if min(durations) < (MIN_SEGMENT if len(rows) > 1 else 0.0):
-        k = int(np.argmin(durations))
-        raise RecordingError(
-            f"{recording.where(rows[k].start)}: only {durations[k]:.3g} s of motion between two gaps of t; required: "
-            f"{MIN_SEGMENT:g} s. Remove these {rows[k].stop - rows[k].start} rows."
-        )
-
-
-def _segment_grid(
-    recording: Recording, clock: TrueTime, arm: Arm, settings: SignalSettings, channels: NDArray[np.float64]
-) -> MotionGrid:
-    """Resamples a motion without gaps, in actuator coordinates."""
-    t = _even_times(clock, GRID_RATE)
-    raw = resample(clock.t, recording.q[clock.rows], t)
-    a = low_pass(raw, GRID_RATE, settings.position_cut_off)
-    slow = low_pass(raw, GRID_RATE, settings.acceleration_cut_off)
-    to_joint = arm.transmission.inverse
-    last = np.searchsorted(clock.rows, np.arange(len(recording)), side="right") - 1
-    return MotionGrid(
-        arm=arm,
-        settings=settings,
-        t=t,
-        q=to_joint.position(a),
-        v=to_joint.velocity(central_difference(a, GRID_RATE)),
-        vd=to_joint.velocity(central_difference(central_difference(slow, GRID_RATE), GRID_RATE)),
-        row_times=clock.t[np.maximum(last, 0)],
-        rate=(len(recording) - 1) / float(clock.t[-1] - clock.t[0]),
-        clock=clock,
-        channels=channels,
-    )

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.signals.motion_faults import MotionFault, jump_fault, source_fault, time_fault
-from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
-from dvrk_drake.errors import IdentificationError, RecordingError
+from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.static.static_identification import average_repeated_poses
+from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Recording
 
@@ -221,76 +220,3 @@ def _segments_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm:
             segments.append(run)
             means = np.vstack([means, q])
     return segments
-
-
-#: Note for models identified from low-speed segments.
-LOW_SPEED_NOTE = (
-    "Low-speed segments are treated as static poses. The torques of these segments contain friction, and other joints "
-    "may move. Evaluate the model by the cross-validated errors or on another recording, not by the errors of the fit."
-)
-
-
-class Poses(NamedTuple):
-    """Result of `find_poses`.
-
-    Attributes:
-        recording: Recording with one row per extracted pose, or the unchanged recording.
-        measured: Mask (m, n) of the efforts that are holding torques, None if all efforts are holding torques.
-        note: Note on how poses were extracted from a motion, "" if no poses were extracted.
-        moves: True if the recording is a motion with too few static poses, which is suitable for dynamic identification
-            only.
-    """
-
-    recording: Recording
-    measured: NDArray[np.bool_] | None
-    note: str
-    moves: bool = False
-
-
-def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = False) -> Poses:
-    """Extracts the static poses of a motion, or returns the recording unchanged if there are fewer than `MIN_POSES`.
-
-    Args:
-        recording: Poses or a motion, in joint or actuator coordinates.
-        arm: Arm that was recorded.
-        with_low_speed_segments: True to extract low-speed segments if a motion has too few static poses.
-
-    Raises:
-        RecordingError: The recording does not match the arm, has no efforts, or is a motion with decreasing times or
-            with a fault (`source_fault`, `time_fault`, `jump_fault`).
-        IdentificationError: Low-speed segments are requested, but there are none.
-    """
-    fault = source_fault(recording, arm)
-    if fault is None:
-        recording.check_fits(arm)
-        _check_times(recording, arm)
-        fault = time_fault(recording, arm)
-    if fault is not None:
-        raise _refusal(recording, fault)
-    poses = static_poses(recording, arm)
-    if poses is not None and len(poses) >= MIN_POSES:
-        return Poses(poses, None, f"Static poses found in the motion: {len(poses)}, in {len(recording)} rows.")
-    # The arm may move between static poses without being recorded.
-    if (fault := jump_fault(recording, arm)) is not None:
-        raise _refusal(recording, fault)
-    if with_low_speed_segments:
-        return Poses(*low_speed_segments(recording, arm), note=LOW_SPEED_NOTE)
-    return Poses(recording, None, "", moves=poses is not None and bool(recording.motion(arm)))
-
-
-def _refusal(recording: Recording, fault: MotionFault) -> RecordingError:
-    source = recording.source or "recording"
-    return RecordingError(f"{source}: refused: {fault.where}: {fault.what}. {fault.advice}")
-
-
-def _check_times(recording: Recording, arm: Arm) -> None:
-    """Rejects a motion whose times do not increase. Without this check, it would be treated as poses."""
-    t = recording.t
-    if t is None or len(t) < MIN_ROWS or recording.has_increasing_times:
-        return
-    if recording.is_motion or recording.motion(arm):
-        row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
-        raise RecordingError(
-            f"{recording.where(row)}: time t does not increase. Sort the rows by time, and use the times of one clock "
-            "[s]."
-        )

@@ -1,16 +1,16 @@
 """Resampling of known motions to a grid, folds, and predicted efforts."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from motions import friction_everywhere, true_dynamics
 
-import dvrk_drake.analysis.signals.motion_grid as motion_grid_module
-from dvrk_drake.analysis.signals.drive_efforts import drive_efforts
-from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, default_settings, motion_grid
-from dvrk_drake.analysis.signals.repetition import FOLDS, GAP, period_of, phase_folds
+import dvrk_drake.analysis.observations.motion_grid as motion_grid_module
+from dvrk_drake.analysis.observations.drive_efforts import drive_efforts
+from dvrk_drake.analysis.observations.motion_grid import GRID_RATE
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.repetition import FOLDS, GAP, phase_folds
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
@@ -38,8 +38,13 @@ def recorded(seconds=12.0, rate=200.0):
 
 
 @pytest.fixture(scope="module")
-def grid():
-    return motion_grid(recorded(), ARM, default_settings(ARM))
+def observations():
+    return Observations(recorded(), ARM)
+
+
+@pytest.fixture(scope="module")
+def grid(observations):
+    return observations.grid
 
 
 def test_grid_reproduces_the_motion(grid):
@@ -53,7 +58,7 @@ def test_grid_reproduces_the_motion(grid):
 
 
 def test_parts_give_the_filtered_values_of_the_whole_motion(grid, monkeypatch):
-    thinned = replace(motion_grid(recorded(40.0), ARM, default_settings(ARM)), step=3)
+    thinned = replace(Observations(recorded(40.0), ARM).grid, step=3)
     monkeypatch.setattr(motion_grid_module, "PART_ROWS", 1500)
     parts = list(thinned.parts())
     assert len(parts) == 5
@@ -69,7 +74,7 @@ def test_parts_give_the_filtered_values_of_the_whole_motion(grid, monkeypatch):
 
 
 def test_actuator_coordinates_give_the_same_grid(grid):
-    other = motion_grid(recorded().in_actuator_coordinates(ARM), ARM, default_settings(ARM))
+    other = Observations(recorded().in_actuator_coordinates(ARM), ARM).grid
     np.testing.assert_allclose(other.q, grid.q, atol=1e-9)
     np.testing.assert_allclose(other.vd, grid.vd, atol=1e-6)
 
@@ -88,14 +93,14 @@ def test_predicted_efforts_have_the_effort_delay(grid):
 @pytest.mark.parametrize(("seconds", "rate"), [(4.9, 200.0), (12.0, 45.0)])
 def test_short_and_coarse_motions_are_rejected(seconds, rate):
     with pytest.raises(RecordingError, match=rf"motion\.csv: .* {seconds} s at {rate:g} Hz. .* at least 5 s"):
-        motion_grid(recorded(seconds, rate), ARM, default_settings(ARM))
+        _ = Observations(recorded(seconds, rate), ARM).grid
 
 
 # Folds
 
 
-def test_folds_of_a_periodic_motion_follow_the_phase(grid):
-    assert period_of(grid) == pytest.approx(PERIOD, abs=1e-3)
+def test_folds_of_a_periodic_motion_follow_the_phase(observations, grid):
+    assert observations.period == pytest.approx(PERIOD, abs=1e-3)
     fold, edge = phase_folds(grid, PERIOD)
     t = grid.row_times[grid.inner]
     # With 200 rows per second and 800 per period, a row and the row one period later are in the same fold.
@@ -113,9 +118,9 @@ def test_folds_of_an_aperiodic_motion_are_contiguous(grid):
     fold, _ = phase_folds(grid, None, 5)
     assert np.all(np.diff(fold) >= 0)
     np.testing.assert_allclose(np.bincount(fold), len(fold) / 5, atol=1)
-    slow = SimpleNamespace(arm=ARM, q=np.linspace(0, 1, 4000)[:, None] * np.ones(N))
-    slow.longest_segment = slow
-    assert period_of(slow) is None
+    slow = Observations(recorded(), ARM)
+    slow.grid = replace(grid, q=np.linspace(0, 1, 4000)[:, None] * np.ones(N))
+    assert slow.period is None
 
 
 # Efforts

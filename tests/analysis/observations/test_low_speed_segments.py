@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from static_poses import RATE, motion_with_pauses
 
-from dvrk_drake.analysis.signals.static_segments import SAME_REST, find_poses, low_speed_segments, static_poses
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.static_segments import SAME_REST, low_speed_segments, static_poses
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, identify_static
 from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.cli import main
@@ -89,7 +90,7 @@ def test_static_segments_are_poses_of_all_joints(arm, rate, with_speeds):
     np.testing.assert_allclose(rests.q, poses, atol=1e-4)
     truth = IdentifiedModel.from_arm(arm).holding_torque(poses)
     assert np.all(np.abs(rests.tau - truth) < 1e-3 * arm.effort_limits)
-    found = find_poses(recording, arm)
+    found = Observations(recording, arm).poses()
     assert found.measured is None
     assert found.note == f"Static poses found in the motion: 12, in {len(recording)} rows."
 
@@ -99,8 +100,8 @@ def test_recording_without_static_segments_is_unchanged(arm):
     poses = arm.sample_poses(12, generator, margin=0.1)
     moving = motion_with_pauses(arm, poses, generator, rest=0.0)
     assert len(static_poses(moving, arm)) == 0
-    assert find_poses(moving, arm).recording is moving
-    assert find_poses(moving, arm, with_low_speed_segments=True).measured.sum(axis=1).max() == 1
+    assert Observations(moving, arm).poses().recording is moving
+    assert Observations(moving, arm).poses(with_low_speed_segments=True).measured.sum(axis=1).max() == 1
     assert static_poses(replace(moving, t=None, qd=None), arm) is None
     assert static_poses(replace(moving, t=0.1 * np.arange(len(moving))), arm) is None
 

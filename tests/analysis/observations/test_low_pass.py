@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.signals.low_pass import ORDER, central_difference, correlation, low_pass, resample
+from dvrk_drake.analysis.observations.low_pass import ORDER, central_difference, correlation, low_pass, resample
 
 pytestmark = pytest.mark.numeric
 
