@@ -61,21 +61,29 @@ class FittedMotion:
     """Efforts of one recording in an identification, at r rows. One second at each end is omitted.
 
     Attributes:
-        recording: Motion as recorded.
-        grid: Resampled motion.
-        period: Period of the motion [s], or None if the motion does not repeat.
+        observations: Motion as recorded, and its preparation.
+        grid: Resampled motion, thinned out if it is long.
         measured: Measured efforts (r, n) after low-pass filtering, see `MotionGrid.channels` [N m, N].
         predicted: Predicted efforts (r, n), after the same low-pass filter [N m, N].
         held_out: Efforts (r, n) that cross-validation predicts for the rows of each held-out fold [N m, N]. If there is
             more than one recording, the fold is the whole recording.
     """
 
-    recording: Recording
+    observations: Observations
     grid: MotionGrid
-    period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
     held_out: NDArray[np.float64]
+
+    @property
+    def recording(self) -> Recording:
+        """Motion as recorded."""
+        return self.observations.recording
+
+    @property
+    def period(self) -> float | None:
+        """Period of the motion [s], or None if the motion does not repeat."""
+        return self.observations.period
 
     @property
     def held_out_errors(self) -> NDArray[np.float64]:
@@ -141,7 +149,7 @@ def identify_dynamic(
     parts = [np.flatnonzero(problem.recording == i) for i in range(len(recordings))]
     rows = [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
     motions = tuple(
-        FittedMotion(observed.recording, grid, observed.period, measured[own], predicted[own], held_out[own])
+        FittedMotion(observed, grid, measured[own], predicted[own], held_out[own])
         for observed, grid, own in zip(observations, problem.grids, rows, strict=True)
     )
     for motion in motions:

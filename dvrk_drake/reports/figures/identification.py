@@ -49,7 +49,7 @@ def plot_identification(folder: Path, result: Identification) -> None:
             # Each recording after the first one has its own folder.
             own = folder if k == 0 else folder / str(k + 1)
             own.mkdir(exist_ok=True)
-            plot_motion(own, validate_motion(result.model, motion.recording), held_out=motion.held_out)
+            plot_motion(own, validate_motion(result.model, motion.observations), held_out=motion.held_out)
     elif isinstance(result, StaticIdentification):
         plot_static_identification(folder, result)
 

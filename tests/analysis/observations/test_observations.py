@@ -31,7 +31,7 @@ def calls(monkeypatch):
     return counts
 
 
-class Prepared(Exception):
+class PreparedError(Exception):
     """The recording is prepared."""
 
 
@@ -40,12 +40,13 @@ def test_a_recording_is_prepared_once(calls, monkeypatch):
     recording = dvrk.read_recording(SAMPLES_FOLDER / "psm_motion.csv", arm).select(slice(3000))
 
     def stop(*_):
-        raise Prepared
+        raise PreparedError
 
-    # Hypotheses about exchanged and inverted channels are other recordings.
-    monkeypatch.setattr("dvrk_drake.analysis.check.channel_check._hypotheses", lambda *_: [])
+    # Hypotheses about exchanged and inverted channels are other recordings. The other two only need time.
+    for name in ("_hypotheses", "_scales", "_offsets"):
+        monkeypatch.setattr(f"dvrk_drake.analysis.check.channel_check.{name}", lambda *_: [])
     monkeypatch.setattr("dvrk_drake.analysis.dynamic.dynamic_identification.dynamic_columns", stop)
-    with pytest.raises(Prepared):
+    with pytest.raises(PreparedError):
         dvrk.identify(recording, arm)
     assert calls == dict.fromkeys([*PREPARATIONS, "grid"], 1)
     calls.clear()
