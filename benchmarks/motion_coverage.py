@@ -82,7 +82,7 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     problem = motion_problem([observations], truth.effects)
     chosen = np.arange(len(truth.effects))
     selection = problem.selection()
-    selection.fit(chosen)
+    selection.fit_with(chosen)
     fit = problem.consistent(chosen, selection.weights)
     residual = problem.columns.tau - problem.predict(chosen, fit.x)
     cut_off = grid.settings.effort_cut_off

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from dvrk_drake.analysis.static.linear_fit import blocks
+from dvrk_drake.analysis.estimation.robust_fit import blocks
 from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
+from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.observations.drive_efforts import (
     FRICTION_PARTS,
     FrictionPart,
@@ -32,8 +33,6 @@ FOLDS = 4
 #: Prior standard deviations. The first is that of a friction factor, with prior mean 1. The second is that of the
 #: change of an offset, as a share of the RMS effort, with prior mean 0.
 SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
-#: Assumed RMS residual of the fit, as a share of the RMS effort.
-_RELATIVE_ERROR = 0.1
 #: Assumed correlation time of the residuals [s]. Residuals are correlated because they are mainly model errors.
 _CORRELATION_TIME = 0.1
 #: Duration of a block whose residuals are assumed to be independent of those of other blocks [s], see
@@ -171,7 +170,7 @@ def refit_friction(model: IdentifiedModel, observations: Observations) -> Recali
             f"{100 * np.mean(after):.0f} % with fitted friction ({100 * np.mean(before):.0f} % before); at most "
             f"{100 * MAX_ERROR:.0f} % is allowed. Check the arm and the coordinates of the recording."
         )
-    x = fit.solve(free, np.ones(len(fit.tau), dtype=bool))
+    x = fit.solve(free)
     actuators = []
     for i, name in enumerate(fit.names):
         reason = "" if free[i] else "error not reduced" if excited[i] else "no motion in both directions"
@@ -242,10 +241,21 @@ class _Fit:
         self._fold, self._edge = phase_folds(grid, observations.period, folds)
         self.excited = _moves_in_both_directions(model, grid) & self.measured
         self.unchanged = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
+        k, n = len(self.keys), len(self.names)
         size = np.where(self.measured, np.sqrt(np.mean(self.tau**2, axis=0)), 1.0)
-        self._deviation = np.concatenate([np.full(len(self.keys), SCALE_DEVIATION), OFFSET_DEVIATION * size])
+        self._deviation = np.concatenate([np.full(k, SCALE_DEVIATION), OFFSET_DEVIATION * size])
+        columns = []
+        for i in range(n):
+            own = np.flatnonzero(self._loads[:, i])
+            columns.append((np.append(own, k + i), np.column_stack([self.friction[:, i, own], np.ones(len(self.tau))])))
         # Rows within the correlation time are not independent.
-        self._weight = self.measured / (_RELATIVE_ERROR * size) ** 2 / (self.rate * _CORRELATION_TIME)
+        independent = np.bincount(self._fold) / (self.rate * _CORRELATION_TIME)
+        self._estimator = Estimator(
+            NormalEquations.of(columns, k + n, self.tau - self.other, self._fold, self._edge),
+            Prior(self.unchanged, self._deviation**-2.0, np.arange(k + n) < k),
+            np.array([np.sum(self.tau[self._fold == fold] ** 2, axis=0) for fold in range(folds)]),
+            np.outer(independent, np.ones(n)),
+        )
 
     def error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the relative errors (n,) for x (k + n,)."""
@@ -259,10 +269,7 @@ class _Fit:
         residuals = np.empty_like(self.tau)
         for fold in range(self._folds):
             held_out = self._fold == fold
-            adjacent = (self._edge[:, 0] & (self._fold == (fold + 1) % self._folds)) | (
-                self._edge[:, 1] & (self._fold == (fold - 1) % self._folds)
-            )
-            residuals[held_out] = self._residuals(self.solve(free, ~held_out & ~adjacent))[held_out]
+            residuals[held_out] = self._residuals(self.solve(free, fold))[held_out]
         return residuals
 
     def _residuals(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -295,9 +302,9 @@ class _Fit:
             held_out: Residuals (r, n) of held-out folds [N m, N].
         """
         k, fixed = len(self.keys), self._fixed(free)
-        H, P = self._information(np.ones(len(self.tau), dtype=bool))[0], np.diag(self._deviation**-2.0)
-        block = self._blocks()
-        scores = np.hstack([np.einsum("rik,ri->rk", self.friction, self._weight * held_out), self._weight * held_out])
+        H, P = self._estimator.information(), np.diag(self._deviation**-2.0)
+        block, weighted = self._blocks(), self._estimator.weights[0] * held_out
+        scores = np.hstack([np.einsum("rik,ri->rk", self.friction, weighted), weighted])
         of_blocks = np.array([np.sum(scores[block == b], axis=0) for b in range(block[-1] + 1)])
         A = np.linalg.inv(H[np.ix_(~fixed, ~fixed)])
         middle = (of_blocks.T @ of_blocks + P)[np.ix_(~fixed, ~fixed)]
@@ -316,32 +323,15 @@ class _Fit:
     def _fixed(self, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
 
-    def _information(self, rows: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the Hessian H (k + n, k + n) of half the cost and the right-hand side b of H x = b."""
-        n = len(self.names)
-        H, b = np.diag(self._deviation**-2.0), self.unchanged / self._deviation**2
-        for i in range(n):
-            X = np.hstack([self.friction[rows, i], np.tile(np.eye(n)[i], (int(np.sum(rows)), 1))])
-            H += self._weight[i] * X.T @ X
-            b += self._weight[i] * X.T @ (self.tau - self.other)[rows, i]
-        return H, b
-
-    def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Returns x (k + n,), fitted to some rows of the motion.
+    def solve(self, free: NDArray[np.bool_], without_fold: int | None = None) -> NDArray[np.float64]:
+        """Returns x (k + n,), fitted to all rows, or to those outside a fold.
 
         Args:
             free: Mask (n,) of the actuators whose friction and offset are fitted. The friction at a coordinate is
                 fitted only if all actuators that move the coordinate are in the mask.
-            rows: Mask (r,) of the rows.
+            without_fold: Index of the fold that is not used.
         """
-        k, n, fixed = len(self.keys), len(self.names), self._fixed(free)
-        H, b = self._information(rows)
-        x = self.unchanged.copy()
-        R = np.linalg.cholesky(H[np.ix_(~fixed, ~fixed)]).T
-        right = b[~fixed] - H[np.ix_(~fixed, fixed)] @ x[fixed]
-        lower = np.concatenate([np.zeros(k), np.full(n, -np.inf)])[~fixed]
-        x[~fixed] = lsq_linear(R, np.linalg.solve(R.T, right), bounds=(lower, np.inf)).x if len(right) else []
-        return x
+        return self._estimator.solve(np.flatnonzero(~self._fixed(free)), without_fold)
 
     def scale(self, x: NDArray[np.float64], coordinate: str, part: FrictionPart) -> float | None:
         """Returns the factor of the dry or viscous friction of a coordinate, None if the model has no such friction."""

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
-from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
+from dvrk_drake.analysis.estimation.estimator import MIN_ERROR, Estimator, Prior
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.observations.low_pass import low_pass, resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
@@ -41,8 +42,6 @@ ENDS = 1.0
 #: average out model errors. The number of poses is that of the largest public recording of poses (`mtm_2015_good72`),
 #: for which the limits of the gain at rest are set.
 MAX_INDEPENDENT, MAX_INDEPENDENT_POSES = 220.0, 72.0
-#: Smallest assumed RMS residual of an actuator's effort, as a share of the RMS effort.
-MIN_ERROR = 0.02
 #: In poses at rest, an actuator counts as moving if the range of its positions exceeds this value [rad], [m].
 MIN_RANGE = 0.1, 0.01
 #: Smallest information about a direction in the space of rigid-body parameters. The information is the squared relative
@@ -186,10 +185,12 @@ class ChannelFit:
             own = np.flatnonzero(np.any(columns, axis=0))
             self._columns[i] = own, columns[:, own]
         self._num_rigid = directions.shape[1] + tilts.shape[2]
-        self._mean = np.append(np.zeros(self._num_rigid), drive.mean)
-        self._precision = np.append(np.ones(self._num_rigid), spread**-2.0)
         dissipative = [effect.dissipative for effect in drive.effects]
-        self._non_negative = np.append(np.zeros(self._num_rigid, dtype=bool), dissipative)
+        self._prior = Prior(
+            mean=np.append(np.zeros(self._num_rigid), drive.mean),
+            precision=np.append(np.ones(self._num_rigid), spread**-2.0),
+            non_negative=np.append(np.zeros(self._num_rigid, dtype=bool), dissipative),
+        )
 
     def _fit(
         self, tau: NDArray[np.float64], column: NDArray[np.float64] | None = None
@@ -199,31 +200,26 @@ class ChannelFit:
         Returns:
             Log-likelihood, coefficients x (k,) and their precision (k, k).
         """
-        extra = 0 if column is None else 1
-        precision, mean = np.append(self._precision, np.ones(extra)), np.append(self._mean, np.zeros(extra))
-        non_negative = np.append(self._non_negative, np.zeros(extra, dtype=bool))
-        columns, size = [self._columns[i] for i in self.used], len(mean)
+        prior, columns = self._prior, [self._columns[i] for i in self.used]
+        if column is not None:
+            prior = Prior(*(np.append(values, value) for values, value in zip(prior, (0.0, 1.0, False), strict=True)))
+        size = len(prior.mean)
         if column is not None:
             columns = [
                 (np.append(own, size - 1), np.column_stack([X, column[:, i]]))
                 for i, (own, X) in zip(self.used, columns, strict=True)
             ]
-        total = NormalEquations.of(columns, size, (tau - self._nominal)[:, self.used]).total
-        # The prior means act as additional measurements of the unknowns.
-        prior = np.zeros((size + 1, size + 1))
-        prior[:-1, -1] = prior[-1, :-1] = precision * mean
         efforts = np.sum(tau[:, self.used] ** 2, axis=0)
-        weights = self._independent / (0.1**2 * efforts)
-        for _ in range(4):
-            x = NonNegativeFit(total.weighted(weights) + prior, precision, non_negative, np.arange(size)).solve()
-            errors = np.maximum(total.squared_errors(x)[0], MIN_ERROR**2 * efforts)
-            weights = self._independent / errors
+        equations = NormalEquations.of(columns, size, (tau - self._nominal)[:, self.used])
+        estimator = Estimator(equations, prior, efforts[None], np.full((1, len(efforts)), self._independent))
+        x = estimator.fit(estimator.all)
+        errors = np.maximum(estimator.squared_errors(x)[0], MIN_ERROR**2 * efforts)
         at_rest = tau[:, self.resting]
         constants = np.sum((at_rest - np.mean(at_rest, axis=0)) ** 2, axis=0)
         errors = np.append(errors, np.maximum(constants, MIN_ERROR**2 * np.sum(at_rest**2, axis=0)))
         likelihood = -0.5 * self._independent * float(np.sum(np.log(errors)))
-        likelihood -= 0.5 * float(np.sum(precision * (x - mean) ** 2))
-        return likelihood, x, total.weighted(weights)[:-1, :-1] + np.diag(precision)
+        likelihood -= 0.5 * float(np.sum(prior.precision * (x - prior.mean) ** 2))
+        return likelihood, x, estimator.information()
 
     def _offset_column(self, channel: int) -> NDArray[np.float64]:
         """Returns the change (r, n) of the fitted efforts per unit of position offset of a channel."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, ConsistentProgram, DynamicProblem
-from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
 
 #: Number of iterations that estimate the base tilt and the loads of the drives. Each iteration uses the parameters of
 #: the previous iteration. A third iteration changes the errors by less than 0.01 %.
@@ -79,7 +79,7 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     for iteration in range(NUM_ITERATIONS if tilts or problem.is_loaded else 0):
         progress(0.5 * iteration / NUM_ITERATIONS)
         linear = problem.selection(phi, folds=False)
-        x = linear.fit(mandatory)
+        x = linear.fit_with(mandatory)
         phi = problem.rigid_parameters(x)
         if tilts:
             problem = replace(problem, tilt=x[-tilts:])
@@ -87,7 +87,7 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
         problem = problem.with_load(phi, effects, x[linear.num_rigid + effects])
     selection = problem.selection(phi)
     selected = selection.select(mandatory, problem.candidates, lambda share: progress(0.5 + 0.5 * share))
-    x = selection.fit(selected)
+    x = selection.fit_with(selected)
     return EffectSelection(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, mandatory, selected, x)
 
 
@@ -153,5 +153,5 @@ def _select_without(
     problem = whole.problem
     selection = whole.selection.without(first, count)
     selected = selection.select(whole.mandatory, problem.candidates)
-    x = selection.fit(selected)
+    x = selection.fit_with(selected)
     return selected[selected < problem.num_effects], selection.weights, x[len(x) - len(problem.columns.tilts) :]

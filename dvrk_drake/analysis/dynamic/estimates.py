@@ -11,8 +11,8 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import RecordingEffect
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.observations.low_pass import correlation
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import (

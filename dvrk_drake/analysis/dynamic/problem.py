@@ -10,8 +10,9 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
-from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
+from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, Prior
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns
+from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -47,8 +48,6 @@ _MIN_INFORMATION = 1e-2
 #: Factor of the prior standard deviation of the first moments, for rotors that the SDF models as links. The factor is
 #: small because rotors are balanced.
 _BALANCE = 1e-6
-#: Assumed relative error of the efforts, which determines the weights before the first fit.
-_INITIAL_ERROR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,18 +173,20 @@ class DynamicProblem:
             for i in range(len(self.efforts))
         )
         fold, edge = (self.fold, self.edge) if folds else (self.recording, None)
-        precision = [np.ones(num_rigid), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
-        non_negative = [effect.dissipative for effect in self.columns.effects]
+        precision = np.concatenate(
+            [np.ones(num_rigid), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
+        )
+        dissipative = [effect.dissipative for effect in self.columns.effects]
+        non_negative = np.array([False] * num_rigid + dissipative + [False] * tilts)
+        num_folds = int(fold.max()) + 1
         return StepwiseSelection(
             equations=NormalEquations.of(
                 columns, num_rigid + self.num_effects + tilts, residual, fold, edge, self.recording
             ),
-            efforts=np.array([np.sum(self.columns.tau[fold == f] ** 2, axis=0) for f in range(fold.max() + 1)]),
-            rows=np.bincount(fold),
+            prior=Prior(np.zeros(len(precision)), precision, non_negative),
+            efforts=np.array([np.sum(self.columns.tau[fold == f] ** 2, axis=0) for f in range(num_folds)]),
+            independent=np.outer(np.bincount(fold) * self.independent / self.num_rows, np.ones(len(self.efforts))),
             num_rigid=num_rigid,
-            precision=np.concatenate(precision),
-            non_negative=np.array([False] * num_rigid + non_negative + [False] * tilts),
-            independent=self.independent / self.num_rows,
         )
 
     def _own_columns(
@@ -308,7 +309,7 @@ class DynamicProblem:
     def _identifiable(self) -> NDArray[np.float64]:
         """Orthonormal identifiable directions (p, k) of the rigid-body parameters divided by their deviations."""
         efforts = np.where(self.efforts > 0, self.efforts, np.inf)
-        weights = self.independent / self.num_rows / (efforts / self.num_rows * _INITIAL_ERROR**2)
+        weights = self.independent / self.num_rows / (efforts / self.num_rows * ASSUMED_ERROR**2)
         H = sum(weight * self.rigid[:, i].T @ self.rigid[:, i] for i, weight in enumerate(weights))
         scaled = self.columns.base * self.deviation
         values, vectors = np.linalg.eigh(scaled.T @ H @ scaled)

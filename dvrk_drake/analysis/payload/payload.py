@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import phase_folds
 from dvrk_drake.analysis.payload.motion_difference import MotionDifference, Whitening, motion_difference

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 
 #: Largest distance of the point mass from the link's own centre of mass along each axis [m]. All arms are shorter.
 MAX_DISTANCE = 1.0

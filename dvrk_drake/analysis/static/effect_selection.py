@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.static.linear_fit import RobustFit, robust_fit
+from dvrk_drake.analysis.estimation.robust_fit import RobustFit, robust_fit
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     effect_column,

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.estimation.robust_fit import LinearFit, blocks, rms, weighted_fit
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, select_effects
 from dvrk_drake.analysis.static.excluded_measurements import (
@@ -19,7 +20,6 @@ from dvrk_drake.analysis.static.excluded_measurements import (
     find_excluded,
     usable_measurements,
 )
-from dvrk_drake.analysis.static.linear_fit import LinearFit, blocks, rms, weighted_fit
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,

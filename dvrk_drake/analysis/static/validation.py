@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.estimation.robust_fit import rms
 from dvrk_drake.analysis.results import Validation
 from dvrk_drake.analysis.static.excluded_measurements import (
     ExcludedMeasurement,
@@ -14,7 +15,6 @@ from dvrk_drake.analysis.static.excluded_measurements import (
     find_excluded,
     usable_measurements,
 )
-from dvrk_drake.analysis.static.linear_fit import rms
 from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm

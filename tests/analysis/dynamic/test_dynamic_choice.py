@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.dynamic.columns import drive_effects, optional_effects
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
-from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
+from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 
@@ -100,11 +101,9 @@ def test_present_effects_are_selected_and_noise_is_not():
         selection = StepwiseSelection(
             equations=NormalEquations.of([(np.arange(22), X)], 22, tau[:, None], fold, edge),
             efforts=np.array([[np.sum(tau[fold == f] ** 2)] for f in range(FOLDS)]),
-            rows=np.bincount(fold),
+            prior=Prior(np.zeros(22), np.ones(22), np.zeros(22, dtype=bool)),
+            independent=0.1 * np.bincount(fold)[:, None],
             num_rigid=0,
-            precision=np.ones(len(true)),
-            non_negative=np.zeros(len(true), dtype=bool),
-            independent=0.1,
         )
         for part in (selection, selection.without(4, 2)):
             np.testing.assert_array_equal(part.select(np.array([0]), np.arange(1, 22)), [0, 1])
@@ -119,24 +118,21 @@ def test_recordings_are_weighted_by_their_error_variances():
     tau = (X @ true).T + noise[recording] * generator.normal(size=(ROWS, 2))
     fold = np.arange(ROWS) % FOLDS
     columns = [(np.arange(3), x) for x in X]
-    selection = StepwiseSelection(
+    estimator = Estimator(
         equations=NormalEquations.of(columns, 3, tau, fold, recording=recording),
+        prior=Prior(np.zeros(3), np.full(3, 1e-6), np.zeros(3, dtype=bool)),
         efforts=np.array([np.sum(tau[fold == f] ** 2, axis=0) for f in range(FOLDS)]),
-        rows=np.bincount(fold),
-        num_rigid=3,
-        precision=np.full(3, 1e-6),
-        non_negative=np.zeros(3, dtype=bool),
-        independent=1.0,
+        independent=np.outer(np.bincount(fold), np.ones(2)),
     )
-    x = selection.fit(np.array([], dtype=int))
+    x = estimator.fit(estimator.all)
     # The standard deviation of a standard deviation of 600 values is 3 %.
-    np.testing.assert_allclose(selection.weights**-0.5, noise, rtol=0.1, atol=0)
-    weights = selection.weights[recording].T.ravel()
+    np.testing.assert_allclose(estimator.weights**-0.5, noise, rtol=0.1, atol=0)
+    weights = estimator.weights[recording].T.ravel()
     expected = np.linalg.solve(
         (X.reshape(-1, 3).T * weights) @ X.reshape(-1, 3), X.reshape(-1, 3).T @ (weights * tau.T.ravel())
     )
     np.testing.assert_allclose(x, expected, rtol=1e-4, atol=0)
     # Without one recording, its weights are 0.
-    half = selection.without(0, FOLDS // 2)
-    half.fit(np.array([], dtype=int))
+    half = estimator.without(0, FOLDS // 2)
+    half.fit(half.all)
     assert np.all(half.weights[0] == 0) and np.all(half.weights[1] > 0)

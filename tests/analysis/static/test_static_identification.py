@@ -7,8 +7,8 @@ import shutil
 import numpy as np
 import pytest
 
+from dvrk_drake.analysis.estimation.robust_fit import robust_fit, weighted_fit
 from dvrk_drake.analysis.static.excluded_measurements import find_excluded
-from dvrk_drake.analysis.static.linear_fit import robust_fit, weighted_fit
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import predict_static, validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect

@@ -176,6 +176,7 @@ class NonNegativeFit:
         non_negative: NDArray[np.bool_],
         used: NDArray[np.int_],
         candidates: NDArray[np.int_] | None = None,
+        fixed: NDArray[np.float64] | float = 0.0,
     ) -> None:
         """Eliminates the unknowns without a sign constraint.
 
@@ -183,9 +184,12 @@ class NonNegativeFit:
             sums: Weighted sums of products (k + 1, k + 1). The last column is the measured effort.
             precision: Reciprocals (k,) of the prior variances of the unknowns, greater than 0. The prior means are 0.
             non_negative: Mask (k,) of the unknowns that must not be negative.
-            used: Indices of the unknowns in the fit. The remaining elements of x are 0.
+            used: Indices of the unknowns in the fit.
             candidates: Indices of the unknowns that `solve` may add. If None, `solve` cannot add an unknown.
+            fixed: Values (k,) of the unknowns that are not in the fit, 0 for all others. Their efforts are not in
+                `sums`.
         """
+        self._fixed = fixed
         self._scale = np.append(1 / np.sqrt(np.diag(sums)[:-1] + precision), 1.0)
         self._free, constrained = used[~non_negative[used]], used[non_negative[used]]
         self._constrained, self._non_negative = np.arange(len(constrained)), non_negative
@@ -229,7 +233,7 @@ class NonNegativeFit:
         x[self._free] = scipy.linalg.solve_triangular(
             self._factor, -self._coupling @ y, lower=True, trans=1, check_finite=False
         )
-        return (x * self._scale)[:-1]
+        return (x * self._scale)[:-1] + self._fixed
 
     def _minimum(self, S: NDArray[np.float64], constrained: NDArray[np.int_]) -> NDArray[np.float64]:
         """Returns y >= 0 that minimises y' H y / 2 - b' y. H and b are the elements of S for `constrained`.

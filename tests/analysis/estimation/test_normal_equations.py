@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
+from dvrk_drake.analysis.estimation.normal_equations import NonNegativeFit, NormalEquations
 
 pytestmark = pytest.mark.numeric
 
