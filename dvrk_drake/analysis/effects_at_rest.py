@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
+from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.estimation.robust_fit import blocks
 from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
@@ -27,8 +27,6 @@ MIN_NUM_POSES = 20
 MIN_SPRING_RANGE = 0.3
 #: Number of held-out blocks of successive poses. A correction must reduce the errors in these blocks.
 _BLOCKS = 5
-#: Number of iterations of the fit, which estimate the variances of the errors.
-_ITERATIONS = 4
 #: Travels of the hysteresis between poses, as shares of the range of the coordinate in the workspace.
 TRAVELS = (0.03, 0.1, 0.2, 0.4)
 
@@ -58,16 +56,25 @@ def with_effects_at_rest(model: IdentifiedModel, poses: StaticIdentification) ->
     to_actuator = arm.transmission.inverse
     residual = to_actuator.pull_back_effort(poses.recording.measured_effort() - model.holding_torque(q))
     usable = np.array([np.all(poses.usable[:, column != 0], axis=1) for column in to_actuator.matrix.T]).T
-    selected = _candidates(model, q, residual) if len(q) >= MIN_NUM_POSES else []
-    while np.min(ratios := _fit(selected, residual, usable).ratios(selected), initial=np.inf) < MIN_RATIO:
-        del selected[int(np.argmin(ratios))]
-    while corrections := [k for k, c in enumerate(selected) if c.effect.kind != "presliding"]:
-        error = _held_out_error(selected, residual, usable)
-        without = [_held_out_error(selected[:k] + selected[k + 1 :], residual, usable) for k in corrections]
-        if min(without) > error:
+    candidates = _candidates(model, q, residual) if len(q) >= MIN_NUM_POSES else []
+    estimator = _estimator(candidates, residual, usable)
+    is_correction = np.array([c.effect.kind != "presliding" for c in candidates], dtype=bool)
+    least = np.array([c.least for c in candidates])
+    selected = np.arange(len(candidates))
+    while np.any(is_correction[selected]):
+        x, errors = estimator.fit(selected)[selected], estimator.standard_errors(selected)
+        ratios = np.where(np.abs(x) > least[selected], np.abs(x) / errors, 0.0)
+        ratios[~is_correction[selected]] = np.inf
+        if np.min(ratios) >= MIN_RATIO:
             break
-        del selected[corrections[int(np.argmin(without))]]
-    fit = _fit(selected, residual, usable)
+        selected = np.delete(selected, np.argmin(ratios))
+    while len(corrections := np.flatnonzero(is_correction[selected])):
+        without = [_held_out_error(estimator, np.delete(selected, k)) for k in corrections]
+        if min(without) > _held_out_error(estimator, selected):
+            break
+        selected = np.delete(selected, corrections[np.argmin(without)])
+        estimator.fit(selected)
+    x, errors = estimator.fit(selected)[selected], estimator.standard_errors(selected)
     known = {e.coordinate: e.coefficient for e in model.holding_effects if e.kind == "offset"}
     effects = [
         DriveEffect(
@@ -78,7 +85,7 @@ def with_effects_at_rest(model: IdentifiedModel, poses: StaticIdentification) ->
             standard_error=float(error),
             degrees_of_freedom=float(max(len(q) - len(selected), 1)),
         )
-        for c, value, error in zip(selected, fit.coefficients, fit.standard_errors, strict=True)
+        for c, value, error in zip([candidates[k] for k in selected], x, errors, strict=True)
         if c.effect.kind != "presliding"
     ]
     source = poses.recording
@@ -148,49 +155,27 @@ def _hysteresis(x: NDArray[np.float64], travel: float) -> NDArray[np.float64]:
     return share
 
 
-class _Fit(NamedTuple):
-    """Coefficients (k,) and their standard errors."""
+def _estimator(candidates: list[_Candidate], residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> Estimator:
+    """Returns the estimator of the coefficients (k,) from residuals (m, n) with a mask (m, n) of the usable ones.
 
-    coefficients: NDArray[np.float64]
-    standard_errors: NDArray[np.float64]
-
-    def ratios(self, candidates: list[_Candidate]) -> NDArray[np.float64]:
-        """Returns the absolute coefficients in standard errors (k,): 0 for small corrections, inf for friction."""
-        size, least = np.abs(self.coefficients), np.array([c.least for c in candidates])
-        is_friction = np.array([c.effect.kind == "presliding" for c in candidates], dtype=bool)
-        return np.where(is_friction, np.inf, np.where(size > least, size / self.standard_errors, 0.0))
-
-
-def _fit(candidates: list[_Candidate], residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> _Fit:
-    """Returns the weighted least-squares fit. The weights are the reciprocal variances of the actuators' errors."""
-    if not candidates:
-        return _Fit(np.empty(0), np.empty(0))
-    X = np.array([c.efforts for c in candidates])
-    deviation = np.array([c.deviation for c in candidates])
-    lower = np.where([c.effect.kind == "presliding" for c in candidates], 0.0, -np.inf)
-    error, coefficients, inverse = residual, np.zeros(len(X)), np.zeros((len(X), len(X)))
-    for _ in range(_ITERATIONS):
-        variance = np.sum(np.where(usable, error, 0.0) ** 2, axis=0) / np.maximum(usable.sum(axis=0) - 2, 1)
-        W = usable / np.maximum(variance, 1e-18)
-        # In units of the prior deviations, the normal matrix has no eigenvalue below 1.
-        scaled = X * deviation[:, None, None]
-        H = np.einsum("kmn,mn,lmn->kl", scaled, W, scaled) + np.eye(len(X))
-        b = np.einsum("kmn,mn,mn->k", scaled, W, residual)
-        R = np.linalg.cholesky(H).T
-        coefficients = deviation * lsq_linear(R, np.linalg.solve(R.T, b), bounds=(lower, np.inf)).x
-        inverse = np.linalg.inv(H) * np.outer(deviation, deviation)
-        error = residual - np.tensordot(coefficients, X, axes=1)
-    return _Fit(coefficients, np.sqrt(np.diag(inverse)))
+    A fold is a block of successive poses.
+    """
+    efforts = np.array([c.efforts for c in candidates]).reshape(-1, *residual.shape) * usable
+    columns = []
+    for i in range(residual.shape[1]):
+        own = np.flatnonzero(np.any(efforts[:, :, i], axis=1))
+        columns.append((own, efforts[own, :, i].T))
+    tau, fold = residual * usable, blocks(len(residual), _BLOCKS)
+    is_friction = np.array([c.effect.kind == "presliding" for c in candidates], dtype=bool)
+    precision = np.array([c.deviation for c in candidates]) ** -2.0
+    return Estimator(
+        NormalEquations.of(columns, len(candidates), tau, fold),
+        Prior(np.zeros(len(candidates)), precision, is_friction),
+        np.array([np.sum(tau[fold == f] ** 2, axis=0) for f in range(fold[-1] + 1)]),
+        np.array([np.sum(usable[fold == f], axis=0) for f in range(fold[-1] + 1)], dtype=float),
+    )
 
 
-def _held_out_error(candidates: list[_Candidate], residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
-    """Returns the mean squared error in held-out blocks of successive poses, relative to the residual."""
-    block = blocks(len(residual), _BLOCKS)
-    error = residual.copy()
-    for k in range(_BLOCKS):
-        own = block == k
-        training = [replace(c, efforts=c.efforts[~own]) for c in candidates]
-        fit = _fit(training, residual[~own], usable[~own])
-        error[own] -= sum((x * c.efforts[own] for x, c in zip(fit.coefficients, candidates, strict=True)), 0.0)
-    squares = [np.sum(np.where(usable, x, 0.0) ** 2, axis=0) for x in (error, residual)]
-    return float(np.sum(squares[0] / np.maximum(squares[1], 1e-18)))
+def _held_out_error(estimator: Estimator, selected: NDArray[np.int_]) -> float:
+    """Returns the sum over the actuators of the mean squared error in held-out blocks, relative to the residual."""
+    return float(np.sum(estimator.cross_validated(selected) ** 2))

@@ -88,6 +88,13 @@ class Estimator:
         """Returns the sum (k, k) of the weighted X' X and the prior precision, the inverse of the covariance of x."""
         return self._total.weighted(self.weights)[:-1, :-1] + np.diag(self.prior.precision)
 
+    def standard_errors(self, used: NDArray[np.int_]) -> NDArray[np.float64]:
+        """Returns the standard errors (u,) of the unknowns `used` for independent errors and the present weights."""
+        deviation = self.prior.precision[used] ** -0.5
+        # In units of the prior deviations, the matrix has no eigenvalue below 1.
+        H = self.information()[np.ix_(used, used)] * np.outer(deviation, deviation)
+        return deviation * np.sqrt(np.diag(np.linalg.inv(H)))
+
     def cross_validated(self, used: NDArray[np.int_], added: Sequence[int] = ()) -> NDArray[np.float64]:
         """Returns the cross-validated relative errors (1 + a, s, n) without and with each of a additional unknowns.
 
