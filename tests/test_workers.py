@@ -38,19 +38,6 @@ def test_plain_script_uses_workers_and_runs_once(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "once\n[1, 2, 3]\n", "")
 
 
-@pytest.mark.slow
-def test_plain_script_designs_a_motion(tmp_path):
-    done = run_script(
-        tmp_path,
-        """
-        import dvrk_drake as dvrk
-        arm = dvrk.load_arm("mtml")
-        print(dvrk.design_excitation(arm, duration=2.0, period=2.0, harmonics=2, starts=2).motion.duration)
-        """,
-    )
-    assert (done.returncode, done.stdout) == (0, "2.0\n"), done.stderr
-
-
 @pytest.mark.parametrize("task", ["executor.submit(own)", "executor.submit(abs, Own())"])
 def test_function_or_class_of_the_script_is_refused(tmp_path, task):
     done = run_script(

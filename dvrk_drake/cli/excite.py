@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +24,7 @@ from dvrk_drake.cli.app import (
 )
 from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written, quiet_drake
 from dvrk_drake.errors import ExcitationError
+from dvrk_drake.workers import local_executor
 
 if TYPE_CHECKING:
     from dvrk_drake.models.environment import Environment
@@ -117,7 +120,9 @@ def excite(
         raise ExcitationError("--gravity cannot be used with --model, because the model contains the gravity vector")
     moved = mounted(dvrk.load_arm(arm), gravity, None)
     earlier = None if model is None else dvrk.IdentifiedModel.load(model, moved)
-    with Steps("optimising") as steps:
+    starts = 2 if starts is None else starts
+    pool = local_executor(min(starts, os.cpu_count() or 1)) if starts > 1 else nullcontext()
+    with Steps("optimising") as steps, pool as executor:
         design = dvrk.design_excitation(
             moved,
             duration=30.0 if duration is None else duration,
@@ -125,8 +130,9 @@ def excite(
             harmonics=16 if harmonics is None else harmonics,
             limits=limits,
             model=earlier,
-            starts=2 if starts is None else starts,
+            starts=starts,
             seed=seed,
+            executor=executor,
             progress=steps,
         )
     motion = design.motion

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +27,6 @@ from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
-from dvrk_drake.workers import local_executor
 
 #: Number of times per harmonic at which the information is computed.
 INFORMATION_TIMES = 8
@@ -85,6 +83,7 @@ def design_excitation(
     model: IdentifiedModel | None = None,
     starts: int = 2,
     seed: int = 0,
+    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> ExcitationDesign:
     """Designs a motion for `identify`: periodic, at rest at both ends, and within all limits.
@@ -106,6 +105,8 @@ def design_excitation(
             `MotionInformation`.
         starts: Number of random motions from which the optimisation starts.
         seed: Seed of the random motions.
+        executor: Executor that runs the optimisations in parallel, e.g. a `ProcessPoolExecutor`. None: one after the
+            other in this process.
         progress: Callback that receives the name of the step ("optimising") and the finished share (0 to 1).
 
     Raises:
@@ -147,7 +148,7 @@ def design_excitation(
     share(0.0)
     problems = [_Problem(arm, limits, model, period, harmonics, seed + k) for k in range(starts)]
     results = []
-    for result in _in_parallel(problems, share):
+    for result in (map if executor is None else executor.map)(_solve, problems):
         results.append(result)
         share(0.9 * len(results) / starts)
     best = min(results, key=lambda result: result[1])
@@ -250,16 +251,6 @@ class _Problem:
 
 def _solve(problem: _Problem) -> tuple[PeriodicMotion, float, float]:
     return problem.solve()
-
-
-def _in_parallel(
-    problems: list[_Problem], share: Callable[[float], object]
-) -> Iterable[tuple[PeriodicMotion, float, float]]:
-    if len(problems) == 1:
-        yield problems[0].solve()
-        return
-    with local_executor(min(len(problems), multiprocessing.cpu_count())) as executor:
-        yield from executor.map(_solve, problems)
 
 
 def _coefficients(motion: PeriodicMotion, basis: FourierBasis) -> NDArray[np.float64]:
