@@ -456,7 +456,7 @@ class CommandGuard:
                 self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not no_pose)
                 if not measured.is_pose_valid:
                     self._begin_safe_state()
-                    plausibility.reject_all()
+                    plausibility.reject(measured.invalid_pose)
             elif self._is_starting_or_in_force():
                 self._take_over(problem)
             if not measured.is_pose_valid:
@@ -633,7 +633,7 @@ class CommandGuard:
         if self.state == lcmt_dvrk_status.STATE_FAULT and self._is_in_safe_state:
             valid = ~self._plausibility.invalid
             gravity = self._plausibility.model.gravity_effort(np.where(valid, q, self._plausibility.last_valid))
-            v = self._measured.v if self._measured.is_pose_valid else np.zeros(self.num_joints)
+            v = np.where(self._measured.invalid_pose, 0.0, self._measured.v)
             return follower.hold_valid_joints(q, v, valid, gravity, dt)
         if self.state == lcmt_dvrk_status.STATE_POSITION:
             return follower.follow_position(in_force.position, in_force.velocity, dt)

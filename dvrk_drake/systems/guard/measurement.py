@@ -26,11 +26,11 @@ class Measurement:
         joint_names: Names of the n joints.
         max_age: Largest age of a valid measurement [us].
         utime: Time of the last step [us], or None before the first step.
-        q: Last valid positions (n,) [rad, m], or None before the first valid measurement.
-        v: Velocities (n,) [rad/s, m/s] of the last valid measurement.
+        q: Last valid position (n,) of each joint [rad, m], or None before the first valid measurement.
+        v: Last valid velocity (n,) of each joint [rad/s, m/s].
         effort: Last valid motor effort (n,) [N m, N] of each joint.
+        invalid_pose: Mask (n,) of the joints whose position and velocity the last measurement does not contain.
         invalid_effort: Mask (n,) of the joints whose effort in the last measurement is not finite.
-        is_pose_valid: Whether the last measurement has a valid pose. Its efforts may nevertheless be invalid.
         dt: Time between the last two valid measurements [s]; 0 for a repeated measurement, inf for the first
             measurement.
         num_invalid: Number of consecutive invalid measurements up to now.
@@ -42,8 +42,8 @@ class Measurement:
     q: Vector | None = None
     v: Vector = field(init=False)
     effort: Vector = field(init=False)
+    invalid_pose: Mask = field(init=False)
     invalid_effort: Mask = field(init=False)
-    is_pose_valid: bool = False
     dt: float = math.inf
     num_invalid: int = 0
     _measured_utime: int | None = None
@@ -53,6 +53,12 @@ class Measurement:
     def __post_init__(self) -> None:
         self.v = self.effort = np.zeros(len(self.joint_names))
         self.invalid_effort = self._none = np.zeros(len(self.joint_names), bool)
+        self.invalid_pose = ~self._none
+
+    @property
+    def is_pose_valid(self) -> bool:
+        """Whether the last measurement has a valid pose. Its efforts may nevertheless be invalid."""
+        return not self.invalid_pose.any()
 
     def advance(self, utime: int) -> tuple[float, str]:
         """Advances to `utime` [us]. Returns the elapsed time [s] and the description of a clock fault, or ""."""
@@ -76,7 +82,10 @@ class Measurement:
         effort: ArrayLike,
         implausible_pose: Callable[[Vector], str] | None = None,
     ) -> str:
-        """Stores a measurement if its pose is valid. An effort that is not finite is replaced by the last valid effort.
+        """Stores a measurement. A position or an effort that is not finite is replaced by the last valid one.
+
+        If some positions or velocities are not finite, the measurement is invalid, but the other joints can be
+        regulated.
 
         Args:
             measured_utime: Time of the measurement [us].
@@ -97,24 +106,38 @@ class Measurement:
             self.dt = 0.0
             return self._effort_problem
         self.num_invalid += 1
-        self.is_pose_valid = False
+        self.invalid_pose = ~self._none
         if not is_recent:
             return f"the measurement is {1e-6 * age:.3f} s old; allowed: 0 to {1e-6 * self.max_age:g} s"
         if dt < 0:
             return f"the measurement is {-dt:.6f} s older than the previous one"
         q, v, effort = (np.array(numbers, float) for numbers in (q, v, effort))
         n = len(self.joint_names)
-        if not (q.shape == v.shape == effort.shape == (n,) and is_finite([*q.tolist(), *v.tolist()])):
-            return f"the measurement is not {n} finite positions and velocities, and {n} efforts"
-        if implausible_pose is not None and (problem := implausible_pose(q)):
-            return problem
-        self.dt, self.q, self.v, self._measured_utime, self.is_pose_valid = dt, q, v, measured_utime, True
-        if is_finite(effort.tolist()):
-            self.effort, self.invalid_effort, self.num_invalid, self._effort_problem = effort, self._none, 0, ""
-            return ""
-        # Negated comparison, so that NaN counts as invalid.
-        self.invalid_effort = ~(np.abs(effort) < IMPLAUSIBLE / n)
+        if not q.shape == v.shape == effort.shape == (n,):
+            return f"the measurement is not {n} positions, velocities and efforts"
+        if is_finite([*q.tolist(), *v.tolist()]):
+            if implausible_pose is not None and (problem := implausible_pose(q)):
+                return problem
+            self.dt, self.q, self.v, self._measured_utime, self.invalid_pose = dt, q, v, measured_utime, self._none
+            if is_finite(effort.tolist()):
+                self.effort, self.invalid_effort, self.num_invalid, self._effort_problem = effort, self._none, 0, ""
+                return ""
+        self.invalid_effort = _is_invalid(effort)
         self.effort = np.where(self.invalid_effort, self.effort, effort)
-        names = ", ".join(self.joint_names[j] for j in np.flatnonzero(self.invalid_effort))
-        self._effort_problem = f"{names}: the measured effort is not a finite number"
-        return self._effort_problem
+        if self.is_pose_valid:
+            self._effort_problem = f"{self._names(self.invalid_effort)}: the measured effort is not a finite number"
+            return self._effort_problem
+        invalid = _is_invalid(q) | _is_invalid(v)
+        if self.q is not None:
+            self.q, self.v = np.where(invalid, self.q, q), np.where(invalid, self.v, v)
+            self.invalid_pose = invalid
+        return f"{self._names(invalid)}: the measured position or velocity is not a finite number"
+
+    def _names(self, joints: Mask) -> str:
+        return ", ".join(self.joint_names[j] for j in np.flatnonzero(joints))
+
+
+def _is_invalid(numbers: Vector) -> Mask:
+    """Returns a mask (n,) of the numbers that are not finite, or too large, see `is_finite`."""
+    # Negated comparison, so that NaN counts as invalid.
+    return ~(np.abs(numbers) < IMPLAUSIBLE / len(numbers))

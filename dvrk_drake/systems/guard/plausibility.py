@@ -320,19 +320,16 @@ class Plausibility:
         self._before = q, speed
         return self.fault
 
-    def reject_all(self) -> None:
-        """Marks the positions of all joints as invalid. The guard calls this method if measurements are missing."""
-        self._reject(~self._none)
-
     def _report(self, check: Check, joints: Mask) -> None:
         if not is_any(joints):
             return
         if not self.fault:
             self.fault = f"{', '.join(self._names[j] for j in np.flatnonzero(joints))}: {check.text}"
         if check.about_position:
-            self._reject(joints)
+            self.reject(joints)
 
-    def _reject(self, joints: Mask) -> None:
+    def reject(self, joints: Mask) -> None:
+        """Marks the positions of `joints` (n,) as invalid. The guard calls this method if measurements are missing."""
         # An error begins before its detection. The last valid positions are therefore taken from an earlier pose.
         self.last_valid = np.where(joints & ~self.invalid, self._poses[0], self.last_valid)
         self.invalid = self.invalid | joints

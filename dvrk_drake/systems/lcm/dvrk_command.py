@@ -150,9 +150,9 @@ class DvrkCommandReceiver(LeafSystem):
     - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose with zero
       velocity.
     - `effort` (n): motor efforts to apply, inside the effort limits. In OFF, they are zero. In EFFORT, they are the
-      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. If this effort
-      is not finite, the gravity effort of the model is used instead. Outside the state EFFORT, an effort changes by at
-      most its limit within 4 ms.
+      output of the guard plus `gravity_effort`. In all other modes, they are `position_control_effort`. Where this
+      effort is not finite, the gravity effort of the model is used instead. Outside the state EFFORT, an effort
+      changes by at most its limit within 4 ms.
     - `guard`: the CommandGuard, read-only.
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
@@ -260,7 +260,7 @@ class DvrkCommandReceiver(LeafSystem):
         else:
             effort = self._position_control.Eval(context)
             # The effort of the position controller is not finite while measurements are missing for a few periods.
-            effort = effort if is_finite(effort.tolist()) else guard.gravity_effort
+            effort = np.where(np.isfinite(effort), effort, guard.gravity_effort)
         last = context.get_discrete_state(self._last_effort).value()
         # In EFFORT, the guard limits the rate, except that of the soft walls and of the speed limit.
         if guard.state != lcmt_dvrk_status.STATE_EFFORT and is_finite(last.tolist()):

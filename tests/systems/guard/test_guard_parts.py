@@ -74,10 +74,18 @@ def test_measurement_size_and_numbers_are_checked(which, bad):
     vectors = [GOOD, GOOD, GOOD]
     vectors[which] = bad
     for count in (1, 2):
-        text = "the measurement is not 3 finite positions and velocities, and 3 efforts"
-        assert measured.store(NOW, *vectors) == text
+        text = measured.store(NOW, *vectors)
+        if np.shape(bad) == (3,):
+            joint = int(np.argmax(~(np.abs(bad) < 1e5)))
+            assert text == f"{'abc'[joint]}: the measured position or velocity is not a finite number"
+            np.testing.assert_array_equal(measured.invalid_pose, np.arange(3) == joint)
+        else:
+            assert text == "the measurement is not 3 positions, velocities and efforts"
+            assert measured.invalid_pose.all()
         assert (measured.num_invalid, measured.is_pose_valid) == (count, False)
-    np.testing.assert_array_equal(measured.q, GOOD)
+    # The last valid number replaces an invalid one.
+    q = np.where(measured.invalid_pose, GOOD, bad) if which == 0 and np.shape(bad) == (3,) else GOOD
+    np.testing.assert_array_equal(measured.q, q)
     assert measured.store(NOW, GOOD, GOOD, GOOD) == ""
     assert measured.num_invalid == 0
 
