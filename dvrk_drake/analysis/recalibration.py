@@ -11,7 +11,6 @@ from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.observations.drive_efforts import (
-    FRICTION_PARTS,
     FrictionPart,
     drive_efforts,
     refuse_opposite_efforts,
@@ -24,6 +23,7 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
@@ -358,7 +358,7 @@ def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64], errors:
         errors: Standard errors (k + n,) of x, 0 for values that were not fitted.
     """
     offsets = {f"actuator.{name}": i for i, name in enumerate(fit.names, start=len(fit.keys)) if errors[i]}
-    parts = [(e.coordinate, FRICTION_PARTS.get(e.kind)) for e in section.effects]
+    parts = [(e.coordinate, EFFECT_KINDS[e.kind].role) for e in section.effects]
     effects = []
     for effect, part in zip(section.effects, parts, strict=True):
         coefficient, error = effect.coefficient, effect.standard_error

@@ -40,6 +40,14 @@ class EffectKind:
     position_power: int = 0
 
     @property
+    def prior_share(self) -> float:
+        """Prior standard deviation of the torque of an effect, as a share of the RMS effort. The prior mean is 0.
+
+        Friction is a sum of several effects, so each of them is small.
+        """
+        return 0.1 if self.dissipative else 0.3
+
+    @property
     def bounded(self) -> bool:
         """True for dry friction whose largest effort is its coefficient."""
         return self.role == "dry" and not self.loaded and not self.position_power

@@ -9,7 +9,6 @@ from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.observations.drive_efforts import FRICTION_PARTS
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
 from dvrk_drake.cli import main
@@ -17,6 +16,7 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.writing import write_recording
 
@@ -32,7 +32,7 @@ def days(name, seed=0):
     bare = true_dynamics(arm, np.random.default_rng(seed), [])
     first = DynamicModel(arm, dataclasses.replace(bare.section, effects=friction(bare, q, v, vd)))
     section = other_day(first, q, v, vd, generator)
-    kept = [effect for effect in section.effects if effect.kind in (*FRICTION_PARTS, "offset")]
+    kept = [effect for effect in section.effects if EFFECT_KINDS[effect.kind].role != "position"]
     second = DynamicModel(arm, dataclasses.replace(section, effects=kept))
     return dataclasses.replace(IdentifiedModel.from_arm(arm), dynamics=first.section), second, generator
 
@@ -94,7 +94,7 @@ def test_asymmetric_friction_is_refitted():
     section = dataclasses.replace(section, effects=section.effects + forward)
     today = [e for e in section.effects if e.coordinate == first]
     today += [
-        dataclasses.replace(e, coefficient=(1.4 if FRICTION_PARTS[e.kind] == "dry" else 1.0) * e.coefficient)
+        dataclasses.replace(e, coefficient=(1.4 if EFFECT_KINDS[e.kind].role == "dry" else 1.0) * e.coefficient)
         for e in section.effects
         if e.coordinate != first
     ]

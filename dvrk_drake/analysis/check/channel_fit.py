@@ -11,29 +11,22 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
 from dvrk_drake.analysis.estimation.estimator import MIN_ERROR, Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
 from dvrk_drake.analysis.observations.low_pass import low_pass, resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import POSITION_KINDS
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED
 
-#: Prior standard deviation of the link parameters and of the effects in the arm file, as a share of the size of each
-#: parameter or coefficient.
-LINK_DEVIATION, EFFECT_DEVIATION = 0.3, 0.5
-#: Prior standard deviations of the efforts of additional effects, as shares of the RMS effort. The first applies to
-#: viscous and Coulomb friction. The second applies to offsets, and to springs and cables without a coefficient in the
-#: arm file.
-FRICTION_DEVIATION, POSITION_DEVIATION = 0.1, 1.0
-#: Prior standard deviation of the base tilt [rad] and of a position offset [rad], [m].
-TILT_DEVIATION, OFFSET_DEVIATION = 0.05, (0.1, 0.01)
-#: Smallest prior standard deviation of a rotor inertia [kg m^2; kg].
-MIN_ROTOR_DEVIATION = 3e-6
+#: Prior standard deviation of the effects in the arm file, as a share of each coefficient.
+EFFECT_DEVIATION = 0.5
+#: Prior standard deviation of a position offset [rad], [m].
+OFFSET_DEVIATION = 0.1, 0.01
 #: Number of samples of the fit per period of the effort's cut-off frequency.
 OVERSAMPLING = 2.5
 #: Duration that is excluded at each end because of filter transients [s].
@@ -151,11 +144,8 @@ class ChannelFit:
     def _make_columns(self) -> None:
         regressor = self._regressor
         q, v, vd = (x[:: self._half_step] for x in (self._q, self._v, self._vd))
-        num_links = 10 * len(regressor.links)
         prior = regressor.values[: self._base.base.shape[1]]
-        deviations = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
-        rotors = np.maximum(LINK_DEVIATION * prior[num_links:], MIN_ROTOR_DEVIATION)
-        deviation = np.concatenate([*deviations, rotors])
+        deviation = rigid_deviations(regressor, len(prior))
         Y = regressor.regressor(q, v, vd)
         effort = np.sqrt(np.mean(self._tau**2, axis=0))
         rigid, information = {}, np.zeros((len(prior), len(prior)))
@@ -305,5 +295,5 @@ def _drive_effects(arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], mov
             others.append(ActuatorEffect(f"actuator.{name}", "coulomb", DIRECTION_WIDTH * float(speed) or 1.0))
     effects = [*map(ActuatorEffect.of, known), *others]
     mean = np.array([e.coefficient for e in known] + [0.0] * len(others))
-    share = [POSITION_DEVIATION if e.kind in POSITION_KINDS else FRICTION_DEVIATION for e in effects]
+    share = [KNOWN_SHARE if e.kind in POSITION_KINDS else EFFECT_KINDS[e.kind].prior_share for e in effects]
     return _DriveEffects(effects, mean, EFFECT_DEVIATION * np.abs(mean), np.array(share))

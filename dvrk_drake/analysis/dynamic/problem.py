@@ -12,42 +12,29 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns
+from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
 from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.inertial_parameters import rotor_links
 from dvrk_drake.dynamics.physical_consistency import (
     BoundingBox,
-    LinkScale,
     bounding_boxes,
     consistent_parameters,
     log_det_curvature,
 )
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
-#: Prior standard deviation of an inertial parameter about its value in the SDF, as a share of the scale of the
-#: parameter (`LinkScale`). The share was selected by cross-validation.
-LINK_DEVIATION = 0.3
-#: Smallest prior standard deviation of a rotor inertia [kg m^2], and lower bound of a rotor inertia as a share of its
-#: value in the SDF.
-MIN_ROTOR_DEVIATION, MIN_ROTOR_SHARE = 3e-6, 0.1
-#: Prior standard deviations of the torque of an effect, as shares of the RMS effort. The prior means are 0. The first
-#: applies to friction, which is a sum of several effects. The second applies to springs and cables that the arm file
-#: lists, because they may balance gravity. The third applies to the second harmonic of a cable with a first harmonic,
-#: which is a correction; a wide prior would let it diverge outside the range of the motion. The fourth applies to all
-#: other effects.
-FRICTION_DEVIATION, KNOWN_DEVIATION, HARMONIC_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.1, 0.3
+#: Lower bound of a rotor inertia, as a share of its value in the SDF.
+MIN_ROTOR_SHARE = 0.1
+#: Prior standard deviation of the torque of the second harmonic of a known cable with a first harmonic, as a share of
+#: the RMS effort. It is a correction; a wide prior would let it diverge outside the range of the motion.
+HARMONIC_SHARE = 0.1
 #: Prior standard deviation of the torque of a `RecordingEffect`, as a share of the RMS effort.
 RECORDING_DEVIATION = 0.02
-#: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
-TILT_DEVIATION = 0.05
 #: Smallest information about a direction in parameter space, relative to the prior. Along directions with less
 #: information, the estimates are the values of the SDF.
 _MIN_INFORMATION = 1e-2
-#: Factor of the prior standard deviation of the first moments, for rotors that the SDF models as links. The factor is
-#: small because rotors are balanced.
-_BALANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +101,7 @@ class DynamicProblem:
     @cached_property
     def deviation(self) -> NDArray[np.float64]:
         """Prior standard deviations (p,) of the rigid-body parameters."""
-        rotors_as_links = rotor_links(self.regressor.arm)
-        links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in self.regressor.links]
-        for link, deviation in zip(self.regressor.links, links, strict=True):
-            if link.link in rotors_as_links:
-                deviation[1:4] *= _BALANCE
-        rotors = np.maximum(LINK_DEVIATION * self.prior[10 * len(links) :], MIN_ROTOR_DEVIATION)
-        return np.asarray(np.concatenate([*links, rotors]), dtype=float)
+        return rigid_deviations(self.regressor, self.num_rigid)
 
     @cached_property
     def boxes(self) -> dict[str, BoundingBox]:
@@ -134,19 +115,17 @@ class DynamicProblem:
             np.mean((self.columns.shapes[i] * self.columns.rows[:, i]) ** 2, axis=0) / (self.efforts[i] / self.num_rows)
             for i in np.flatnonzero(self.efforts)
         )
-        deviation = np.full(self.num_effects, EFFECT_DEVIATION)
+        share = np.array([EFFECT_KINDS[effect.kind].prior_share for effect in self.columns.effects])
         mandatory = {(e.coordinate, e.kind, e.scale) for e in self.columns.effects[: self.num_mandatory]}
         for k, effect in enumerate(self.columns.effects):
             if isinstance(effect, RecordingEffect):
                 rows = float(np.mean(self.recording == effect.recording))
-                deviation[k] = RECORDING_DEVIATION * np.sqrt(max(rows, 1 / self.num_rows))
-            elif effect.dissipative:
-                deviation[k] = FRICTION_DEVIATION
+                share[k] = RECORDING_DEVIATION * np.sqrt(max(rows, 1 / self.num_rows))
             elif k < self.num_mandatory and EFFECT_KINDS[effect.kind].role == "position":
                 is_second = effect.kind.startswith("cable") and effect.scale > 1
                 first = (effect.coordinate, effect.kind, 1.0)
-                deviation[k] = HARMONIC_DEVIATION if is_second and first in mandatory else KNOWN_DEVIATION
-        return np.asarray(size) / deviation**2 + 1e-9
+                share[k] = HARMONIC_SHARE if is_second and first in mandatory else KNOWN_SHARE
+        return np.asarray(size) / share**2 + 1e-9
 
     @property
     def num_rows(self) -> int:

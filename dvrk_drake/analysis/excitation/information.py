@@ -10,14 +10,14 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import COULOMB_WIDTHS, BaseColumns, base_columns
-from dvrk_drake.analysis.dynamic.problem import FRICTION_DEVIATION, LINK_DEVIATION, MIN_ROTOR_DEVIATION
+from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, rigid_deviations
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 #: RMS error of a measured effort relative to the RMS effort of the motion, and time over which errors are correlated
 #: [s]. The errors are those of the model, not of the sensor. The values are those of the public motions of a real MTM
@@ -28,8 +28,6 @@ EFFORT_ERROR, CORRELATION_TIME = 0.1, 0.1
 NUM_MOTIONS, MOTION_PERIOD, MOTION_HARMONICS, STATES_PER_MOTION = 20, 10.0, 6, 50
 #: Acceleration below which presliding is smoothed, as a share of the RMS acceleration of the random motions.
 SMOOTHED_ACCELERATION = 0.2
-#: Prior standard deviation of an offset, as a share of the RMS effort.
-OFFSET_DEVIATION = 1.0
 #: Step of the central differences with respect to positions, velocities and accelerations, relative to their limits.
 _STEP = 1e-5
 
@@ -135,13 +133,9 @@ class MotionInformation:
     @cached_property
     def prior(self) -> NDArray[np.float64]:
         """Precision (k, k) of the unknowns before the motion: of the prior of `identify`, and of `model`."""
-        regressor = self._regressor
-        p = self._base.base.shape[1]
-        links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
-        rotors = np.maximum(LINK_DEVIATION * regressor.values[10 * len(links) : p], MIN_ROTOR_DEVIATION)
-        scaled = self._base.base * np.concatenate([*links, rotors])
+        scaled = self._base.base * rigid_deviations(self._regressor, self._base.base.shape[1])
         num_friction = 1 + len(COULOMB_WIDTHS) + len(self._travels)
-        of_actuator = [*[FRICTION_DEVIATION] * num_friction, OFFSET_DEVIATION]
+        of_actuator = [*[EFFECT_KINDS["coulomb"].prior_share] * num_friction, KNOWN_SHARE]
         effects = np.diag(np.tile(of_actuator, self.arm.num_joints) ** -2.0)
         return np.asarray(scipy.linalg.block_diag(_inverse(scaled @ scaled.T) + self._earlier, effects))
 

@@ -14,12 +14,9 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.recordings.recording import Recording
 
+#: Roles of friction effects. All effects of one role at a coordinate change together, for example with temperature or
+#: lubrication.
 FrictionPart = Literal["dry", "viscous"]
-#: Part of the friction of each kind of friction effect. All kinds of one part change together, for example with
-#: temperature or lubrication.
-FRICTION_PARTS: dict[str, FrictionPart] = {
-    name: kind.role for name, kind in EFFECT_KINDS.items() if kind.role == "dry" or kind.role == "viscous"
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +56,9 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
         if not coefficient:
             continue
         effort = coefficient * shape[:, None] * rows[effect.coordinate]
-        if effect.kind in FRICTION_PARTS:
-            key = (effect.coordinate, FRICTION_PARTS[effect.kind])
+        role = EFFECT_KINDS[effect.kind].role
+        if role == "dry" or role == "viscous":
+            key = (effect.coordinate, role)
             friction[key] = friction.get(key, 0.0) + effort
         else:
             other = other + effort
