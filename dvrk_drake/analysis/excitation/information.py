@@ -28,8 +28,8 @@ EFFORT_ERROR, CORRELATION_TIME = 0.1, 0.1
 NUM_MOTIONS, MOTION_PERIOD, MOTION_HARMONICS, STATES_PER_MOTION = 20, 10.0, 6, 50
 #: Acceleration below which presliding is smoothed, as a share of the RMS acceleration of the random motions.
 SMOOTHED_ACCELERATION = 0.2
-#: Step of the central differences with respect to positions, velocities and accelerations, relative to their limits.
-_STEP = 1e-5
+#: Step of the forward differences with respect to positions, velocities and accelerations, relative to their limits.
+_STEP = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,21 +193,20 @@ class MotionInformation:
         squares = self._mean_squares(tau)
         # Derivatives of log(error) with respect to the columns X of an actuator (X D / s^2), and to the efforts, on
         # which the RMS effort s of the motion depends.
-        G, by_effort = [], np.empty_like(tau)
-        for i, (own, X) in enumerate(self.columns(state)):
+        G, by_effort, columns = [], np.empty_like(tau), self.columns(state)
+        for i, (own, X) in enumerate(columns):
             G.append(X @ D[own[:, None], own] / squares[i])
             by_effort[:, i] = -np.sum(G[i] * X) / squares[i] * tau[:, i] / len(tau)
         gradient = np.empty_like(state)
         for k in range(3):
             for j in range(state.shape[2]):
                 step = _STEP * self.scales[k, j]
-                ahead, back = state.copy(), state.copy()
+                ahead = state.copy()
                 ahead[k, :, j] += step
-                back[k, :, j] -= step
-                change = np.sum(by_effort * (self._efforts(ahead) - self._efforts(back)), axis=1)
-                for g, (_, X), (_, Z) in zip(G, self.columns(ahead), self.columns(back), strict=True):
-                    change += np.sum(g * (X - Z), axis=1)
-                gradient[k, :, j] = change / (2 * step)
+                change = np.sum(by_effort * (self._efforts(ahead) - tau), axis=1)
+                for g, (_, Z), (_, X) in zip(G, self.columns(ahead), columns, strict=True):
+                    change += np.sum(g * (Z - X), axis=1)
+                gradient[k, :, j] = change / step
         return 0.5 * float(np.log(square)), gradient
 
     def known_parameters(self, state: NDArray[np.float64], period: float, share: float = 0.1) -> int:
