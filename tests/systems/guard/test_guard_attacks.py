@@ -98,6 +98,12 @@ def test_session_zero_is_refused():
 # Configuration
 
 
+@pytest.mark.parametrize("mode", [-1, 99])
+def test_unknown_modes_are_refused(mode):
+    with pytest.raises(StationError, match=rf"modes must be POSITION, EFFORT or OFF; got \[{mode}\]"):
+        CommandGuard(ARM, 1, Weightless(), None, [mode])
+
+
 def test_empty_modes_accept_no_mode():
     bench = Bench(modes=())
     assert bench.guard.accepted_modes == modes(Command.HOLD)

@@ -37,6 +37,8 @@ def test_block_is_no_fault_and_ends_with_an_empty_reason(mode):
     assert bench.guard.blocked_reason == ""
     assert all(accepts(bench.guard, active) for active in ACTIVE)
     bench.started(mode)
+    bench.guard.block("")  # a driver repeats the empty reason
+    assert bench.tick().control_mode == mode
 
 
 @pytest.mark.parametrize("mode", ACTIVE)

@@ -61,6 +61,25 @@ def unit(joint, size=1.0):
     return size * np.eye(N)[joint]
 
 
+def test_earlier_speed_does_not_delay_the_detection_of_a_drift():
+    times = []
+    for speed in (0.0, 1.0):
+        sensors = Sensors()
+        assert sensors.move(unit(0, speed), ticks=100) == ("", 100)
+        assert sensors.move(np.zeros(N), ticks=2000) == ("", 2000)
+        fault, ticks = sensors.move(unit(0, 0.5), ticks=500, measured_v=np.zeros_like)
+        assert fault == f"{ARM.joint_names[0]}: position and velocity disagree"
+        times.append(ticks)
+    assert times[0] == pytest.approx(times[1], abs=2)
+
+
+@pytest.mark.parametrize("is_invalid", [False, True])
+def test_invalid_effort_is_not_compared_with_the_motion(is_invalid):
+    sensors, invalid = Sensors(), np.full(N, is_invalid)
+    faults = [sensors.checks.check(MS, sensors.q, sensors.v, 3.0 * LIMIT * (k > 10), None, invalid) for k in range(100)]
+    assert (faults[-1] == "") == is_invalid
+
+
 @pytest.mark.parametrize("joint", JOINTS)
 @pytest.mark.parametrize("side", [-1, 1])
 def test_position_jump_beyond_tolerance_is_found(joint, side):
