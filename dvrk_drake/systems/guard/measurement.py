@@ -57,7 +57,7 @@ class Measurement:
 
     @property
     def is_pose_valid(self) -> bool:
-        """Whether the last measurement has a valid pose. Its efforts may nevertheless be invalid."""
+        """True if the last measurement has a valid pose. Its efforts may nevertheless be invalid."""
         return not self.invalid_pose.any()
 
     def advance(self, utime: int) -> tuple[float, str]:
