@@ -208,13 +208,6 @@ class Recording:
         edges = [0, *(np.flatnonzero(intervals > max(GAP * typical, MIN_GAP)) + 1).tolist(), len(self)]
         return [slice(first, last) for first, last in pairwise(edges)]
 
-    def longest_segment(self) -> Recording:
-        """Returns the longest segment of a motion between gaps of its times, or the recording if it has no gap."""
-        segments = self.segments()
-        if len(segments) == 1:
-            return self
-        return self.select(max(segments, key=lambda rows: rows.stop - rows.start))
-
     @property
     def unmeasured(self) -> NDArray[np.bool_]:
         """Mask (n,) of the channels whose effort is 0 in all rows, so that it was not measured."""

@@ -55,7 +55,7 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
     recording, arm = observations.recording, observations.arm
     interval = float(np.median(np.diff(np.asarray(recording.t))))
     # The channels that were measured are those of the whole motion.
-    actuators = recording.measured_actuators(arm).longest_segment()
+    actuators = recording.measured_actuators(arm).select(observations.longest_rows)
     (clock,) = observations.longest.clocks
     t = np.asarray(actuators.t)
     duration, rate = float(t[-1] - t[0]), 1 / interval

@@ -1,1 +1,1 @@
-"""Signal processing of recordings: filtering, resampling, static segments, repetitions and folds."""
+"""Preparation of recordings: times, faults, filtering, resampling, static segments, repetitions and folds."""

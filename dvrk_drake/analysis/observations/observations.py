@@ -93,7 +93,7 @@ class Observations:
 
     @cached_property
     def source_fault(self) -> MotionFault | None:
-        """Result of `source_fault`."""
+        """Fault of the sources of the rows, see `motion_faults.source_fault`."""
         return source_fault(self.recording, self.arm)
 
     @cached_property
@@ -168,13 +168,19 @@ class Observations:
             return (true_time(actuators),)
         return tuple(true_time(actuators.select(rows)) for rows in self.segments)
 
+    @property
+    def longest_rows(self) -> slice:
+        """Rows of the longest segment between gaps."""
+        return max(self.segments, key=lambda rows: rows.stop - rows.start)
+
     @cached_property
     def longest(self) -> Observations:
         """Longest segment between gaps, or these observations if the motion has no gap."""
         if len(self.segments) == 1:
             return self
-        k = max(range(len(self.segments)), key=lambda i: self.segments[i].stop - self.segments[i].start)
-        return Observations(self.recording.select(self.segments[k]), self.arm, self.settings, (self.clocks[k],))
+        rows = self.longest_rows
+        clock = self.clocks[self.segments.index(rows)]
+        return Observations(self.recording.select(rows), self.arm, self.settings, (clock,))
 
     @cached_property
     def period(self) -> float | None:

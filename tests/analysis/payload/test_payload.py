@@ -42,6 +42,12 @@ CASES = {
 }
 
 
+def point_masses(reference, loaded, model, links=None):
+    """Returns the estimates on all `links` for recordings and a DynamicModel."""
+    prepared = [r if r is None else Observations(r, model.arm, model.section.signals) for r in (reference, loaded)]
+    return estimate_payload(*prepared, model, links)
+
+
 def inverse_dynamics(arm, plant, context, q, v, vd):
     """Returns the joint efforts (n,) that Drake computes, mapped to the independent joints of the linkage."""
     order = [plant.GetJointByName(name).velocity_start() for name in arm.tree_joint_names]
@@ -86,12 +92,7 @@ def test_intervals_contain_the_true_values(case, seed):
     """
     name, link, mass, position = CASES[case]
     model, reference, loaded = two_days(name, link, mass, position, seed)
-    (payload,) = estimate_payload(
-        Observations(reference, model.arm, model.section.signals),
-        Observations(loaded, model.arm, model.section.signals),
-        model,
-        [link],
-    )
+    (payload,) = point_masses(reference, loaded, model, [link])
     reach = 1.5 * payload.quantile
     known = payload.body.determined
     assert abs(payload.body.mass - mass) < reach * payload.mass_error
@@ -106,26 +107,17 @@ def test_intervals_contain_the_true_values(case, seed):
 def test_one_recording_is_compared_with_the_model():
     name, link, mass, position = CASES["end"]
     model, _, loaded = two_days(name, link, mass, position, 0)
-    (payload,) = estimate_payload(None, Observations(loaded, model.arm, model.section.signals), model, [link])
+    (payload,) = point_masses(None, loaded, model, [link])
     assert payload.found and payload.shift == 0.0
     assert abs(payload.body.mass - mass) < 1.5 * payload.quantile * payload.mass_error
     _, _, unloaded = two_days(name, link, 0.0, [0.0, 0.0, 0.0], 0)
-    (none,) = estimate_payload(None, Observations(unloaded, model.arm, model.section.signals), model, [link])
+    (none,) = point_masses(None, unloaded, model, [link])
     assert not none.found and none.largest_at_com < mass
 
 
 def test_finds_the_link_and_equally_good_links():
     model, reference, loaded = two_days("psm", "end_link", 0.2, [0.0, 0.02, 0.39], 3)
-    best = [
-        payload.link
-        for payload in equally_good_links(
-            estimate_payload(
-                Observations(reference, model.arm, model.section.signals),
-                Observations(loaded, model.arm, model.section.signals),
-                model,
-            )
-        )
-    ]
+    best = [payload.link for payload in equally_good_links(point_masses(reference, loaded, model))]
     # The cranks and the end link rotate by the same angle about points on the yaw axis.
     assert set(best) == {"end_link", "back_crank_link", "front_crank_link"}
 
@@ -133,37 +125,19 @@ def test_finds_the_link_and_equally_good_links():
 def test_no_payload_is_found_without_payload():
     for seed in range(3):
         model, reference, loaded = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], seed)
-        assert not any(
-            p.found
-            for p in estimate_payload(
-                Observations(reference, model.arm, model.section.signals),
-                Observations(loaded, model.arm, model.section.signals),
-                model,
-                ["end_link", "bottom_bar_link"],
-            )
-        )
+        assert not any(p.found for p in point_masses(reference, loaded, model, ["end_link", "bottom_bar_link"]))
 
 
 def test_rejects_identical_recordings():
     model, reference, _ = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
     with pytest.raises(RecordingError, match=r"simulated: the efforts equal the efforts of the reference"):
-        estimate_payload(
-            Observations(reference, model.arm, model.section.signals),
-            Observations(reference, model.arm, model.section.signals),
-            model,
-            ["end_link"],
-        )
+        point_masses(reference, reference, model, ["end_link"])
 
 
 def test_largest_mass_is_printed_without_payload(capsys):
     link = "end_link"
     model, reference, other = two_days("psm", link, 0.0, [0.0, 0.0, 0.0], 0)
-    (none,) = estimate_payload(
-        Observations(reference, model.arm, model.section.signals),
-        Observations(other, model.arm, model.section.signals),
-        model,
-        [link],
-    )
+    (none,) = point_masses(reference, other, model, [link])
     print_payload(make_console(), result_of(none, [none]))
     printed = " ".join(capsys.readouterr().out.split())
     assert "No payload found on end_link" in printed and f"below {1e3 * none.largest_at_com:.3g} g (95 %)" in printed
@@ -172,12 +146,7 @@ def test_largest_mass_is_printed_without_payload(capsys):
     com = next(own for own in model.regressor.links if own.link == link).parameters
     mass = 1.5 * none.largest_at_com
     model, reference, loaded = two_days("psm", link, mass, com[1:4] / com[0], 0)
-    (some,) = estimate_payload(
-        Observations(reference, model.arm, model.section.signals),
-        Observations(loaded, model.arm, model.section.signals),
-        model,
-        [link],
-    )
+    (some,) = point_masses(reference, loaded, model, [link])
     assert mass < some.largest_at_com < 4 * mass
 
 
@@ -210,24 +179,14 @@ def test_reports_a_payload_on_another_link(capsys):
     name, link, mass, position = CASES["end"]
     model, reference, loaded = two_days(name, link, mass, position, 0)
     assert_end_link_explains(
-        estimate_payload(
-            Observations(reference, model.arm, model.section.signals),
-            Observations(loaded, model.arm, model.section.signals),
-            model,
-            LINKS,
-        ),
+        point_masses(reference, loaded, model, LINKS),
         capsys,
     )
 
 
 def test_without_payload_no_link_is_better():
     model, reference, other = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
-    estimates = estimate_payload(
-        Observations(reference, model.arm, model.section.signals),
-        Observations(other, model.arm, model.section.signals),
-        model,
-        LINKS,
-    )
+    estimates = point_masses(reference, other, model, LINKS)
     for payload in estimates:
         assert not better_link_warnings(payload, estimates)
         assert payload.as_dict(estimates)["largest_at_com"] > 0
@@ -237,12 +196,7 @@ def test_aligns_a_reference_that_begins_later():
     name, link, mass, position = CASES["end"]
     model, reference, loaded = two_days(name, link, mass, position, 0)
     late = Recording(reference.q[260:], reference.tau[260:], reference.qd[260:], reference.t[260:])
-    (payload,) = estimate_payload(
-        Observations(late, model.arm, model.section.signals),
-        Observations(loaded, model.arm, model.section.signals),
-        model,
-        [link],
-    )
+    (payload,) = point_masses(late, loaded, model, [link])
     # Both motions have a period of 6.5 s, and t is the same clock.
     assert (payload.shift + 3.25) % 6.5 - 3.25 == pytest.approx(0, abs=2e-3)
     assert abs(payload.body.mass - mass) < 1.5 * payload.quantile * payload.mass_error
@@ -251,22 +205,12 @@ def test_aligns_a_reference_that_begins_later():
 def test_rejects_invalid_inputs():
     model, reference, loaded = two_days("psm", "end_link", 0.2, [0.0, 0.0, 0.4], 0)
     with pytest.raises(ModelError, match=r'unknown link "arm"\. Moving links of PSM: yaw_link, back_crank_link'):
-        estimate_payload(
-            Observations(reference, model.arm, model.section.signals),
-            Observations(loaded, model.arm, model.section.signals),
-            model,
-            ["arm"],
-        )
+        point_masses(reference, loaded, model, ["arm"])
     backwards = Recording(loaded.q[::-1], loaded.tau[::-1], -loaded.qd[::-1], loaded.t, source="other.csv")
     with pytest.raises(
         RecordingError, match=r"other.csv: the motion differs from the reference. .* at most 10 % is allowed"
     ):
-        estimate_payload(
-            Observations(reference, model.arm, model.section.signals),
-            Observations(backwards, model.arm, model.section.signals),
-            model,
-            ["end_link"],
-        )
+        point_masses(reference, backwards, model, ["end_link"])
 
 
 def test_payload_command(tmp_path, capsys):
@@ -347,12 +291,7 @@ def unloaded(shared_data):
 def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
     folder, reference, model = unloaded
     loaded = read_recording(folder / file, model.arm, "actuator")
-    (payload,) = estimate_payload(
-        Observations(reference, model.arm, model.section.signals),
-        Observations(loaded, model.arm, model.section.signals),
-        model,
-        [link],
-    )
+    (payload,) = point_masses(reference, loaded, model, [link])
     assert abs(payload.body.mass - mass) < payload.quantile * payload.mass_error
     assert abs(payload.position_in_base[2] - height) < payload.quantile * payload.position_error[2]
     assert abs(payload.body.mass / mass - 1) < 0.15
@@ -362,7 +301,7 @@ def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
 @pytest.mark.parametrize(("file", "link", "mass", "height"), WEIGHTS)
 def test_known_weights_without_reference(unloaded, file, link, mass, height):
     folder, _, model = unloaded
-    (payload,) = estimate_payload(
+    (payload,) = point_masses(
         None,
         Observations(read_recording(folder / file, model.arm, "actuator"), model.arm, model.section.signals),
         model,
@@ -377,11 +316,6 @@ def test_reports_a_real_payload_on_another_link(unloaded, capsys):
     folder, reference, model = unloaded
     loaded = read_recording(folder / "psm_one_205g_insertion.csv", model.arm, "actuator")
     assert_end_link_explains(
-        estimate_payload(
-            Observations(reference, model.arm, model.section.signals),
-            Observations(loaded, model.arm, model.section.signals),
-            model,
-            LINKS,
-        ),
+        point_masses(reference, loaded, model, LINKS),
         capsys,
     )

@@ -144,7 +144,7 @@ def test_invalid_measurements_lead_to_hold_then_fault(which, value, joints):
     bench.q = Q - 0.03
     output = bench.tick(100)
     assert output.control_mode == Command.EFFORT
-    np.testing.assert_allclose(output.effort[invalid], Heavy().gravity_effort(Q)[invalid], rtol=0.05, atol=0)
+    np.testing.assert_allclose(output.effort[invalid], Heavy().gravity_effort(Q)[invalid], rtol=0, atol=1e-12)
     bench.run(Command.HOLD, 1)
     output = bench.run(Command.HOLD, 1, reset_fault=True)
     assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_NONE)
