@@ -21,8 +21,8 @@ Columns of the table:
     accepted    accepted commands per second
     ignored     ignored and refused commands per second
 
-The arm, the controller and the measuring process use real-time scheduling if the system permits it. The flooding
-process does not.
+The arm and the controller use real-time scheduling if the system permits it. The measuring and the flooding process do
+not: on two cores, they would suspend each other.
 
 The benchmark requires a multicast route:
 
@@ -196,7 +196,6 @@ def main() -> None:
 
 def run(file: Path | None, options: argparse.Namespace) -> None:
     """Measures all kinds of flood and prints the table. `file` contains the key, or is None for no key."""
-    make_realtime()
     observer = Observer()
     while not observer.listen(0.1)[0].session_id:
         pass

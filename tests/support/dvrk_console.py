@@ -150,7 +150,7 @@ class Console:
 
 def _start(command, environment, output, arm, events, domain):
     """Starts the console. Returns its process and the `Console`. The file `output` receives its output."""
-    from dvrk_drake.systems.ros.domain import RosDomain
+    from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
     # A pipe that nobody reads would stop the process when it is full.
     with output.open("w") as stream:
@@ -160,11 +160,14 @@ def _start(command, environment, output, arm, events, domain):
         return re.search(r"console pid (\d+)", output.read_text(errors="replace"))
 
     try:
+        joined = open_ros_domain(domain)
         wait_until(pid, "start of the dVRK console", process)
-    except AssertionError as error:
+    except BaseException as error:
         process.kill()
-        raise AssertionError(f"{error}: {output.read_text(errors='replace')}") from None
-    return process, Console(arm, process, int(pid()[1]), events, RosDomain(domain))
+        if isinstance(error, AssertionError):
+            raise AssertionError(f"{error}: {output.read_text(errors='replace')}") from None
+        raise
+    return process, Console(arm, process, int(pid()[1]), events, joined)
 
 
 @contextlib.contextmanager
