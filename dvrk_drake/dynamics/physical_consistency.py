@@ -43,8 +43,10 @@ class BoundingBox:
 def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
     """Returns link -> bounding box for every moving link, according to `bounding_shapes` in the arm's files.
 
+    A link without collision shapes gets a box that contains its joints and a box with the link's inertia.
+
     Raises:
-        ArmError: A moving link has neither collision shapes nor a box, or a box is not valid.
+        ArmError: A box is not valid.
     """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
@@ -57,7 +59,9 @@ def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
             name = body.name()
             corners = shapes[name].boxes.get(name)
             if corners is None:
-                boxes[name] = _box_around_shapes(plant, scene_graph.model_inspector(), name, shapes[name].margin)
+                boxes[name] = _box_around_shapes(
+                    plant, scene_graph.model_inspector(), name, shapes[name].margin
+                ) or _box_from_inertia(plant, name, shapes[name].margin)
             else:
                 boxes[name] = _box_from_corners(name, corners)
     return boxes
@@ -75,7 +79,10 @@ def _shapes_of_links(arm: Arm) -> dict[str, BoundingShapes]:
     return settings
 
 
-def _box_around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: str, margin: float) -> BoundingBox:
+def _box_around_shapes(
+    plant: MultibodyPlant, inspector: SceneGraphInspector, link: str, margin: float
+) -> BoundingBox | None:
+    """Returns the box around the collision shapes of a link with a margin [m], None if it has no shapes."""
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
     frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(link).index())
     for geometry in inspector.GetGeometries(frame, Role.kProximity):
@@ -84,12 +91,23 @@ def _box_around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, li
         half_width = np.abs(X_LB.rotation().matrix()) @ box.half_width()
         lower = np.minimum(lower, X_LB.translation() - half_width)
         upper = np.maximum(upper, X_LB.translation() + half_width)
-    if not np.all(np.isfinite(lower)):
-        raise ArmError(
-            f"{link} has no <collision> in its SDF, so its bounding box is unknown. Define a box for this link in "
-            "bounding_shapes.boxes of the arm's mechanism or instrument file"
-        )
-    return BoundingBox(lower - margin, upper + margin)
+    return BoundingBox(lower - margin, upper + margin) if np.all(np.isfinite(lower)) else None
+
+
+def _box_from_inertia(plant: MultibodyPlant, link: str, margin: float) -> BoundingBox:
+    """Returns a box with a margin [m] around the joints of a link and around a solid box with its inertia.
+
+    The moments of a solid box with the half widths w about its centre of mass are m w^2 / 3.
+    """
+    body = plant.GetBodyByName(link)
+    M_LLo_L = body.default_spatial_inertia()
+    p_LoLcm_L = M_LLo_L.get_com()
+    G = M_LLo_L.Shift(p_LoLcm_L).get_unit_inertia().CopyToFullMatrix3()
+    half_width = np.sqrt(3 * (np.trace(G) / 2 - np.diag(G)))
+    joints = map(plant.get_joint, plant.GetJointIndices())
+    ends = [j.frame_on_parent().GetFixedPoseInBodyFrame().translation() for j in joints if j.parent_body() is body]
+    points = np.array([np.zeros(3), p_LoLcm_L - half_width, p_LoLcm_L + half_width, *ends])
+    return BoundingBox(points.min(axis=0) - margin, points.max(axis=0) + margin)
 
 
 def _box_from_corners(link: str, corners: BoxCorners) -> BoundingBox:

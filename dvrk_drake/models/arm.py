@@ -40,14 +40,14 @@ _MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """One arm of a dVRK. Arms and all their parts are immutable; `dataclasses.replace` returns a modified arm.
+    """One robot arm. Arms and all their parts are immutable; `dataclasses.replace` returns a modified arm.
 
     Vectors have n elements, one per independent joint, in the dVRK's order. Units are rad and N m for revolute joints,
     m and N for prismatic joints.
 
     Attributes:
         name: Name of the arm in the dVRK, e.g. "MTML".
-        source: Argument of `load_arm` for this arm: a name such as "mtml", or the absolute path of the YAML file.
+        source: Argument of `load_arm` for this arm: a name such as "mtml", or the absolute path of its file.
         joint_names: Names of the n independent joints.
         tree_joint_names: Names of all joints of the SDF tree, including the linkage.
         sdf: Package URLs or paths of the SDF files: first the arm, then its instrument if there is one.
@@ -61,7 +61,7 @@ class Arm:
         transmission: Map a = J q from joint positions q to actuator positions a.
         loop_closures: Pairs of frames whose origins coincide at every pose of the linkage.
         gravity: Gravity vector (3,) in the base frame [m/s^2].
-        gains: Default gains of the controller.
+        gains: Default gains of the controller. Without numbers while an arm without stated gains is loaded.
         friction_coordinates: Additional coordinates along which friction acts, besides joints and actuators: mapping
             from the name of a coordinate to a vector (n,), whose dot product with q is the coordinate.
         identification: Settings for recordings of the arm, and bounds of the mass distribution of the links.
@@ -128,16 +128,19 @@ class Arm:
             return fault
         if fault := number_fault(gains):
             return f"gains.{fault}"
-        width = self.position_upper - self.position_lower
-        least_error = self.per_joint(*_MIN_ERROR)
-        for name, rate in (("kp", 1.0), ("kd", 10.0), ("ki", 0.1)):
-            lowest = _MIN_SHARE[name] * self.effort_limits / width
-            highest = self.effort_limits / (rate * least_error)
+        for name in ("kp", "kd", "ki"):
+            lowest, highest = self.gain_range(name)
             for i, gain in enumerate(getattr(gains, name)):
                 allowed = Range(float(lowest[i]), float(highest[i]), also=() if name == "kp" else (0.0,))
                 if fault := allowed.fault(f"gains.{name}[{i}]", float(gain)):
                     return f"{fault} for the position range and effort limit of {self.joint_names[i]}"
         return ""
+
+    def gain_range(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the smallest and the largest accepted gains (n,) of one kind: "kp", "kd" or "ki"."""
+        rate = {"kp": 1.0, "kd": 10.0, "ki": 0.1}[name]
+        lowest = _MIN_SHARE[name] * self.effort_limits / (self.position_upper - self.position_lower)
+        return lowest, self.effort_limits / (rate * self.per_joint(*_MIN_ERROR))
 
     def _faults(self) -> Iterator[str]:
         arrays = ("position_lower", "position_upper", "effort_limits", "prismatic")
@@ -146,7 +149,8 @@ class Arm:
             limits = float(self.position_lower[i]), float(self.position_upper[i])
             yield limits_fault(f"position_limits.{name}", *limits, slides=bool(self.prismatic[i]))
             yield EFFORTS.fault(f"effort limit of joint {name}", float(self.effort_limits[i]))
-        yield self.gains_fault(self.gains)
+        if any(vars(self.gains).values()):
+            yield self.gains_fault(self.gains)
         for limit in self.coupled_limits:
             yield coupled_limit_fault(limit, self.joint_names, self.prismatic, self.position_lower, self.position_upper)
         for name, row in self.friction_coordinates.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
@@ -25,11 +26,14 @@ from dvrk_drake.models.arm_schema import (
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.model_file import MODEL_SUFFIXES
 from dvrk_drake.models.schema_fault import suggest_name
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 _ARMS = MODELS_FOLDER / "arms"
+#: Largest number of independent joints. The identification of a serial arm with more joints was not tested.
+MAX_JOINTS = 12
 
 Part = TypeVar("Part", Mechanism, Instrument)
 
@@ -42,11 +46,16 @@ def known_arms() -> list[str]:
 def load_arm(name: str | Path) -> Arm:
     """Loads an arm. Repeated calls, also from other threads, return the same immutable object until the file changes.
 
-    Changes of the other files of the arm (mechanism, instrument, SDF) take effect only in a new process.
+    Changes of the other files of an arm file (mechanism, instrument, model) take effect only in a new process.
+
+    A model file (URDF, SDF, MJCF or Drake's model directives) suffices. Joints that mimic no other joint are the
+    independent joints, in the order of the model. The base is the link that no joint moves, or the world if links are
+    fixed to it. Gravity acts along -z of the base. Gains result in a critically damped control of each joint. An arm
+    file can state all of this otherwise, see `derived_arm_file`.
 
     Args:
         name: Name of an arm of this package, e.g. "mtml" (not case-sensitive). For any other arm, the path or package
-            URL of its YAML file.
+            URL of its arm file (YAML) or of a model file.
 
     Raises:
         ArmError: The arm does not exist, or its files are invalid or inconsistent.
@@ -61,12 +70,9 @@ def load_arm(name: str | Path) -> Arm:
     name = os.fspath(name)
     if "\0" in name:
         raise ArmError(f"{name!r} is not a valid file name")
-    if not name.lower().endswith((".yaml", ".yml")):
+    if not name.lower().endswith((".yaml", ".yml", *MODEL_SUFFIXES)):
         if name.lower() not in known_arms() and os.path.isfile(name):
-            raise ArmError(
-                f"{name} is not an arm file: its name does not end in .yaml; known arms: {', '.join(known_arms())}, or "
-                "the path of a YAML file"
-            )
+            raise ArmError(f"{name} is not the file of an arm; {_accepted()}")
         return _load_arm(name.lower())
     path = Path(os.path.realpath(local_path(name)))
     # The name and the path of an arm of this package give the same Arm object.
@@ -92,12 +98,19 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     if not path.is_absolute():
         if name not in known_arms():
             near = suggest_name(name, known_arms())
-            raise ArmError(
-                f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}, or the path of a YAML file'
-            )
+            raise ArmError(f'unknown arm "{name}"; {near}{_accepted()}')
         path = _ARMS / f"{name}.yaml"
-    description = load_typed_yaml(ArmDescription, path, ArmError, "an arm file")
-    mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
+    if str(path).lower().endswith(MODEL_SUFFIXES):
+        description = ArmDescription(sdf=str(path))
+    else:
+        description = load_typed_yaml(ArmDescription, path, ArmError, "an arm file")
+    if description.mechanism and description.sdf:
+        raise ArmError(f"{path}: mechanism and sdf are both given; allowed: one of them")
+    mechanism: Mechanism = description
+    if description.mechanism:
+        mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
+    else:
+        _resolve_sdf(description, path)
     instrument = Instrument()
     if description.instrument:
         instrument = _load_part(Instrument, path, "instrument", description.instrument)
@@ -121,8 +134,7 @@ def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part
         if not os.path.lexists(path):
             raise ArmError(f"{arm_path}: {kind} {path} does not exist")
         part = load_typed_yaml(schema, path, ArmError, what)
-        if part.sdf and not part.sdf.startswith(PACKAGE_URL):
-            part.sdf = str(path.parent / part.sdf)
+        _resolve_sdf(part, path)
         return part
     folder = MODELS_FOLDER / f"{kind}s"
     known = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -133,26 +145,53 @@ def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part
     return load_typed_yaml(schema, folder / f"{name}.yaml", ArmError, what)
 
 
+def _resolve_sdf(part: Mechanism | Instrument, path: Path) -> None:
+    """Makes a path of a model file absolute, which is relative to the folder of the file at `path`."""
+    if part.sdf and not part.sdf.startswith(PACKAGE_URL):
+        part.sdf = str(path.parent / part.sdf)
+
+
+def _accepted() -> str:
+    """Returns the accepted arguments of `load_arm`, for messages."""
+    return (
+        f"known arms: {', '.join(known_arms())}, or the path of an arm file (.yaml) or of a model file "
+        f"({', '.join(MODEL_SUFFIXES[:4])})"
+    )
+
+
 def _build_arm(
     source: str, path: Path, description: ArmDescription, mechanism: Mechanism, instrument: Instrument
 ) -> Arm:
-    joints = [*mechanism.joints, *instrument.joints]
-    if not joints or len({*joints}) < len(joints):
-        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and all joint names must differ")
     if not mechanism.sdf:
-        raise ArmError(f"{path}: the mechanism file has no sdf")
+        raise ArmError(f"{path}: {'the mechanism file has no sdf' if description.mechanism else 'sdf is missing'}")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
     mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
     facts = read_sdf_facts(compose_sdf(sdf, mirrored))
-    position_limits = {**instrument.position_limits, **description.position_limits}
-    if set(joints) != set(position_limits):
-        raise ArmError(f"{path}: position_limits must have one entry for each of {', '.join(joints)}")
+    if not mechanism.joints:
+        others = {*facts.mimics, *instrument.joints}
+        mechanism.joints = [name for name in facts.joint_names if name not in others]
+    joints = [*mechanism.joints, *instrument.joints]
+    if not joints or len({*joints}) < len(joints):
+        raise ArmError(f"{path}: the mechanism and instrument need at least one joint, and all joint names must differ")
+    if len(joints) > MAX_JOINTS:
+        raise ArmError(f"{path}: the model has {len(joints)} independent joints; allowed: 1 to {MAX_JOINTS}")
+    position_limits = {**facts.position_limits, **instrument.position_limits, **description.position_limits}
+    for key, stated in (
+        ("position_limits", instrument.position_limits | description.position_limits),
+        ("effort_limits", description.effort_limits),
+    ):
+        if unknown := sorted(set(stated) - set(joints)):
+            raise ArmError(f'{path}: {key}: unknown joint "{unknown[0]}"; allowed: {", ".join(joints)}')
     if (separate := instrument.separate_joint) and separate not in instrument.joints:
         raise ArmError(f'{path}: separate_joint is "{separate}"; allowed: {", ".join(instrument.joints) or "none"}')
     if missing := set(joints) - set(facts.joint_names):
         raise ArmError(f"{path}: the SDF has no joint {', '.join(sorted(missing))}")
+    if unlimited := [j for j in joints if j not in position_limits]:
+        raise ArmError(f"{path}: joint {unlimited[0]} of the model has no position limits; state position_limits")
     limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
-    gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
+    effort_limits = _effort_limits(path, joints, facts.effort_limits | description.effort_limits)
+    has_gains = not mechanism.joints or any(vars(mechanism.gains).values())
+    joined = {k: getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")}
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
     for row, name in enumerate(facts.joint_names):
@@ -160,8 +199,8 @@ def _build_arm(
         if leader not in joints:
             raise ArmError(f"{path}: joint {name} of the SDF must be in the list joints, or mimic a joint of that list")
         G[row, joints.index(leader)], c[row] = multiplier, offset
-    return Arm(
-        name=description.name,
+    arm = Arm(
+        name=description.name or _name_of(path),
         source=source,
         joint_names=tuple(joints),
         tree_joint_names=facts.joint_names,
@@ -169,14 +208,14 @@ def _build_arm(
         mirrored_links=mirrored,
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
-        effort_limits=_effort_limits(path, joints, facts),
+        effort_limits=effort_limits,
         prismatic=np.array([j in facts.prismatic for j in joints]),
         coupled_limits=_coupled_limits(path, description, mechanism),
         linkage=LinearMap(G, c),
         transmission=LinearMap(_transmission(path, joints, mechanism, instrument), np.zeros(len(joints))),
         loop_closures=tuple(mechanism.loop_closures),
         gravity=checked_gravity(description.gravity),
-        gains=gains,
+        gains=Gains(**joined) if has_gains else Gains(),
         friction_coordinates={
             name: _row(path, f"friction_coordinates.{name}", terms, joints)
             for name, terms in instrument.friction_coordinates.items()
@@ -187,6 +226,16 @@ def _build_arm(
         console_gravity_compensation=mechanism.console_gravity_compensation,
         view=_view_settings(path, mechanism.view, instrument.view, facts),
     )
+    if has_gains:
+        return arm
+    from dvrk_drake.models.plant import critically_damped_gains  # circular import
+
+    return dataclasses.replace(arm, gains=critically_damped_gains(arm))
+
+
+def _name_of(path: Path) -> str:
+    """Returns the name of a file without its ending, with "_" for characters that ROS does not accept in a name."""
+    return re.sub(r"\W", "_", path.name.partition(".")[0], flags=re.ASCII)
 
 
 def _view_settings(path: Path, mechanism: ViewSettings, instrument: ViewSettings, facts: SdfFacts) -> ViewSettings:
@@ -235,10 +284,10 @@ def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanis
     limits = {limit.name: limit for limit in mechanism.coupled_limits}
     for limit in mechanism.coupled_limits:
         _row(path, f"coupled_limits.{limit.name}", limit.coefficients, mechanism.joints)
-    for name, bounds in description.coupled_limits.items():
+    for name, bounds in description.coupled_limit_bounds.items():
         if name not in limits:
             raise ArmError(f'{path}: unknown coupled limit "{name}"; known: {", ".join(limits) or "none"}')
-        lower, upper = _lower_and_upper(path, f"coupled_limits.{name}", bounds)
+        lower, upper = _lower_and_upper(path, f"coupled_limit_bounds.{name}", bounds)
         limits[name] = dataclasses.replace(limits[name], lower=lower, upper=upper)
     return tuple(limits.values())
 
@@ -251,10 +300,13 @@ def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmE
     return effects
 
 
-def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np.float64]:
-    if missing := [joint for joint in joints if joint not in facts.effort_limits]:
-        raise ArmError(f"{path}: joint {missing[0]} of the SDF needs a positive <axis><limit><effort> [N m, N]")
-    return np.array([facts.effort_limits[joint] for joint in joints])
+def _effort_limits(path: Path, joints: list[str], stated: dict[str, float]) -> NDArray[np.float64]:
+    if missing := [joint for joint in joints if not stated.get(joint, 0.0) > 0]:
+        raise ArmError(
+            f"{path}: joint {missing[0]} needs a positive effort limit [N m, N]: state it in the model, or under "
+            "effort_limits of an arm file"
+        )
+    return np.array([stated[joint] for joint in joints])
 
 
 def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:

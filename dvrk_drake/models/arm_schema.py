@@ -11,7 +11,7 @@ from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.immutable import Shared
-from dvrk_drake.models.schema_fault import Range, within
+from dvrk_drake.models.schema_fault import RANGE, Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: Accepted position limits of a joint. The roll joint of an MTM reaches -8.4 rad, and the joints of a UR10e reach 6.3
@@ -197,16 +197,18 @@ class Instrument:
 
 
 @dataclass
-class ArmDescription:
+class ArmDescription(Mechanism):
     """Schema of `arms/*.yaml`.
 
     `format` is the version of the file, see `FileFormat`. A file without this key has version 1.0.
     `mechanism` and `instrument` are names of files in the folders `mechanisms` and `instruments`, or paths of YAML
-    files relative to the folder of the arm file. `sdf` in a mechanism or instrument file is a path relative to the
-    folder of that file. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `mirrored_links` maps an SDF
-    file to its links that are mirrored for this arm (x to -x in the link's frame). SDF files without an entry, such as
-    a file exported from this arm, are used unchanged. `coupled_limits` maps the name of a coupled limit to its [lower,
-    upper] for this arm, e.g. after the calibration of a joint stop. These values replace the values of the mechanism.
+    files relative to the folder of the arm file. A file without `mechanism` has the keys of a mechanism itself; of
+    these keys, only `sdf` is required. `sdf` is the path of a model file relative to the folder of the file that
+    states it. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `position_limits` and `effort_limits`
+    replace those of the model. `mirrored_links` maps an SDF file to its links that are mirrored for this arm (x to -x
+    in the link's frame). SDF files without an entry, such as a file exported from this arm, are used unchanged.
+    `coupled_limit_bounds` maps the name of a coupled limit to its [lower, upper] for this arm, e.g. after the
+    calibration of a joint stop. These values replace the values of the mechanism.
     """
 
     format: str = field(default="", metadata=FileFormat("dvrk_drake arm", 1).metadata)
@@ -214,7 +216,8 @@ class ArmDescription:
     mechanism: str = ""
     instrument: str = ""
     position_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
-    coupled_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
+    effort_limits: dict[str, float] = field(default_factory=dict, metadata={RANGE: EFFORTS})
+    coupled_limit_bounds: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     mirrored_links: dict[str, list[str]] = field(default_factory=dict)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)
 

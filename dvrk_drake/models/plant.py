@@ -17,9 +17,14 @@ from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
+
+#: Bandwidth [rad/s] of derived gains, and ratio ki / kp [1/s]: within the 16 to 30 rad/s and 1.2 to 1.5 1/s of the
+#: gains of the MTM, which were tuned in simulation.
+_BANDWIDTH, _INTEGRAL_RATE = 20.0, 1.2
 
 
 def package_map() -> PackageMap:
@@ -175,6 +180,24 @@ def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]
         set_arm_positions(plant, context, arm, q)
         tau[row] = holding_torque(plant, context, arm)
     return tau
+
+
+def critically_damped_gains(arm: Arm) -> Gains:
+    """Returns gains with which each joint, moving alone, has the bandwidth `_BANDWIDTH` and is critically damped.
+
+    The inertia of a joint is the largest one in random poses, with the rotors of the model. The gains are within the
+    ranges of `Arm.gain_range`.
+    """
+    plant = shared_plant(arm)
+    context, selector = plant.CreateDefaultContext(), tree_selector(plant, arm)
+    inertia = np.zeros(arm.num_joints)
+    for q in arm.sample_poses(50, np.random.default_rng(0)):
+        set_arm_positions(plant, context, arm, q)
+        M = plant.CalcMassMatrix(context)[np.ix_(selector, selector)]
+        inertia = np.maximum(inertia, np.diag(arm.linkage.matrix.T @ M @ arm.linkage.matrix))
+    kp = _BANDWIDTH**2 * inertia
+    gains = {"kp": kp, "kd": 2 * _BANDWIDTH * inertia, "ki": _INTEGRAL_RATE * kp}
+    return Gains(**{name: np.clip(values, *arm.gain_range(name)).tolist() for name, values in gains.items()})
 
 
 def inverse_dynamics(

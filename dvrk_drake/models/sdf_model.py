@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.files import MAX_TEXT, read_input
+from dvrk_drake.models.immutable import cached
+from dvrk_drake.models.model_file import DRAKE, MODEL_SUFFIXES, convert_model, read_xml
 from dvrk_drake.models.schema_fault import Range
 
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"
-DRAKE = "{http://drake.mit.edu}"
-#: Maximum nesting of elements; the SDF of an arm has 7 levels.
-_MAX_DEPTH = 50
 #: Numbers in SDF files that mean that a joint has no position limit.
 _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
@@ -58,6 +57,7 @@ class SdfFacts:
         joint_names: Names of all moving joints.
         mimics: Mapping from a dependent joint to (leading joint, multiplier, offset).
         effort_limits: Mapping from a joint to its `<effort>` [N m or N]; joints without the tag have no entry.
+        position_limits: Mapping from a joint to its [lower, upper] [rad, m]; joints without both have no entry.
         prismatic: Names of the prismatic joints; all others are revolute.
         link_names: Names of the links.
         frame_names: Names of the frames that are not frames of links.
@@ -66,6 +66,7 @@ class SdfFacts:
     joint_names: tuple[str, ...]
     mimics: dict[str, tuple[str, float, float]]
     effort_limits: dict[str, float]
+    position_limits: dict[str, list[float]]
     prismatic: frozenset[str]
     link_names: frozenset[str]
     frame_names: frozenset[str]
@@ -93,10 +94,10 @@ def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | Non
         mirrored: Mapping from a URL to the links of that file that are mirrored (`mirror_links`).
 
     Raises:
-        ArmError: A file is not an SDF with one model, repeats a link with inertia, or does not contain a link in
+        ArmError: A file is not a model of an arm, repeats a link with inertia, or does not contain a link in
             `mirrored`.
     """
-    root, *others = (_read(local_path(url)) for url in urls)
+    root, *others = (_read(local_path(url), may_convert=url == urls[0]) for url in urls)
     for url, part in zip(urls, (root, *others), strict=True):
         mirror_links(part, (mirrored or {}).get(url, ()), url)
     (model,) = root.findall("model")
@@ -133,7 +134,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         # If the mass is missing, Drake uses 1 kg without a warning.
         if link.get("name") != "base_link" and not float(link.findtext("inertial/mass") or 0.0) > 0:
             raise ArmError(f"link {link.get('name')} of the SDF needs a positive <inertial><mass>")
-    names, mimics, efforts, prismatic = [], {}, {}, set()
+    names, mimics, efforts, positions, prismatic = [], {}, {}, {}, set()
     for joint in root.findall("model/joint"):
         name = joint.get("name", "")
         mimic = joint.find(f"{DRAKE}mimic")
@@ -163,18 +164,25 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         effort = joint.findtext("axis/limit/effort")
         if effort is not None:
             efforts[name] = float(effort)
+        limits = [float(joint.findtext(f"axis/limit/{side}", "inf")) for side in ("lower", "upper")]
+        if not set(limits) & set(_NO_LIMIT):
+            positions[name] = limits
     links, frames = (
         frozenset(part.get("name", "") for part in root.findall(f"model/{tag}")) for tag in ("link", "frame")
     )
-    return SdfFacts(tuple(names), mimics, efforts, frozenset(prismatic), links, frames)
+    return SdfFacts(tuple(names), mimics, efforts, positions, frozenset(prismatic), links, frames)
 
 
-def _read(path: Path) -> ElementTree.Element:
-    try:
-        root = _parse(read_input(path, ArmError, MAX_TEXT))
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ArmError(f"{path}: invalid SDF: {error}") from error
-    if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
+def _read(path: Path, may_convert: bool) -> ElementTree.Element:
+    """Returns the model of a file. A file that is not an SDF of one model with a link `base_link` may be converted."""
+    if may_convert and path.suffix.lower() != ".sdf" and path.name.lower().endswith(MODEL_SUFFIXES):
+        return _convert(path)
+    root = read_xml(path)
+    tags = [element.tag for element in root.iter() if element.tag in ("model", "include")]
+    is_one_model = root.find("model") is not None and tags == ["model"]
+    if may_convert and not (is_one_model and root.find("model/link[@name='base_link']") is not None):
+        return _convert(path)
+    if not is_one_model:
         raise ArmError(f"{path}: <sdf> must contain exactly one <model>, without a nested <model> or <include>")
     for link in root.iterfind("model/link"):
         # Files contain a mass of 0 only because Drake's parser uses 1 kg for a link without <inertial>.
@@ -189,19 +197,19 @@ def _read(path: Path) -> ElementTree.Element:
     return root
 
 
-def _parse(content: bytes) -> ElementTree.Element:
-    parser: Any = ElementTree.XMLPullParser(("start", "end"))
-    parser.feed(content)
-    depth = 0
-    root: ElementTree.Element | None = None
-    for event, element in parser.read_events():
-        root = element if root is None else root
-        depth += 1 if event == "start" else -1
-        if depth > _MAX_DEPTH:
-            raise ValueError(f"elements are nested deeper than {_MAX_DEPTH} levels")
-    parser.close()
-    if root is None:
-        raise ValueError("the file has no element")
+def _convert(path: Path) -> ElementTree.Element:
+    state = (0, 0)
+    with suppress(OSError):  # convert_model reports a missing file
+        status = path.stat()
+        state = (status.st_mtime_ns, status.st_size)
+    return copy.deepcopy(_converted(path, state))
+
+
+@cached
+def _converted(path: Path, state: tuple[int, int]) -> ElementTree.Element:
+    """Returns the converted model of a file. `state` (time of change, size) is its version."""
+    root = convert_model(path)
+    _check_numbers(path, root)
     return root
 
 

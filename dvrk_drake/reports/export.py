@@ -144,7 +144,7 @@ def _print_kinematic_compensation(
 ) -> None:
     """Prints the largest differences from the model, and the links of the kinematic chain in the file."""
     entries = f'"kinematic_gc": "{Path(path).name}", "mounting_pitch": {file.mounting_pitch:.6g}'
-    where = "the JSON file of the arm" if export.configuration is None else f"{export.configuration}"
+    where = "the arm's JSON" if export.configuration is None else f"{export.configuration}"
     print_answer(console, _loss_text(file.loss), f"enter {entries} in {where}")
     if file.configured_pitch is not None:
         what = f"mounting_pitch of {export.configuration}, {file.configured_pitch:.6g} rad (0 if it is not stated)"

@@ -413,7 +413,7 @@ def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -
 def _print_motion_validation(console: Console, validation: DynamicValidation, verbose: bool) -> None:
     name = Path(validation.recording.source).name or "recording"
     title = f"{validation.model.arm.name}, motion of {name}: RMS effort and error [N m; N]"
-    table = make_table(title, "", "measured", "error", "ratio", "repeatability", "inside", "other day", "verdict")
+    table = make_table(title, "", "effort", "error", "ratio", "repeatability", "inside", "other day", "verdict")
     table.columns[-1].justify = "left"
     for a in validation.actuators:
         shares = (

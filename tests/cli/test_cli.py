@@ -297,14 +297,14 @@ def test_commands_accept_an_arm_file(folder, tmp_path, capsys):
     """The arm file has a calibrated coupled limit. The model stores the path of the arm file."""
     text = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("name: MTMR", "name: OURS")
     arm_file = tmp_path / "ours.yaml"
-    arm_file.write_text(text + "coupled_limits:\n  parallelogram: [-0.22, 0.5]\n")
+    arm_file.write_text(text + "coupled_limit_bounds:\n  parallelogram: [-0.22, 0.5]\n")
     arm = load_arm(str(arm_file))
     assert (arm.coupled_limits[0].lower, arm.coupled_limits[0].upper) == (-0.22, 0.5)
     model = tmp_path / "model.yaml"
     assert main(["identify", f"{folder}/poses.csv", "--arm", str(arm_file), "--output", str(model)]) == 0
     assert main(["validate", f"{folder}/other.csv", "--model", str(model)]) == 0
     capsys.readouterr()
-    arm_file.write_text(text + "coupled_limits:\n  parallelogramm: [-0.22, 0.5]\n")
+    arm_file.write_text(text + "coupled_limit_bounds:\n  parallelogramm: [-0.22, 0.5]\n")
     (tmp_path / "other.yaml").write_text(arm_file.read_text())
     assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "model", "--arm", tmp_path / "other.yaml")
 

@@ -144,7 +144,7 @@ def test_gravity_that_mounting_pitch_cannot_express_is_refused(tmp_path, capsys,
     assert not os.path.exists("gc.json")
     assert main([*command, "pitch.yaml"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert 'enter "kinematic_gc": "gc.json", "mounting_pitch": -0.785398 in the JSON file of the arm' in printed
+    assert 'enter "kinematic_gc": "gc.json", "mounting_pitch": -0.785398 in the arm\'s JSON' in printed
     # An SDF has no gravity vector of the base frame. One line states it.
     assert main(["export", "--model", "roll.yaml", "--sdf", "roll.sdf"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
@@ -184,7 +184,7 @@ def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):
     assert main(["export", "--arm", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "are equal at rest" in printed and out.is_file()
-    assert 'enter "kinematic_gc": "psm.json", "mounting_pitch": 0 in the JSON file of the arm' in printed
+    assert 'enter "kinematic_gc": "psm.json", "mounting_pitch": 0 in the arm\'s JSON' in printed
     assert main(["export", "--arm", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
     assert "is not a PSM" in refusal(capsys.readouterr().err)
 

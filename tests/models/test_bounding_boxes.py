@@ -68,10 +68,16 @@ def with_shapes(arm, shapes):
     return dataclasses.replace(arm, identification=dataclasses.replace(arm.identification, bounding_shapes=(shapes,)))
 
 
-def test_links_without_bounds_are_refused():
+def test_link_without_shapes_gets_a_box_around_its_inertia():
     arm = load_arm("mtmr")
-    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*Define a box"):
-        bounding_boxes(with_shapes(arm, BoundingShapes()))
+    boxes = bounding_boxes(with_shapes(arm, BoundingShapes(margin=0.0)))
+    link = next(link for link in link_inertias(arm) if link.link == "motor_4_link")
+    # The solid box is the smallest box for which the second moments can be those of a body of uniform density.
+    assert np.all(box_margins(link.parameters, boxes["motor_4_link"]) >= 2 / 3 - 1e-9)
+
+
+def test_invalid_bounds_are_refused():
+    arm = load_arm("mtmr")
     box = BoxCorners([0, 0, 0], [1, -1, 1])
     with pytest.raises(ArmError, match="lower and upper of crank_link must be three numbers each"):
         shapes = dataclasses.replace(arm.identification.bounding_shapes[0], boxes={"crank_link": box})

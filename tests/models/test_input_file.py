@@ -134,11 +134,11 @@ def own_arm(folder, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("effort>", "ef>"), r"joint \S+ of the SDF needs a positive <axis><limit><effort>"),
+        (("effort>", "ef>"), r"joint \S+ needs a positive effort limit"),
         (("<mass>", "<mass>nan "), r"link \S+: <mass> is 'nan .*'; allowed: a finite number"),
         (("<ixx>", "<ixx>inf"), r"link \S+: <ixx> is 'inf.*'; allowed: a finite number"),
         (('multiplier="', 'multiplier="x'), r"joint \S+: multiplier is 'x.*'; allowed: a finite number"),
-        (("</model>", "<model name='a'/></model>"), r"own\.sdf: <sdf> must contain exactly one <model>"),
+        (("</model>", "<model name='a'/></model>"), r"own\.sdf: Drake cannot read this model: .*"),
         (('type="revolute"', 'type="ball"'), r"own\.yaml: joint \S+ of the SDF has type 'ball'; allowed: revolute"),
         (("<mass>", "<mass>-"), r"link \S+: <mass> is -\S+; allowed: 1e-06\.\.200 kg"),
         (("<inertial>.*?</inertial>", ""), r"link \S+ of the SDF needs a positive <inertial><mass>"),
@@ -152,7 +152,6 @@ def own_arm(folder, change):
             ("<child>upper_arm_link", "<child>no_link"),
             r"own\.yaml: .*own\.sdf: Drake cannot load this model: .*no_link",
         ),
-        (("base_link", "bottom_link"), r"own\.yaml: the SDF has no link base_link"),
     ],
 )
 def test_sdf_without_a_valid_arm_is_refused(change, message, tmp_path):
@@ -170,16 +169,16 @@ def test_gains_of_the_wrong_sign_are_refused(name, gain, tmp_path):
         load_arm(path)
 
 
-@pytest.mark.parametrize("key", ["position_limits.outer_yaw", "coupled_limits.parallelogram"])
+@pytest.mark.parametrize("key", ["position_limits.outer_yaw", "coupled_limit_bounds.parallelogram"])
 def test_limits_in_degrees_are_refused(key, tmp_path):
     table, name = key.split(".")
     path = Path(own_arm(tmp_path, ("<!--.*?-->", "")))
     content = yaml.safe_load(path.read_text())
     content.setdefault(table, {})[name] = [-40, 65]
     path.write_text(yaml.safe_dump(content))
-    with pytest.raises(
-        ArmError, match=rf"own\.yaml: {key}\[0\] is -40; allowed: -12\.6\.\.12\.6 rad; is it in degrees\?"
-    ):
+    where = key.replace("limit_bounds", "limits")
+    message = rf"own\.yaml: {where}\[0\] is -40; allowed: -12\.6\.\.12\.6 rad; is it in degrees\?"
+    with pytest.raises(ArmError, match=message):
         load_arm(str(path))
 
 

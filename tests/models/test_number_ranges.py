@@ -289,8 +289,8 @@ def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message
     [
         ("<effort>3[^<]*", "<effort>1e9", r"<effort> is 1e\+09; allowed: -1 or 0 or 0\.001\.\.2000 N m or N"),
         ("<effort>3[^<]*", "<effort>1e-9", r"<effort> is 1e-09; allowed: "),
-        ("<effort>3[^<]*", "<effort>0", r"effort limit of joint yaw is 0; allowed: 0\.001\.\.2000 N m or N"),
-        ("<effort>3[^<]*", "<effort>-1", r"effort limit of joint yaw is -1; allowed: "),
+        ("<effort>3[^<]*", "<effort>0", r"joint yaw needs a positive effort limit"),
+        ("<effort>3[^<]*", "<effort>-1", r"joint yaw needs a positive effort limit"),
         ("<mass>[^<]*", "<mass>1470.5", r"<mass> is 1470\.5; allowed: 1e-06\.\.200 kg; is it in g\?"),
         ("<mass>[^<]*", "<mass>1e-9", r"<mass> is 1e-09; allowed: "),
         ("<ixx>[^<]*", "<ixx>26605", r"<ixx> is 26605; allowed: 0\.\.50 kg m\^2"),

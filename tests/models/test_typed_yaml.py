@@ -36,7 +36,7 @@ def test_the_files_themselves_are_read(tmp_path):
         (
             "arm",
             ("name:", "nam:"),
-            'key "nam" is unknown; did you mean "name"? allowed in an arm file: format, name, mech',
+            'key "nam" is unknown; did you mean "name"? allowed in an arm file: format, sdf, joints, ',
         ),
         ("arm", ("name: PSM", "name: PSM\neffort_limit: abc"), 'key "effort_limit" is unknown; '),
         ("arm", ("name: PSM", "name: [PSM]"), "name is ['PSM']; allowed: a string"),
@@ -44,8 +44,8 @@ def test_the_files_themselves_are_read(tmp_path):
         ("arm", ("yaw: [", "yaw: [low, "), 'position_limits.yaw[0] is "low"; allowed: a number'),
         (
             "arm",
-            ("name: PSM", "name: PSM\ncoupled_limits: []"),
-            "coupled_limits is []; allowed: a mapping from names to",
+            ("name: PSM", "name: PSM\ncoupled_limit_bounds: []"),
+            "coupled_limit_bounds is []; allowed: a mapping from names to",
         ),
         (
             "mechanism",

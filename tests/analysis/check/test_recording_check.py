@@ -24,7 +24,7 @@ from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import MIN_ROWS, Recording
 from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.reports.terminal_tables import make_table
 
@@ -160,10 +160,11 @@ def test_motion_without_velocities():
 
 
 @pytest.mark.parametrize("rows", [1, 2, 99, 100, 150, 600, 1010, 1500, 2100])
-def test_short_recordings_are_not_refused(rows):
+def test_only_motions_of_few_rows_are_refused(rows):
     whole = clean_motion()
     short = replace(whole, q=whole.q[:rows], qd=whole.qd[:rows], tau=whole.tau[:rows], t=whole.t[:rows])
-    assert check_recording(Observations(short, load_arm("psm"))).refusals == ()
+    refusals = check_recording(Observations(short, load_arm("psm"))).refusals
+    assert [finding.kind for finding in refusals] == (["too few rows"] if 1 < rows < MIN_ROWS else [])
 
 
 def test_arm_at_rest_without_efforts():
@@ -184,12 +185,12 @@ def test_lcm_log(tmp_path):
         status.position_commanded, status.effort_commanded = status.position, status.effort_measured
         events.append(event_bytes(LcmEvent(row, status.utime, status_channel(arm), status.encode())))
     (tmp_path / "arm.log").write_bytes(b"".join(events))
-    report = check_recording(Observations(Observations(read_recording(tmp_path / "arm.log", arm)), arm))
+    report = check_recording(Observations(read_recording(tmp_path / "arm.log", arm), arm))
     assert report.kind == "motion"
     assert [finding.kind for finding in report.findings] == ["repetition"]
     assert report.period == pytest.approx(PERIOD, abs=1e-3)
     (tmp_path / "cut.log").write_bytes(b"".join(events)[:-10])
-    report = check_recording(Observations(Observations(read_recording(tmp_path / "cut.log", arm)), arm))
+    report = check_recording(Observations(read_recording(tmp_path / "cut.log", arm), arm))
     assert {finding.kind for finding in report.findings} == {"reading", "repetition"}
 
 

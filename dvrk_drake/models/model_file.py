@@ -1,0 +1,527 @@
+"""Converts a robot model that Drake's parser reads (URDF, SDF, MJCF, model directives) to the SDF of an arm."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    Mesh,
+    Role,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import LoadModelDirectives, Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Joint,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+    UnitInertia,
+    WeldJoint,
+)
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.files import MAX_TEXT, read_input
+
+#: Endings of the names of model files.
+MODEL_SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml", ".dmd.yml")
+#: Prefix of the names of Drake's extensions of SDF and URDF.
+DRAKE = "{http://drake.mit.edu}"
+#: Maximum nesting of elements; the models of the dVRK's arms have 7 levels.
+_MAX_DEPTH = 50
+#: Position limits of a joint that can turn without end [rad]. Most drives of such joints count two turns at most.
+CONTINUOUS = 2 * math.pi
+#: Mass of a massless link between two moving joints, as a share of the mean mass of the links. Such a link only
+#: connects the axes of a joint with two degrees of freedom. Its mass must be positive, and small for the other links.
+_CONNECTOR_MASS = 1e-3
+#: Smallest radius of gyration of a link, as a share of the largest distance between two neighbouring joints. A smaller
+#: one (in some files 0) would fix the inertia in an identification, since priors are relative to it.
+_MIN_GYRATION = 0.02
+
+
+class _Link(NamedTuple):
+    """A body with all bodies that are welded to it.
+
+    Attributes:
+        name: Name of the link.
+        members: Body -> its pose X_LB in the frame of the link.
+        joint: Joint that moves the link, None for the base.
+    """
+
+    name: str
+    members: dict[BodyIndex, RigidTransform]
+    joint: Joint | None
+
+
+def convert_model(path: Path) -> ElementTree.Element:
+    """Returns the root element `<sdf>` of the arm in a model file.
+
+    The links are `base_link`, which is the world and all that is welded to it, and one link per moving joint. Bodies
+    that are welded to a link become a part of it, and their frames become frames of the link. The origin of a link is
+    on the axis of its joint. Joints, mimic joints, limits, rotors, frames and shapes are those of the file. Shapes are
+    omitted if a mesh is missing.
+
+    Raises:
+        ArmError: Drake cannot read the file, or the model is not an arm: it has a floating body, a joint with several
+            degrees of freedom, a closed loop, no moving joint, no masses, or two joints with one name.
+    """
+    try:
+        return _Model.of(path).to_sdf()
+    except ArmError as error:
+        raise error if str(error).startswith(str(path)) else ArmError(f"{path}: {error}") from error
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """Returns the root element of an XML file.
+
+    Raises:
+        ArmError: The file cannot be read, is not XML, or has more than `_MAX_DEPTH` levels of elements.
+    """
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
+    depth = 0
+    root: ElementTree.Element | None = None
+    try:
+        parser.feed(read_input(path, ArmError, MAX_TEXT))
+        for event, element in parser.read_events():
+            root = element if root is None else root
+            depth += 1 if event == "start" else -1
+            if depth > _MAX_DEPTH:
+                raise ValueError(f"elements are nested deeper than {_MAX_DEPTH} levels")
+        parser.close()
+        if root is None:
+            raise ValueError("the file has no element")
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise ArmError(f"{path}: invalid XML: {error}") from error
+    return root
+
+
+class _DrakeLog(logging.Handler):
+    """Context in which the messages of Drake's parser are collected instead of being printed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.messages: list[str] = []
+        self._logger = logging.getLogger("drake")
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Collects a message."""
+        self.messages.append(record.getMessage())
+
+    def __enter__(self) -> _DrakeLog:
+        self._handlers, self._propagate = self._logger.handlers, self._logger.propagate
+        self._logger.handlers, self._logger.propagate = [self], False
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.handlers, self._logger.propagate = self._handlers, self._propagate
+
+
+@dataclass(eq=False)
+class _Model:
+    """Model that Drake has read.
+
+    Attributes:
+        plant: Finalized plant of the model.
+        scene_graph: Shapes of the model, None without shapes.
+        documents: Root elements of the XML files of the model.
+    """
+
+    plant: MultibodyPlant
+    scene_graph: SceneGraph | None
+    documents: list[ElementTree.Element]
+    _names: set[str] = field(default_factory=set)
+
+    @classmethod
+    def of(cls, path: Path) -> _Model:
+        """Reads a model file, without its shapes if a mesh is missing."""
+        if path.suffix.lower() not in (".yaml", ".yml"):
+            read_xml(path)
+        try:
+            with _DrakeLog() as log:
+                try:
+                    model = cls._read(path, with_shapes=True)
+                except (RuntimeError, ValueError):
+                    log.messages.clear()
+                    model = cls._read(path, with_shapes=False)
+        except (RuntimeError, ValueError) as error:
+            raise ArmError(f"Drake cannot read this model: {' '.join(str(error).split())[:300]}") from error
+        if places := sorted({message.split(": warning: ")[0] for message in log.messages if "inertia" in message}):
+            warnings.warn(
+                f"{', '.join(places)}: the inertia is not physically consistent; a sphere of the same mass is assumed",
+                UserWarning,
+                stacklevel=2,
+            )
+        return model
+
+    @classmethod
+    def _read(cls, path: Path, with_shapes: bool) -> _Model:
+        plant, scene_graph = MultibodyPlant(1e-3), SceneGraph() if with_shapes else None
+        if scene_graph is not None:
+            plant.RegisterAsSourceForSceneGraph(scene_graph)
+        parser = Parser(plant)
+        parser.package_map().PopulateFromRosPackagePath()
+        parser.package_map().PopulateFromFolder(str(path.parent))
+        # Most ROS packages are one or two folders above their URDF files.
+        for folder in path.parents[:2]:
+            if not parser.package_map().Contains(folder.name):
+                parser.package_map().Add(folder.name, str(folder))
+        parser.AddModels(str(path))
+        documents = [read_xml(file) for file in _files(path, parser)]
+        _weld_base(plant)
+        plant.Finalize()
+        return cls(plant, scene_graph, documents)
+
+    @property
+    def joints(self) -> list[Joint]:
+        """All joints."""
+        return [self.plant.get_joint(index) for index in self.plant.GetJointIndices()]
+
+    @cached_property
+    def links(self) -> list[_Link]:
+        """Links of the tree, each after its parent."""
+        children: dict[BodyIndex, list[Joint]] = {}
+        for joint in self.joints:
+            children.setdefault(joint.parent_body().index(), []).append(joint)
+        links: list[_Link] = []
+        open_links = [_Link("base_link", {self.plant.world_body().index(): RigidTransform()}, None)]
+        while open_links:
+            link = open_links.pop(0)
+            links.append(link)
+            todo = list(link.members)
+            while todo:
+                body = todo.pop()
+                for joint in children.get(body, ()):
+                    X_LP = link.members[body] @ joint.frame_on_parent().GetFixedPoseInBodyFrame()
+                    X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+                    child = joint.child_body().index()
+                    if isinstance(joint, WeldJoint):
+                        link.members[child] = X_LP @ joint.X_FM() @ X_MB
+                        todo.append(child)
+                    elif isinstance(joint, RevoluteJoint | PrismaticJoint):
+                        open_links.append(_Link(self._name(joint.child_body()), {child: X_MB}, joint))
+                    else:
+                        raise ArmError(
+                            f"joint {joint.name()} is of type {joint.type_name()}; allowed: revolute, continuous, "
+                            "prismatic and fixed joints"
+                        )
+        return links
+
+    def _name(self, body: RigidBody) -> str:
+        """Returns the name of a body, with the name of its model if another body has the same name."""
+        name = body.name()
+        if name in self._names or name in ("base_link", "world"):
+            name = f"{self.plant.GetModelInstanceName(body.model_instance())}_{name}"
+        self._names.add(name)
+        return name
+
+    def to_sdf(self) -> ElementTree.Element:
+        """Returns the root element of the SDF."""
+        moving = self.links[1:]
+        names = [link.joint.name() for link in moving if link.joint]
+        if not moving:
+            raise ArmError("the model has no moving joint")
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise ArmError(f"several joints have the name {repeated[0]}")
+        mimics = self._mimics()
+        if self.plant.num_constraints() > len(mimics):
+            raise ArmError("the model has a closed loop; allowed: loops whose dependent joints are mimic joints")
+        root = ElementTree.Element("sdf", version="1.9")
+        instance = self.plant.get_body(next(iter(moving[0].members))).model_instance()
+        model = ElementTree.SubElement(root, "model", name=self.plant.GetModelInstanceName(instance))
+        context = self.plant.CreateDefaultContext()
+        self.plant.SetPositions(context, np.zeros(self.plant.num_positions()))
+        efforts = self._effort_limits()
+        for link, inertia in zip(self.links, [None, *self._inertias()], strict=True):
+            body, X_LB = next(iter(link.members.items()))
+            X_WL = self.plant.get_body(body).EvalPoseInWorld(context) @ X_LB.inverse()
+            element = ElementTree.SubElement(model, "link", name=link.name)
+            _add_pose(element, X_WL)
+            if inertia is not None:
+                element.append(inertial_element(inertia))
+            for body, X_LB in link.members.items():
+                self._add_shapes(element, body, X_LB)
+        parents = {body: link.name for link in self.links for body in link.members}
+        for link in moving:
+            assert link.joint is not None
+            parent = parents[link.joint.parent_body().index()]
+            self._add_joint(model, link, parent, efforts.get(link.joint.name()), mimics.get(link.joint.name()))
+        self._add_frames(model)
+        return root
+
+    def _inertias(self) -> list[SpatialInertia]:
+        """Returns the inertia of each moving link about its origin, with `_MIN_GYRATION`."""
+        found, sizes = [], [0.0]
+        for link in self.links[1:]:
+            M_LLo_L = SpatialInertia.Zero()
+            for index, X_LB in link.members.items():
+                body = self.plant.get_body(index)
+                M_BBo_B = body.default_spatial_inertia()
+                if M_BBo_B.get_mass() > 0 and body.name() not in self._massless:
+                    M_LLo_L += M_BBo_B.ReExpress(X_LB.rotation()).Shift(-X_LB.translation())
+            found.append(M_LLo_L)
+            sizes += [float(np.linalg.norm(X_LB.translation())) for X_LB in link.members.values()]
+            assert link.joint is not None
+            sizes.append(float(np.linalg.norm(link.joint.frame_on_parent().GetFixedPoseInBodyFrame().translation())))
+        masses = [M.get_mass() for M in found]
+        if not max(masses) > 0:
+            raise ArmError("no moving link has a mass; the model must state <inertial> or geometry with a density")
+        least_gyration = _MIN_GYRATION * max(sizes)
+        for i, mass in enumerate(masses):
+            if not mass > 0:
+                found[i] = SpatialInertia(_CONNECTOR_MASS * float(np.mean(masses)), np.zeros(3), UnitInertia(0, 0, 0))
+            found[i] = _with_gyration(found[i], least_gyration)
+        return found
+
+    @cached_property
+    def _massless(self) -> set[str]:
+        """Links of URDF and SDF files without a mass. For some of them, Drake's parser assumes 1 kg.
+
+        Raises:
+            ArmError: A mass is negative or not a number.
+        """
+        found = set()
+        for link in (link for document in self.documents for link in document.iter("link")):
+            mass = link.find("inertial/mass")
+            text = "0" if mass is None else mass.get("value", mass.text or "")
+            try:
+                is_valid = float(text) >= 0
+            except ValueError:
+                is_valid = False
+            if not is_valid:
+                raise ArmError(f"link {link.get('name')}: the mass is {text!r}; allowed: a number, not negative [kg]")
+            if float(text) == 0:
+                found.add(link.get("name", ""))
+        return found
+
+    def _mimics(self) -> dict[str, dict[str, str]]:
+        """Returns the attributes of `drake:mimic` for each dependent joint."""
+        found = {}
+        for document in self.documents:
+            for joint in document.iter("joint"):
+                for mimic in (joint.find("mimic"), joint.find(f"{DRAKE}mimic"), joint.find("axis/mimic")):
+                    if mimic is not None:
+                        multiplier = mimic.findtext("multiplier", mimic.get("multiplier", "1"))
+                        offset = mimic.findtext("offset", mimic.get("offset", "0"))
+                        leader = mimic.get("joint", "")
+                        found[joint.get("name", "")] = {"joint": leader, "multiplier": multiplier, "offset": offset}
+            for equality in document.iterfind("equality/joint"):
+                constant, linear, *higher = [*map(float, equality.get("polycoef", "0 1 0 0 0").split()), 0.0]
+                second = equality.get("joint2")
+                if second is not None and not any(higher):
+                    values = {"joint": second, "multiplier": repr(linear), "offset": repr(constant)}
+                    found[equality.get("joint1", "")] = values
+        return found
+
+    def _effort_limits(self) -> dict[str, float]:
+        """Returns the effort limits of the joints. A URDF states them also for joints without a motor."""
+        limits = {
+            joint.get("name", ""): float(limit.get("effort", "0"))
+            for document in self.documents
+            if document.tag == "robot"
+            for joint in document.iter("joint")
+            if (limit := joint.find("limit")) is not None
+        }
+        for index in self.plant.GetJointActuatorIndices():
+            actuator = self.plant.get_joint_actuator(index)
+            limits.setdefault(actuator.joint().name(), actuator.effort_limit())
+        return {name: limit for name, limit in limits.items() if 0 < limit < math.inf}
+
+    def _add_joint(
+        self, model: ElementTree.Element, link: _Link, parent: str, effort: float | None, mimic: dict[str, str] | None
+    ) -> None:
+        joint = link.joint
+        assert isinstance(joint, RevoluteJoint | PrismaticJoint)
+        slides = isinstance(joint, PrismaticJoint)
+        element = ElementTree.SubElement(model, "joint", name=joint.name(), type="prismatic" if slides else "revolute")
+        add_element(element, "parent", parent)
+        add_element(element, "child", link.name)
+        axis = ElementTree.SubElement(element, "axis")
+        add_element(axis, "xyz", _numbers(joint.translation_axis() if slides else joint.revolute_axis()))
+        limit = ElementTree.SubElement(axis, "limit")
+        lower, upper = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
+        if not lower < upper:
+            raise ArmError(
+                f"joint {joint.name()}: the position limits are {lower:g}, {upper:g}; allowed: lower < upper"
+            )
+        if not slides and math.isinf(lower) and math.isinf(upper):
+            lower, upper = -CONTINUOUS, CONTINUOUS
+        values = {"lower": lower, "upper": upper, "effort": effort}
+        if math.isfinite(speed := float(joint.velocity_upper_limits()[0])) and speed > 0:
+            values["velocity"] = speed
+        for tag, value in values.items():
+            if value is not None:
+                add_element(limit, tag, repr(value))
+        if damping := float(joint.default_damping_vector()[0]):
+            add_element(ElementTree.SubElement(axis, "dynamics"), "damping", repr(damping))
+        if mimic is not None:
+            ElementTree.SubElement(element, f"{DRAKE}mimic", mimic)
+        for index in self.plant.GetJointActuatorIndices():
+            actuator = self.plant.get_joint_actuator(index)
+            if actuator.joint() is joint and actuator.default_rotor_inertia() > 0:
+                add_element(element, f"{DRAKE}rotor_inertia", repr(actuator.default_rotor_inertia()))
+                add_element(element, f"{DRAKE}gear_ratio", repr(actuator.default_gear_ratio()))
+
+    def _add_frames(self, model: ElementTree.Element) -> None:
+        """Adds the frames of the bodies that are a part of a link, and the other frames of the file."""
+        names = {"world", *(link.name for link in self.links)}
+        of_joints = {f.index() for joint in self.joints for f in (joint.frame_on_parent(), joint.frame_on_child())}
+        for link in self.links:
+            for body, X_LB in link.members.items():
+                own = self.plant.get_body(body)
+                others = map(self.plant.get_frame, self.plant.GetFrameIndices(own.model_instance()))
+                frames = [own.body_frame(), *(f for f in others if f.body() is own and not f.is_body_frame())]
+                for frame in frames:
+                    name = frame.name()
+                    is_own = frame.is_body_frame() or frame.index() not in of_joints
+                    if name and is_own and name not in names and not name.startswith("__"):
+                        names.add(name)
+                        element = ElementTree.SubElement(model, "frame", name=name, attached_to=link.name)
+                        _add_pose(element, X_LB @ frame.GetFixedPoseInBodyFrame())
+
+    def _add_shapes(self, element: ElementTree.Element, body: BodyIndex, X_LB: RigidTransform) -> None:
+        if self.scene_graph is None:
+            return
+        inspector = self.scene_graph.model_inspector()
+        frame = self.plant.GetBodyFrameIdOrThrow(body)
+        for tag, role in (("visual", Role.kIllustration), ("collision", Role.kProximity)):
+            for geometry in inspector.GetGeometries(frame, role):
+                shape = _shape(inspector.GetShape(geometry))
+                if shape is None:
+                    continue
+                name = f"{inspector.GetName(geometry).rpartition('::')[2]}_{len(element)}"
+                part = ElementTree.SubElement(element, tag, name=name)
+                _add_pose(part, X_LB @ inspector.GetPoseInFrame(geometry))
+                ElementTree.SubElement(part, "geometry").append(shape)
+                properties = inspector.GetIllustrationProperties(geometry) if tag == "visual" else None
+                if properties is not None and properties.HasProperty("phong", "diffuse"):
+                    color = properties.GetProperty("phong", "diffuse")
+                    material = ElementTree.SubElement(part, "material")
+                    add_element(material, "diffuse", _numbers([color.r(), color.g(), color.b(), color.a()]))
+
+
+def _files(path: Path, parser: Parser) -> Iterator[Path]:
+    """Yields the XML files of a model file, which may be model directives."""
+    if not path.name.lower().endswith((".yaml", ".yml")):
+        yield path
+        return
+    for directive in LoadModelDirectives(str(path)).directives:
+        added = directive.add_model or directive.add_directives
+        if added is not None:
+            package, _, relative = added.file.removeprefix("package://").partition("/")
+            if added.file.startswith("package://"):
+                yield from _files(Path(parser.package_map().GetPath(package)) / relative, parser)
+            else:
+                yield from _files(Path(re.sub("^file://", "", added.file)), parser)
+
+
+def _weld_base(plant: MultibodyPlant) -> None:
+    """Welds the only body that no joint moves to the world, if nothing is attached to the world.
+
+    Raises:
+        ArmError: Several bodies are not connected by joints.
+    """
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    moved = {joint.child_body().index() for joint in joints}
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    roots = [body for body in bodies if body.index() not in moved]
+    if len(roots) > 1 or (roots and any(joint.parent_body() is plant.world_body() for joint in joints)):
+        names = ", ".join(sorted(body.name() for body in roots)[:5])
+        raise ArmError(f"no joint connects {names} to the rest; allowed: one tree of links, without a floating base")
+    for root in roots:
+        plant.WeldFrames(plant.world_frame(), root.body_frame())
+
+
+def _with_gyration(M_LLo_L: SpatialInertia, least: float) -> SpatialInertia:
+    """Returns the inertia, with a sphere added to its moments if a radius of gyration [m] is less than `least`."""
+    m, p_LoLcm_L = M_LLo_L.get_mass(), M_LLo_L.get_com()
+    I_LLcm_L = M_LLo_L.Shift(p_LoLcm_L).CalcRotationalInertia().CopyToFullMatrix3()
+    moments = np.linalg.eigvalsh(I_LLcm_L)
+    # The second moments along the principal axes, of which those of a flat or thin body are 0.
+    if moments.sum() / 2 - moments.max() >= m * least**2:
+        return M_LLo_L
+    I_LLcm_L += 2 * m * least**2 * np.eye(3)
+    central = RotationalInertia(*np.diag(I_LLcm_L), I_LLcm_L[0, 1], I_LLcm_L[0, 2], I_LLcm_L[1, 2])
+    return SpatialInertia.MakeFromCentralInertia(m, p_LoLcm_L, central)
+
+
+def inertial_element(M_LLo_L: SpatialInertia) -> ElementTree.Element:
+    """Returns the element `<inertial>` in full precision, with the rotational inertia about the centre of mass."""
+    p_LoLcm_L = M_LLo_L.get_com()
+    I_LLcm_L = M_LLo_L.Shift(p_LoLcm_L).CalcRotationalInertia()
+    element = ElementTree.Element("inertial")
+    add_element(element, "pose", f"{_numbers(p_LoLcm_L)} 0 0 0")
+    add_element(element, "mass", repr(float(M_LLo_L.get_mass())))
+    inertia_element = ElementTree.SubElement(element, "inertia")
+    values = _numbers([*I_LLcm_L.get_moments(), *I_LLcm_L.get_products()]).split()
+    for name, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), values, strict=True):
+        add_element(inertia_element, name, value)
+    return element
+
+
+def _shape(shape: Shape) -> ElementTree.Element | None:
+    """Returns the SDF element of a shape, None if SDF has no such shape."""
+    match shape:
+        case Box():
+            values = {"size": shape.size()}
+        case Sphere():
+            values = {"radius": [shape.radius()]}
+        case Cylinder() | Capsule():
+            values = {"radius": [shape.radius()], "length": [shape.length()]}
+        case Ellipsoid():
+            values = {"radii": [shape.a(), shape.b(), shape.c()]}
+        case Mesh() | Convex() if shape.source().is_path():
+            element = ElementTree.Element("mesh")
+            add_element(element, "uri", str(shape.source().path()))
+            add_element(element, "scale", _numbers(shape.scale3()))
+            if isinstance(shape, Convex):
+                ElementTree.SubElement(element, f"{DRAKE}declare_convex")
+            return element
+        case _:
+            return None
+    element = ElementTree.Element(type(shape).__name__.lower())
+    for tag, numbers in values.items():
+        add_element(element, tag, _numbers(numbers))
+    return element
+
+
+def _add_pose(element: ElementTree.Element, X: RigidTransform) -> None:
+    """Adds the element `<pose>`, unless it is the identity."""
+    if not X.IsExactlyIdentity():
+        rpy = RollPitchYaw(X.rotation()).vector()
+        add_element(element, "pose", " ".join(repr(float(x) + 0.0) for x in (*X.translation(), *rpy)))
+
+
+def add_element(parent: ElementTree.Element, tag: str, text: str) -> ElementTree.Element:
+    """Adds an element with a text."""
+    element = ElementTree.SubElement(parent, tag)
+    element.text = text
+    return element
+
+
+def _numbers(values: ArrayLike) -> str:
+    """Formats numbers in full precision. Numbers below 1e-15 times the largest number become 0."""
+    array = np.asarray(values, dtype=float).ravel()
+    threshold = 1e-15 * np.abs(array).max()
+    return " ".join(repr(float(x)) if abs(x) > threshold else "0" for x in array)

@@ -1,0 +1,69 @@
+"""Model files of a robot that is not an arm of this package."""
+
+from pathlib import Path
+
+#: Arm with four moving joints: a turning column, a carriage on it, and two links of which the second mimics the first.
+#: The column has two bodies, and the base is fixed to the world by a turned joint.
+URDF = """<robot name="crane">
+  <link name="world"/>
+  <link name="floor">
+    <inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="anchor" type="fixed">
+    <parent link="world"/><child link="floor"/><origin xyz="0.1 0.2 0.3" rpy="0.3 0.2 0.1"/>
+  </joint>
+  <link name="column">
+    <inertial><origin xyz="0.02 0.01 0.2"/><mass value="3"/>
+      <inertia ixx="0.05" iyy="0.06" izz="0.02" ixy="0.001" ixz="0.002" iyz="0.003"/></inertial>
+    <collision><origin xyz="0 0 0.2"/><geometry><box size="0.1 0.1 0.4"/></geometry></collision>
+  </link>
+  <joint name="turn" type="continuous">
+    <parent link="floor"/><child link="column"/><axis xyz="0 0 1"/><limit effort="80" velocity="3"/>
+    <dynamics damping="0.5"/>
+  </joint>
+  <link name="motor_box">
+    <inertial><origin xyz="0 0.05 0"/><mass value="1.5"/>
+      <inertia ixx="0.004" iyy="0.003" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://crane_description/meshes/no_such_file.obj"/></geometry></visual>
+  </link>
+  <joint name="mount" type="fixed">
+    <parent link="column"/><child link="motor_box"/><origin xyz="0.1 0 0.1" rpy="0 0 1.2"/>
+  </joint>
+  <link name="carriage">
+    <inertial><origin xyz="0.1 0 0"/><mass value="2"/>
+      <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="lift" type="prismatic">
+    <parent link="column"/><child link="carriage"/><origin xyz="0 0.03 0.4" rpy="0 0.4 0"/><axis xyz="0 0 1"/>
+    <limit lower="0" upper="0.3" effort="120" velocity="1"/>
+  </joint>
+  <link name="arm">
+    <inertial><origin xyz="0.2 0.01 0"/><mass value="1.2"/>
+      <inertia ixx="0.002" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="swing" type="revolute">
+    <parent link="carriage"/><child link="arm"/><origin xyz="0.2 0 0" rpy="1.5 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-1.5" upper="2" effort="20" velocity="4"/>
+  </joint>
+  <link name="hand">
+    <inertial><origin xyz="0.05 0 0.02"/><mass value="0.4"/>
+      <inertia ixx="0.0004" iyy="0.0008" izz="0.0007" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="level" type="revolute">
+    <parent link="arm"/><child link="hand"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="10" velocity="4"/><mimic joint="swing" multiplier="-0.8" offset="0.1"/>
+  </joint>
+  <link name="tip"/>
+  <joint name="tip_joint" type="fixed"><parent link="hand"/><child link="tip"/><origin xyz="0.1 0 0"/></joint>
+</robot>
+"""
+
+
+def write_robot(folder: Path, *changes: tuple[str, str], name: str = "crane.urdf", text: str = URDF) -> Path:
+    """Writes the model file, with parts of its text replaced, and returns its path."""
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / name
+    path.write_text(text)
+    return path
