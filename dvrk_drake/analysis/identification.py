@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
@@ -95,6 +96,9 @@ def identify(
             return _identify_several(recording, arm, progress)
         (recording,) = recording
     recording, dropped = with_power(recording, arm)
+    if is_assumed(arm):
+        arm, mounting = find_mounting(Observations(recording, arm))
+        dropped = (*dropped, *mounting)
     poses = Observations(recording, arm).poses(with_low_speed_segments=low_speed_segments)
     report = require_usable(poses.observations, progress, channels=True)
     share = step_progress(progress, "identifying")
@@ -154,6 +158,9 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
     motions: list[tuple[str, Observations]] = []
     static: list[tuple[str, Observations]] = []
     warnings: list[Finding] = []
+    if is_assumed(arm):
+        arm, mounting = find_mounting(Observations(with_power(recordings[0], arm)[0], arm))
+        warnings += mounting
     for i, whole in enumerate(recordings):
         recording, dropped = with_power(whole, arm)
         name = recording.source or f"recording {i + 1}"

@@ -36,6 +36,7 @@ from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect, half_width
 from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.locked_joints import lock_joints
+from dvrk_drake.models.model_file import MODEL_SUFFIXES
 from dvrk_drake.models.schema_fault import formerly, missing_key, schema_fault, with_current_keys, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
@@ -44,7 +45,7 @@ from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 #: Format of the files that `IdentifiedModel.save` writes.
 #: Versions 2 to 4 have no locked joints. In version 2, `arm` is a name or an absolute path.
-FORMAT = FileFormat("dvrk_drake identified model", 5, oldest=2)
+FORMAT = FileFormat("dvrk_drake identified model", 5, 1, oldest=2)
 #: Text between the method of an identification and the recording of the last recalibration.
 _RECALIBRATED = ", recalibrated on "
 #: Allowed range of measured positions, which may be beyond the limits of a joint.
@@ -181,12 +182,14 @@ class _Header:
         arm: URL or name of an arm of this package, or path of an arm file relative to the model file.
         gravity: Gravity vector (3,) in the arm's base frame [m/s^2].
         locked_joints: Positions of the joints that were not recorded [rad, m], see `lock_joints`.
+        position_offsets: Positions in the model at the recorded positions 0 [rad, m], see `Arm.position_offsets`.
     """
 
     format: str = field(default="", metadata=FORMAT.metadata)
     arm: str = ""
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
     locked_joints: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
+    position_offsets: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
 
 
 @dataclass(kw_only=True)
@@ -278,13 +281,15 @@ class IdentifiedModel(_Identified):
         content = with_current_keys(ModelFile, content, str(path))
         if version < 5:
             content.setdefault("locked_joints", {})
+        if isinstance(content, dict):
+            content.setdefault("position_offsets", {})  # since version 5.1
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A missing number would otherwise silently become 0.
         if key := missing_key(ModelFile, content):
             raise ModelError(f"{path}: {key} is missing")
         try:
             own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
-            own_arm = lock_joints(own_arm, file.locked_joints)
+            own_arm = lock_joints(own_arm.with_position_offsets(file.position_offsets), file.locked_joints)
             if arm is not None and own_arm.name != arm.name:
                 raise ModelError(f"the model is for {own_arm.name}, not for {arm.name}")
             if arm is not None and own_arm.joint_names != arm.joint_names:
@@ -313,7 +318,11 @@ class IdentifiedModel(_Identified):
 
     def _file(self, arm: str) -> ModelFile:
         parts = {part.name: getattr(self, part.name) for part in fields(_Identified)}
-        header = {"gravity": self.arm.gravity.tolist(), "locked_joints": dict(self.arm.locked_joints)}
+        header = {
+            "gravity": self.arm.gravity.tolist(),
+            "locked_joints": dict(self.arm.locked_joints),
+            "position_offsets": dict(self.arm.position_offsets),
+        }
         return ModelFile(format=str(FORMAT), arm=arm, **header, **parts)
 
     def check(self) -> None:
@@ -480,7 +489,7 @@ def _other_joints(own: Arm, arm: Arm) -> str:
 
 def _arm_argument(path: str | Path, name: str) -> str:
     """Returns the argument of `load_arm` for the arm that has the reference `name` in the model file at `path`."""
-    if not name.endswith((".yaml", ".yml")) or name.startswith(PACKAGE_URL):
+    if not name.lower().endswith((".yaml", ".yml", *MODEL_SUFFIXES)) or name.startswith(PACKAGE_URL):
         return name
     return os.path.join(os.path.dirname(os.path.realpath(path)), name)
 

@@ -72,6 +72,8 @@ class Arm:
         locked_joints: Positions of the joints that are locked [rad, m], which are not among the independent joints; see
             `dvrk_drake.models.locked_joints.lock_joints`.
         view: Close-ups, remote centre and tip for 3D views.
+        position_offsets: Mapping from a joint to the position in the model at the recorded position 0 [rad, m]. Offsets
+            are a part of `linkage` and of all limits; see `with_position_offsets`. Joints without an entry have none.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -107,6 +109,7 @@ class Arm:
     console_gravity_compensation: bool = False
     locked_joints: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
     view: ViewSettings = field(default_factory=ViewSettings)
+    position_offsets: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
 
     def __post_init__(self) -> None:
         for part in dataclasses.fields(self):
@@ -264,6 +267,20 @@ class Arm:
         """
         return _mounted(self, tuple(checked_gravity(gravity).tolist()))
 
+    def with_position_offsets(self, offsets: Mapping[str, float]) -> Arm:
+        """Returns the same arm with other joint zeros: model position = recorded position + offset.
+
+        Args:
+            offsets: Mapping from a joint to its offset [rad, m]. It replaces the present offsets.
+
+        Raises:
+            ArmError: A joint is unknown, or a limit is outside the accepted range after the change.
+        """
+        if unknown := sorted(set(offsets) - set(self.joint_names)):
+            known = ", ".join(self.joint_names)
+            raise ArmError(f'{self.name}: position_offsets: unknown joint "{unknown[0]}"; allowed: {known}')
+        return _with_zeros(self, tuple((name, float(offsets[name])) for name in self.joint_names if offsets.get(name)))
+
     @property
     def locked_text(self) -> str:
         """Locked joints and their positions [rad, m], e.g. "roll = 0, jaw = 0.5", or "" if there are none."""
@@ -296,6 +313,28 @@ def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], join
             count = f"{np.size(numbers)} number{'s' * (np.size(numbers) != 1)}"
             return f"{key}{name} has {count}; allowed: {len(joints)}, one per joint: {', '.join(joints)}"
     return ""
+
+
+@cached
+def _with_zeros(arm: Arm, offsets: tuple[tuple[str, float], ...]) -> Arm:
+    """Returns the arm with other joint zeros. Calls with equal arguments return the same Arm object."""
+    stated = dict(offsets)
+    change = np.array([stated.get(name, 0.0) - arm.position_offsets.get(name, 0.0) for name in arm.joint_names])
+    if not np.any(change):
+        return arm
+    A, _, _ = arm.limit_matrix()
+    of_limits = (A @ change)[arm.num_joints :]
+    return dataclasses.replace(
+        arm,
+        position_lower=arm.position_lower - change,
+        position_upper=arm.position_upper - change,
+        coupled_limits=tuple(
+            dataclasses.replace(limit, lower=limit.lower - x, upper=limit.upper - x)
+            for limit, x in zip(arm.coupled_limits, of_limits, strict=True)
+        ),
+        linkage=LinearMap(arm.linkage.matrix, arm.linkage.offset + arm.linkage.matrix @ change),
+        position_offsets=stated,
+    )
 
 
 def checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:

@@ -84,6 +84,11 @@ def load_arm(name: str | Path) -> Arm:
     return _load_arm(str(path))
 
 
+def is_from_model_file(arm: Arm) -> bool:
+    """Returns whether an arm has no arm file, so that nobody stated more than its model file does."""
+    return arm.source.lower().endswith(MODEL_SUFFIXES)
+
+
 def is_package_arm(arm: Arm | str) -> bool:
     """Returns whether an arm, or its name, has the name of an arm of this package."""
     name = arm if isinstance(arm, str) else arm.name
@@ -179,6 +184,7 @@ def _build_arm(
     for key, stated in (
         ("position_limits", instrument.position_limits | description.position_limits),
         ("effort_limits", description.effort_limits),
+        ("position_offsets", description.position_offsets),
     ):
         if unknown := sorted(set(stated) - set(joints)):
             raise ArmError(f'{path}: {key}: unknown joint "{unknown[0]}"; allowed: {", ".join(joints)}')
@@ -189,6 +195,8 @@ def _build_arm(
     if unlimited := [j for j in joints if j not in position_limits]:
         raise ArmError(f"{path}: joint {unlimited[0]} of the model has no position limits; state position_limits")
     limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
+    for j in description.position_limits.keys() & description.position_offsets.keys():
+        limits[joints.index(j)] += description.position_offsets[j]
     effort_limits = _effort_limits(path, joints, facts.effort_limits | description.effort_limits)
     has_gains = not mechanism.joints or any(vars(mechanism.gains).values())
     joined = {k: getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")}
@@ -226,6 +234,7 @@ def _build_arm(
         console_gravity_compensation=mechanism.console_gravity_compensation,
         view=_view_settings(path, mechanism.view, instrument.view, facts),
     )
+    arm = arm.with_position_offsets(description.position_offsets)
     if has_gains:
         return arm
     from dvrk_drake.models.plant import critically_damped_gains  # circular import

@@ -205,7 +205,8 @@ class ArmDescription(Mechanism):
     files relative to the folder of the arm file. A file without `mechanism` has the keys of a mechanism itself; of
     these keys, only `sdf` is required. `sdf` is the path of a model file relative to the folder of the file that
     states it. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `position_limits` and `effort_limits`
-    replace those of the model. `mirrored_links` maps an SDF file to its links that are mirrored for this arm (x to -x
+    replace those of the model. `position_offsets` are the positions in the model at the recorded positions 0; limits
+    refer to recorded positions. `mirrored_links` maps an SDF file to its links that are mirrored for this arm (x to -x
     in the link's frame). SDF files without an entry, such as a file exported from this arm, are used unchanged.
     `coupled_limit_bounds` maps the name of a coupled limit to its [lower, upper] for this arm, e.g. after the
     calibration of a joint stop. These values replace the values of the mechanism.
@@ -219,6 +220,7 @@ class ArmDescription(Mechanism):
     effort_limits: dict[str, float] = field(default_factory=dict, metadata={RANGE: EFFORTS})
     coupled_limit_bounds: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     mirrored_links: dict[str, list[str]] = field(default_factory=dict)
+    position_offsets: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)
 
 

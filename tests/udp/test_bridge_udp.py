@@ -78,10 +78,10 @@ def wait_for_efforts(console, bridge, after=0):
     """Waits until efforts act. `after` is a number of characters of the bridge's output."""
     # If the computer is stalled, the guard changes to FAULT and remains there.
     try:
-        wait_until(lambda: re.search("effort, sender|fault: ", bridge.output()[after:]), "efforts", bridge)
+        wait_until(lambda: re.search(r"effort, sender|\bfault: ", bridge.output()[after:]), "efforts", bridge)
     except AssertionError as error:
         raise AssertionError(f"{error}; {bridge.output()}") from None
-    assert "fault: " not in bridge.output()[after:], bridge.output()
+    assert not re.search(r"\bfault: ", bridge.output()[after:]), bridge.output()
     wait_for_mode(console, EFFORT, bridge)
 
 
@@ -238,7 +238,7 @@ def test_restarted_console_is_not_commanded_until_reset(operator, tmp_path):
         bridge, controller = start_efforts("mtml", tmp_path, console, "--domain", "9")
     ended = time.monotonic()
     with running(bridge, controller):
-        wait_for_line(bridge, "fault: ")
+        wait_until(lambda: re.search(r"\bfault: ", bridge.output()), "fault", bridge)
         with start_console("MTML", tmp_path, domain=9) as console:
             wait_for_line(bridge, "/MTML/measured_js: header stamp 0 marks invalid data. Home the arm")
             monitor = CommandMonitor(console.domain, "/MTML")

@@ -89,7 +89,7 @@ def check_channels(observations: Observations) -> list[Finding]:
         # The spring torque of a cable may exceed the gravity torque of a light wrist. The effort then opposes gravity.
         return [replace(f, severity="warning") if f.kind == "effort sign" else f for f in found]
     hypotheses, scales_and_offsets = [], []
-    for segment in _segments(observations.longest):
+    for segment in segments_of(observations.longest):
         if segment.recording.motion(arm):
             fit = ChannelFit(segment)
             hypotheses.append(_hypotheses(fit))
@@ -97,7 +97,7 @@ def check_channels(observations: Observations) -> list[Finding]:
     return _best_hypothesis(hypotheses) or _merge_segments(scales_and_offsets, arm)
 
 
-def _segments(observations: Observations) -> list[Observations]:
+def segments_of(observations: Observations) -> list[Observations]:
     """Returns at most `MAX_SEGMENTS` equal segments of a motion, each at most `MAX_SEGMENT_DURATION` long."""
     recording = observations.recording
     t = recording.t

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.estimation.estimator import MIN_ERROR, Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
 from dvrk_drake.analysis.observations.low_pass import low_pass, resample
-from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid
+from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid, ends_of
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
@@ -29,8 +29,6 @@ EFFECT_DEVIATION = 0.5
 OFFSET_DEVIATION = 0.1, 0.01
 #: Number of samples of the fit per period of the effort's cut-off frequency.
 OVERSAMPLING = 2.5
-#: Duration that is excluded at each end because of filter transients [s].
-ENDS = 1.0
 #: Largest assumed numbers of independent measurements of an effort in a motion and in poses. More measurements do not
 #: average out model errors. The number of poses is that of the largest public recording of poses (`mtm_2015_good72`),
 #: for which the limits of the gain at rest are set.
@@ -59,6 +57,7 @@ class ChannelFit:
         used: Indices (k,) of the actuators that move and have an effort. The model is fitted to these efforts.
         resting: Indices (l,) of the actuators that have an effort and do not move. These efforts are modelled as
             constants.
+        num_independent: Effective number of independent measurements of each effort.
         log_likelihood: Log-likelihood of the unmodified recording, up to a constant.
     """
 
@@ -80,7 +79,8 @@ class ChannelFit:
             self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
             self._q, self._v, self._vd = grid.q, grid.v, grid.vd
             self._tau = self._sampled_efforts(grid)
-            duration = float(grid.t[-1] - grid.t[0]) - 2 * ENDS
+            duration = float(grid.t[-1] - grid.t[0])
+            duration -= 2 * ends_of(duration)
             independent = 2 * self._cut_off * min(duration, observations.period or duration)
             moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
         else:
@@ -91,7 +91,7 @@ class ChannelFit:
             self._tau = observations.tau
             independent = min(len(recording), MAX_INDEPENDENT_POSES)
             moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*MIN_RANGE)
-        self._independent = min(independent, MAX_INDEPENDENT)
+        self.num_independent = min(independent, MAX_INDEPENDENT)
         measured = np.any(recording.measured_actuators(arm).measured_effort() != 0, axis=0)
         self.used, self.resting = np.flatnonzero(moves & measured), np.flatnonzero(~moves & measured)
         self.log_likelihood = 0.0
@@ -108,7 +108,7 @@ class ChannelFit:
 
     def gain(self, transform: NDArray[np.float64]) -> float:
         """Returns the gain in log-likelihood if `transform` (n, n) is applied to the recorded actuator efforts."""
-        volume = self._independent * float(np.log(abs(np.linalg.det(transform))))
+        volume = self.num_independent * float(np.log(abs(np.linalg.det(transform))))
         return self._fit(self._tau @ transform.T)[0] + volume - self.log_likelihood
 
     def position_offset(self, channel: int) -> tuple[float, float]:
@@ -135,6 +135,31 @@ class ChannelFit:
                 ratios[i] = float(residual @ v[:, i]) / expected
         return ratios
 
+    @property
+    def samples(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Measured efforts and velocities (r, n) of the actuators at the samples of the fit."""
+        return self._tau, self._sampled(self.arm.transmission.velocity(self._v))
+
+    def holding_efforts(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the holding efforts (r, n) of the nominal links for a gravity vector and offsets of the positions.
+
+        Args:
+            gravity: Gravity vector (3,) in the base frame [m/s^2].
+            offsets: Differences (n,) between the positions in the model and the recorded positions [rad, m].
+        """
+        return self._rigid_efforts(self._regressor.with_gravity(gravity.tolist()), offsets, moves=False)
+
+    def efforts_of_motion(self) -> NDArray[np.float64]:
+        """Returns the efforts (r, n) of the nominal links without gravity."""
+        whole = self._rigid_efforts(self._regressor, np.zeros(self.arm.num_joints), moves=True)
+        return whole - self.holding_efforts(self.arm.gravity, np.zeros(self.arm.num_joints))
+
+    def _rigid_efforts(
+        self, regressor: DynamicRegressor, offsets: NDArray[np.float64], moves: bool
+    ) -> NDArray[np.float64]:
+        q, v, vd = (x[:: self._half_step] for x in (self._q + offsets, moves * self._v, moves * self._vd))
+        return self._filtered(self._to_joint.pull_back_effort(regressor.torque(q, v, vd, regressor.values)))
+
     def _sampled_efforts(self, grid: MotionGrid) -> NDArray[np.float64]:
         tau = self.observations.tau
         # A repeated row has the time of the previous row.
@@ -160,7 +185,7 @@ class ChannelFit:
         values, vectors = np.linalg.eigh(information)
         directions = vectors[:, values > MIN_INFORMATION]
         self._to_parameters = deviation[:, None] * directions
-        tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._unit_gravity_efforts(q)
+        tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._unit_gravity_efforts(q)[:, :, :2]
         self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)
         self._rows = np.array([self.arm.effect_coordinates[effect.coordinate] for effect in drive.effects])
         shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, self._q, self._v)))
@@ -201,13 +226,13 @@ class ChannelFit:
             ]
         efforts = np.sum(tau[:, self.used] ** 2, axis=0)
         equations = NormalEquations.of(columns, size, (tau - self._nominal)[:, self.used])
-        estimator = Estimator(equations, prior, efforts[None], np.full((1, len(efforts)), self._independent))
+        estimator = Estimator(equations, prior, efforts[None], np.full((1, len(efforts)), self.num_independent))
         x = estimator.fit(estimator.all)
         errors = np.maximum(estimator.squared_errors(x)[0], MIN_ERROR**2 * efforts)
         at_rest = tau[:, self.resting]
         constants = np.sum((at_rest - np.mean(at_rest, axis=0)) ** 2, axis=0)
         errors = np.append(errors, np.maximum(constants, MIN_ERROR**2 * np.sum(at_rest**2, axis=0)))
-        likelihood = -0.5 * self._independent * float(np.sum(np.log(errors)))
+        likelihood = -0.5 * self.num_independent * float(np.sum(np.log(errors)))
         likelihood -= 0.5 * float(np.sum(prior.precision * (x - prior.mean) ** 2))
         return likelihood, x, estimator.information()
 
@@ -233,7 +258,7 @@ class ChannelFit:
         return np.asarray(change / _STEP)
 
     def _unit_gravity_efforts(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the holding efforts (r, n, 2) for gravity of 1 m/s^2 along the x- and y-axis of the base."""
+        """Returns the holding efforts (r, n, 3) for gravity of 1 m/s^2 along the axes of the base."""
         efforts, zero = [], np.zeros_like(q)
         for regressor in self._tilted:
             torque = regressor.torque(q, zero, zero, regressor.values)
@@ -252,15 +277,16 @@ class ChannelFit:
         return self._inner(flat.reshape(x.shape))
 
     def _inner(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        ends = int(ENDS * GRID_RATE / self._half_step)
+        rate = GRID_RATE / self._half_step
+        ends = int(ends_of(len(x) / rate) * rate)
         return x[ends : len(x) - ends : 2]
 
 
 @cache
 def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor], BaseColumns]:
-    """Returns the regressor, two regressors for unit gravity along the base x- and y-axes, and the base columns."""
+    """Returns the regressor, three regressors for unit gravity along the axes of the base, and the base columns."""
     regressor = DynamicRegressor(arm)
-    tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
+    tilted = [regressor.with_gravity(axis) for axis in np.eye(3).tolist()]
     return regressor, tilted, base_columns([regressor])
 
 

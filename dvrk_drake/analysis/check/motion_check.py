@@ -33,8 +33,9 @@ MIN_EXTRA = 0.05
 #: Smallest reported jitter as a share of the mean interval.
 MIN_JITTER = 0.05
 #: An effort has the wrong sign in two cases: its Coulomb friction is more than the first number of standard errors
-#: below 0, or its Coulomb friction is negative and the relative work of the motor is below minus the second number.
-MIN_SIGN_ERRORS, MIN_NEGATIVE_WORK = 5.0, 0.05
+#: below 0, or it is more than the second number of standard errors below 0 and the relative work of the motor is below
+#: minus the third number. The drives of a robot without friction have estimates within their standard errors of 0.
+MIN_SIGN_ERRORS, MIN_SIGN_ERRORS_WITH_WORK, MIN_NEGATIVE_WORK = 5.0, 2.0, 0.05
 #: The parameters of two joints are hardly identifiable separately if the correlation of the joint velocities exceeds
 #: this value.
 MIN_CORRELATION = 0.95
@@ -231,7 +232,7 @@ def _wrong_signs(work: NDArray[np.float64], lags: EffortLag, arm: Arm) -> list[F
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = lags.coulomb / lags.coulomb_error
     # Negative work alone is not sufficient, because gravity and inertia may transfer power from other joints.
-    wrong = (errors < -MIN_SIGN_ERRORS) | ((work < -MIN_NEGATIVE_WORK) & (errors < 0))
+    wrong = (errors < -MIN_SIGN_ERRORS) | ((work < -MIN_NEGATIVE_WORK) & (errors < -MIN_SIGN_ERRORS_WITH_WORK))
     findings = []
     for j in np.flatnonzero(wrong):
         friction, unit = float(lags.coulomb[j]), "N" if arm.prismatic[j] else "N m"

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.channel_check import check_channels
+from dvrk_drake.analysis.check.channel_check import MIN_GAIN, check_channels, segments_of
+from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
+from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.observations.motion_grid import MIN_SEGMENT
 from dvrk_drake.analysis.observations.observations import Observations
@@ -286,8 +288,13 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     share = step_progress(progress, "checking the recording")
     share(0.0)
     recording, dropped = with_power(recording, arm)
+    if assumed := is_assumed(arm):
+        arm, mounting = find_mounting(Observations(recording, arm))
+        dropped = (*dropped, *mounting)
     observations = Observations(recording, arm)
     report = check_with_channels(observations)
+    if not report.refusals and not assumed:
+        dropped = (*dropped, *find_mounting(observations)[1])
     report = replace(report, findings=(*report.refusals, *dropped, *report.findings[len(report.refusals) :]))
     share(1.0)
     if report.refusals:
@@ -369,7 +376,9 @@ def require_usable(
     """
     report_share = step_progress(progress, "checking the recording")
     report_share(0.0)
-    report = (check_with_channels if channels else check_recording)(observations)
+    report = check_with_channels(observations) if channels else check_recording(observations)
+    if not channels:
+        report = _without_contradictions(report, observations)
     report_share(1.0)
     kept = tuple(finding for finding in report.findings if finding.kind != ignored_kind)
     report = replace(report, findings=kept)
@@ -385,7 +394,7 @@ def check_with_channels(observations: Observations) -> RecordingReport:
 
     The channels are not checked if `check_recording` reports a refusal, unless all refusals are efforts with a wrong
     sign. Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels
-    therefore replaces the refusals for wrong signs.
+    therefore replaces the refusals for wrong signs. A wrong sign that contradicts the links of the arm is not reported.
     """
     recording, arm = observations.recording, observations.arm
     if recording.coordinates == "wpi" and recording.q.shape[1] == arm.num_joints:
@@ -401,10 +410,30 @@ def check_with_channels(observations: Observations) -> RecordingReport:
     if any(finding.severity == "refusal" for finding in found):
         kept = [finding for finding in report.findings if finding.severity != "refusal"]
         return replace(report, findings=(*found, *kept))
+    report = _without_contradictions(report, observations)
     if report.refusals:
         return report
     order = {"warning": 0, "note": 1}
     return replace(report, findings=tuple(sorted((*report.findings, *found), key=lambda f: order[f.severity])))
+
+
+def _without_contradictions(report: RecordingReport, observations: Observations) -> RecordingReport:
+    """Returns the report without findings on the sign of an effort that contradict the links of the arm.
+
+    The sign of `check_motion` is that of the friction, which is uncertain for a drive with little friction.
+    """
+    if not any(finding.kind == "effort sign" for finding in report.refusals):
+        return report
+    try:
+        fit = ChannelFit(segments_of(observations.longest)[0])
+    except RecordingError:
+        return report
+
+    def is_contradicted(finding: Finding) -> bool:
+        signs = np.where(np.isin(np.arange(fit.arm.num_joints), finding.joints), -1.0, 1.0)
+        return finding.kind == "effort sign" and fit.gain(fit.in_actuators(np.diag(signs))) < -MIN_GAIN
+
+    return replace(report, findings=tuple(finding for finding in report.findings if not is_contradicted(finding)))
 
 
 def _refusals_of_identify(observations: Observations) -> tuple[Finding, ...]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
+from dvrk_drake.models.arm_files import is_from_model_file
 
 #: Number of iterations that estimate the base tilt and the loads of the drives. Each iteration uses the parameters of
 #: the previous iteration. A third iteration changes the errors by less than 0.01 %.
@@ -18,6 +19,9 @@ NUM_ITERATIONS = 2
 #: Number of adjacent folds of one motion that `cross_validate` holds out together. Long held-out segments are more
 #: similar to another motion than short ones.
 NUM_HELD_OUT_FOLDS = 2
+#: Factors of the prior standard deviations of the links, for the links of a model file. With the first, the deviations
+#: are those for the links of this package. With the last, the centre of mass of a link may be anywhere near the link.
+LINK_SCALES = (1.0, 3.0, 10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +78,8 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     tilts = len(problem.columns.tilts)
     mandatory = np.append(np.arange(problem.num_mandatory), problem.num_effects + np.arange(tilts))
     phi = problem.prior
+    if is_from_model_file(problem.regressor.arm):
+        problem = _with_link_scale(problem, mandatory)
     # The efforts contain products of the tilt or a friction coefficient and the link parameters. Each iteration is
     # linear, because it uses the previous link parameters in these products.
     for iteration in range(NUM_ITERATIONS if tilts or problem.is_loaded else 0):
@@ -89,6 +95,20 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     selected = selection.select(mandatory, problem.candidates, lambda share: progress(0.5 + 0.5 * share))
     x = selection.fit_with(selected)
     return EffectSelection(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, mandatory, selected, x)
+
+
+def _with_link_scale(problem: DynamicProblem, mandatory: NDArray[np.int_]) -> DynamicProblem:
+    """Returns the problem with the scale from `LINK_SCALES` that has the smallest cross-validated error.
+
+    The masses and centres of mass of a model file may come from CAD, or be placeholders.
+    """
+
+    def error(trial: DynamicProblem) -> float:
+        selection = trial.selection(problem.prior)
+        selection.fit_with(mandatory)
+        return float(selection.errors(mandatory, np.empty(0, dtype=int))[0])
+
+    return min((replace(problem, link_scale=scale) for scale in LINK_SCALES), key=error)
 
 
 def cross_validate(

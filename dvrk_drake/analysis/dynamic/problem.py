@@ -54,6 +54,7 @@ class DynamicProblem:
         independent: Effective number of independent rows. It can be less than r, because filtered and repeated efforts
             are correlated.
         num_mandatory: Number of mandatory effects, which come first. The remaining effects are candidates.
+        link_scale: Factor of the prior standard deviations of the links.
     """
 
     grids: tuple[MotionGrid, ...]
@@ -66,6 +67,7 @@ class DynamicProblem:
     independent: float
     num_mandatory: int
     tilt: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    link_scale: float = 1.0
 
     @property
     def num_rigid(self) -> int:
@@ -101,7 +103,7 @@ class DynamicProblem:
     @cached_property
     def deviation(self) -> NDArray[np.float64]:
         """Prior standard deviations (p,) of the rigid-body parameters."""
-        return rigid_deviations(self.regressor, self.num_rigid)
+        return rigid_deviations(self.regressor, self.num_rigid, self.link_scale)
 
     @cached_property
     def boxes(self) -> dict[str, BoundingBox]:

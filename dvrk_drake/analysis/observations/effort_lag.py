@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.observations.low_pass import low_pass
-from dvrk_drake.analysis.observations.motion_grid import MotionSignals
+from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
 
 #: Cut-off of the low-pass filter for efforts and regressor columns [Hz].
 CUT_OFF = 20.0
 #: Largest tested delay and step between tested delays [s].
 MAX_LAG, LAG_STEP = 0.04, 0.0025
-#: Duration that is omitted at each end because of filter transients [s].
-ENDS = 1.0
 #: Largest number of samples in a fit. A longer motion is thinned out after low-pass filtering.
 MAX_ROWS = 50_000
 #: Width of the smoothed sign function for Coulomb friction, as a share of the RMS velocity.
@@ -63,7 +61,7 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
         moving: Mask (n,) of the actuators that move.
     """
     rate = signals.rate
-    start = max(int(ENDS * rate), int(MAX_LAG * rate))
+    start = max(int(ends_of(len(signals.t) / rate) * rate), int(MAX_LAG * rate))
     inner = slice(start, len(signals.t) - start, -(-len(signals.t) // MAX_ROWS))
     tau = low_pass(signals.tau, rate, CUT_OFF)
     angles = signals.q[:, moving]

@@ -16,8 +16,9 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Rate of the time grid [Hz], high enough to resolve hysteresis when a joint reverses its direction.
 GRID_RATE = 400.0
-#: Duration that is omitted at each end because of filter transients [s].
-ENDS = 1.0
+#: Duration that is omitted at each end because of filter transients [s], and its largest share of a motion. Motions of
+#: less than 20 s would otherwise lose more than a tenth of their rows.
+ENDS, ENDS_SHARE = 1.0, 0.05
 #: Smallest accepted duration of a segment of a motion between gaps [s].
 MIN_SEGMENT = 3.0
 #: Number of rows in one part of `MotionGrid.parts`.
@@ -25,6 +26,11 @@ PART_ROWS = 10_000
 #: Additional rows at both ends of a part, in periods of the effort filter's cut-off. A filter transient decays by a
 #: factor of 1e13 in this time.
 PART_OVERLAP = 20.0
+
+
+def ends_of(duration: float) -> float:
+    """Returns the duration [s] that is omitted at each end of a motion of some duration [s]."""
+    return min(ENDS, ENDS_SHARE * duration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +166,10 @@ class MotionGrid:
 
     @property
     def inner(self) -> slice | NDArray[np.int_]:
-        """Index of every `step`-th row, without the first and the last `ENDS` seconds of each segment."""
+        """Index of every `step`-th row, without both ends of each segment (`ends_of`)."""
         if self.segments:
             return np.concatenate([rows.start + own.inner_rows for own, _, rows in self.each_segment()])
-        ends = round(ENDS * self.rate)
+        ends = round(ends_of(len(self.row_times) / self.rate) * self.rate)
         return slice(ends, len(self.row_times) - ends, self.step)
 
     @property
@@ -203,7 +209,7 @@ class MotionGrid:
         return (1 - share) * x[before] + share * x[before + 1]
 
     def filter_efforts(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Applies the low-pass filter of the efforts to x (r, ...) and removes `ENDS` seconds at both ends."""
+        """Applies the low-pass filter of the efforts to x (r, ...) and removes both ends, see `ends_of`."""
         return self.filter_rows(x, self.inner)
 
     def filter_rows(self, x: NDArray[np.float64], rows: slice | NDArray[np.int_]) -> NDArray[np.float64]:

@@ -22,8 +22,9 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_LOST, MIN_RATE, MIN_ROWS, Recording
 
-#: Smallest accepted duration of a motion [s].
-MIN_DURATION = 5.0
+#: Smallest accepted duration of a motion [s]. At the cut-off frequency of 10 Hz that is the default for efforts, it has
+#: 40 independent values of each effort.
+MIN_DURATION = 2.0
 #: Note for models identified from low-speed segments.
 LOW_SPEED_NOTE = (
     "Low-speed segments are treated as static poses. The torques of these segments contain friction, and other joints "

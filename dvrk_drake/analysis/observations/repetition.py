@@ -6,14 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.analysis.observations.low_pass import correlation, low_pass, resample
-from dvrk_drake.analysis.observations.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid, ends_of
 
 #: Largest difference D(T) of the positions of a motion that repeats after the period T, see `find_period`.
 SAME_MOTION = 0.1
 #: Smallest recorded part of the second period, as a share of the period.
 MIN_OVERLAP = 0.25
-#: Duration that is omitted at each end because of filter transients [s].
-ENDS = 1.0
 
 
 def find_period(q: NDArray[np.float64], rate: float) -> float | None:
@@ -65,7 +63,7 @@ def repeatability_floor(
         floor_j = rms(tau_j(t) - tau_j(t + T)) / sqrt(2) / rms(tau_j)
 
     This value approximates the smallest possible relative error of a model that is a function of q, v and vd. The
-    efforts are filtered with a zero-phase low-pass filter, and `ENDS` seconds are omitted at both ends.
+    efforts are filtered with a zero-phase low-pass filter, and both ends are omitted, see `ends_of`.
 
     Args:
         tau: Efforts (m, n) of the actuators at a constant rate [N m, N].
@@ -76,7 +74,7 @@ def repeatability_floor(
     Returns:
         Relative differences (n,), nan for an effort that is always 0.
     """
-    ends = int(ENDS * rate)
+    ends = int(ends_of(len(tau) / rate) * rate)
     filtered = low_pass(tau, rate, cut_off)[ends : len(tau) - ends]
     shift = round(period * rate)
     difference = filtered[shift:] - filtered[:-shift]

@@ -1,0 +1,182 @@
+"""Finds the direction of gravity and the joint zeros with which the links of an arm explain a recording.
+
+A model file does not state how a robot is mounted. Its joint zeros may differ from those of the robot's controller, in
+most cases by multiples of 90 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.check.channel_check import segments_of
+from dvrk_drake.analysis.check.channel_fit import ChannelFit
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.static.static_identification import MIN_POSES
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import is_from_model_file
+
+#: Gravity in the base frame that is assumed for a model file [m/s^2].
+ASSUMED_GRAVITY = (0.0, 0.0, -9.81)
+#: Smallest gain in log-likelihood of another direction of gravity or another joint zero. It is the gain at which an
+#: exchange of channels is accepted (`channel_check.MIN_GAIN`). On recordings of six robots, the gain of the true
+#: hypotheses is at least 260, and that of all others at most 6.
+MIN_GAIN = 20.0
+#: Smallest angle of a reported direction from the stated one [rad]. Smaller angles are tilts of the base, which the
+#: identification estimates (`base_may_tilt`).
+MIN_ANGLE = np.deg2rad(30.0)
+#: Largest angle between an estimated direction and an axis of the base at which the axis is used [rad]. Robots are
+#: mounted at right angles, and the estimate contains the errors of the nominal masses.
+SNAP_ANGLE = np.deg2rad(10.0)
+#: Differences of the joint zeros of a model and of a controller [rad].
+QUARTER_TURNS = (np.pi / 2, -np.pi / 2, np.pi)
+#: Number of reweighted fits for the direction of gravity, after which it changes by less than 1 degree.
+_ITERATIONS = 5
+
+
+def is_assumed(arm: Arm) -> bool:
+    """Returns whether the mounting of an arm is that of its model file, because nobody stated another one."""
+    is_unchanged = not arm.position_offsets and np.array_equal(arm.gravity, ASSUMED_GRAVITY)
+    return is_from_model_file(arm) and is_unchanged
+
+
+def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
+    """Returns the arm with the mounting that explains a recording, and findings on the differences.
+
+    The direction of gravity and joint zeros are changed one after the other, as long as a change makes the efforts much
+    more likely. The mounting is used if the one of the arm is only assumed (`is_assumed`). Otherwise, the returned arm
+    is unchanged, and the findings advise to correct the arm file.
+    """
+    arm = observations.arm
+    if not observations.recording.motion(arm) and len(observations.recording) < MIN_POSES:
+        return arm, []
+    try:
+        own = segments_of(observations.longest)[0]
+        fit = ChannelFit(own)
+    except RecordingError:
+        return arm, []  # `check_channels` omits the same recordings.
+    if not len(fit.used):
+        return arm, []
+    gravity, offsets = _Search(fit).best()
+    found = _arm_with(arm, gravity, offsets)
+    if found is arm or _log_likelihood(own, found) - fit.log_likelihood < MIN_GAIN:
+        return arm, []
+    is_used = is_assumed(arm)
+    return (found if is_used else arm), list(_findings(arm, gravity, offsets, is_used))
+
+
+def _arm_with(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> Arm:
+    if np.any(offsets):
+        total = {n: arm.position_offsets.get(n, 0.0) + float(x) for n, x in zip(arm.joint_names, offsets, strict=True)}
+        arm = arm.with_position_offsets(total)
+    return arm if np.array_equal(gravity, arm.gravity) else arm.with_gravity(gravity.tolist())
+
+
+def _log_likelihood(observations: Observations, arm: Arm) -> float:
+    return ChannelFit(Observations(observations.recording, arm)).log_likelihood
+
+
+def _findings(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64], is_used: bool) -> Iterator[Finding]:
+    used = "This is used." if is_used else "It is not used."
+    if not np.array_equal(gravity, arm.gravity):
+        vector, stated = (" ".join(f"{x:.3g}" for x in g + 0.0) for g in (gravity, arm.gravity))
+        what = f"gravity acts along ({vector}) m/s^2 in the base frame, not along ({stated}). {used}"
+        advice = f"Confirm it with --gravity {vector}, or state it in the arm file."
+        yield Finding("warning", "gravity direction", arm.name, what, advice)
+    for j in np.flatnonzero(offsets):
+        name, degrees = arm.joint_names[j], np.rad2deg(offsets[j])
+        what = f"the zero of q{j + 1} differs by {degrees:+.0f} degrees from that of the model. {used}"
+        advice = f"State it in the arm file: position_offsets: {{{name}: {offsets[j]:.4f}}}."
+        yield Finding("warning", "joint zero", name, what, advice, (int(j),), float(offsets[j]))
+
+
+class _Search:
+    """Least squares of the efforts of each actuator for a direction of gravity and joint zeros.
+
+    The columns are the efforts of gravity and of the motion, both of the nominal links and with free factors, since
+    masses of model files are inaccurate, and viscous friction, Coulomb friction and an offset.
+    """
+
+    def __init__(self, fit: ChannelFit) -> None:
+        self._fit, self._arm = fit, fit.arm
+        self._tau, velocities = fit.samples
+        # Offsets hardly change these efforts, compared with those of gravity.
+        self._motion = fit.efforts_of_motion()
+        scale = np.std(velocities, axis=0) + np.finfo(float).tiny
+        self._friction = [
+            np.column_stack([np.ones(len(v)), v / s, np.tanh(3 * v / s)]) if fit.moves else np.ones((len(v), 1))
+            for v, s in zip(velocities.T, scale, strict=True)
+        ]
+
+    def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the gravity vector (3,) [m/s^2] and the joint offsets (n,) [rad, m]."""
+        gravity, offsets = self._arm.gravity, np.zeros(self._arm.num_joints)
+        current = self._log_likelihood(gravity, offsets)
+        # Each joint and the gravity change at most once.
+        for _ in range(self._arm.num_joints + 1):
+            candidates = [(self._log_likelihood(*c), *c) for c in self._candidates(gravity, offsets)]
+            likelihood, *best = max(candidates, key=lambda candidate: candidate[0], default=(-np.inf, gravity, offsets))
+            if likelihood - current < MIN_GAIN:
+                break
+            current, (gravity, offsets) = likelihood, best
+        return gravity, offsets
+
+    def _candidates(
+        self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]
+    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        if np.array_equal(gravity, self._arm.gravity):
+            estimate = self._estimated_gravity(offsets)
+            if _angle(estimate, gravity) > MIN_ANGLE:
+                yield estimate, offsets
+        for j in np.flatnonzero(~self._arm.prismatic & (offsets == 0)):
+            for turn in QUARTER_TURNS:
+                yield gravity, offsets + turn * np.eye(len(offsets))[j]
+
+    def _estimated_gravity(self, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the gravity vector (3,) that best explains the efforts, with the magnitude of the arm's."""
+        unit_efforts = np.stack([self._fit.holding_efforts(axis, offsets) for axis in np.eye(3)], axis=2)
+        tau = self._tau - self._motion
+        weights = 1 / (np.sqrt(np.mean(tau**2, axis=0)) + np.finfo(float).tiny)
+        magnitude = float(np.linalg.norm(self._arm.gravity))
+        for _ in range(_ITERATIONS):
+            rows, efforts = [], []
+            for i in self._fit.used:
+                X = self._friction[i]
+                # The friction is eliminated, so that only the three components remain.
+                own = np.column_stack([unit_efforts[:, i], tau[:, i]])
+                own = weights[i] * (own - X @ np.linalg.lstsq(X, own, rcond=None)[0])
+                rows.append(own[:, :3])
+                efforts.append(own[:, 3])
+            g = np.linalg.lstsq(np.concatenate(rows), np.concatenate(efforts), rcond=1e-6)[0]
+            errors = [e - r @ g for r, e in zip(rows, efforts, strict=True)]
+            weights[self._fit.used] /= [np.sqrt(np.mean(e**2)) + 1e-9 for e in errors]
+        if not np.any(g):
+            return self._arm.gravity
+        axis = np.sign(g[np.argmax(np.abs(g))]) * np.eye(3)[np.argmax(np.abs(g))]
+        direction = axis if _angle(g, axis) < SNAP_ANGLE else g / np.linalg.norm(g)
+        return magnitude * direction
+
+    def _log_likelihood(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> float:
+        """Returns the log-likelihood of the efforts, up to a constant."""
+        holding = self._fit.holding_efforts(gravity, offsets)
+        total = 0.0
+        for i in self._fit.used:
+            tau = self._tau[:, i]
+            X = np.column_stack([holding[:, i], self._motion[:, i], self._friction[i]])
+            x, *_ = np.linalg.lstsq(X, tau, rcond=1e-9)
+            if x[0] < 0:  # Masses are positive.
+                X = X[:, 1:]
+                x, *_ = np.linalg.lstsq(X, tau, rcond=1e-9)
+            # Errors of a few percent are those of the nominal links.
+            error = max(float(np.mean((tau - X @ x) ** 2)), (0.05**2) * float(np.mean(tau**2)))
+            total -= 0.5 * self._fit.num_independent * np.log(error)
+        return total
+
+
+def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Returns the angle between two vectors [rad]."""
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
