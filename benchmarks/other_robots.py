@@ -8,8 +8,8 @@ used:
 
     UR10e   motion of another day (50 s), which has no load
     TX40    last 40 % of the file; its arm file states the transmission, which a URDF cannot
-    AR5     last 40 % of the file; the robot is mounted sideways, which only the least squares are told
-    UR10    last 40 % of the file; the zeros of two joints differ by 90 degrees, which only the least squares are told
+    AR5     last 40 % of the file; the robot is mounted sideways, which only the least squares know
+    UR10    last 40 % of the file; the zeros of two joints differ by 90 degrees, which only the least squares know
 
 Errors are |tau - tau_hat| / |tau| of each actuator. Both efforts are low-pass filtered with a zero-phase Butterworth
 filter, and 1.5 periods of its cut-off frequency are omitted at each end.

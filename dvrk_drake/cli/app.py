@@ -75,7 +75,10 @@ def one_of(title: str, least: int = 1) -> Group:
 
 
 Arm = Annotated[
-    str, Parameter(metavar="ARM", completer=_complete_arm, help="mtml, mtmr, psm, or the path of an arm file (YAML).")
+    str,
+    Parameter(
+        metavar="ARM", completer=_complete_arm, help="mtml, mtmr, psm, or the path of a YAML, URDF, SDF or MJCF file."
+    ),
 ]
 Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written by identify.")]
 Gravity = Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
@@ -57,6 +58,34 @@ def model(
     with atomic_write(output) as stream:
         stream.write(text)
     print_written(output)
+
+
+@app.command(group=MODEL)
+def arm_file(
+    model_file: Annotated[str, Parameter(metavar="MODEL_FILE")],
+    /,
+    *,
+    output: Annotated[str, Parameter(metavar="FILE.yaml")],
+    overwrite: Overwrite = False,
+) -> None:
+    """Write an arm file with everything that is derived from a model file, to change it.
+
+    Commands also accept the model file itself as --arm.
+
+    Args:
+        model_file: URDF, SDF, MJCF (.xml), or Drake's model directives (.dmd.yaml).
+        output: Arm file to write.
+    """
+    from dvrk_drake.models.arm_files import derived_arm_file
+    from dvrk_drake.models.files import atomic_write
+
+    if not output.lower().endswith((".yaml", ".yml")):
+        raise DvrkDrakeError(f"--output {output}: the name of an arm file ends in .yaml")
+    check_output(output, overwrite=overwrite)
+    text = derived_arm_file(model_file, Path(output).parent)
+    with atomic_write(output) as stream:
+        stream.write(text)
+    print_written(output, f"use it as --arm {output}")
 
 
 @app.command(group=MODEL)

@@ -49,7 +49,7 @@ COMMANDS = model, recordings, identify, excite, export, simulate, demo, simulate
 
 #: Mapping from required options to the accepted values, for the message of a missing option.
 REQUIRED = {
-    "--arm": ": mtml, mtmr, psm, or the path of an arm file",
+    "--arm": ": mtml, mtmr, psm, or the path of a YAML, URDF, SDF or MJCF file",
     "--model": ": the model file that identify wrote",
 }
 

@@ -20,6 +20,7 @@ from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.arm_schema import Gains, load_gains
+from dvrk_drake.models.model_file import MODEL_SUFFIXES
 from dvrk_drake.models.schema_fault import formerly, within
 from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
 from dvrk_drake.systems.gravity_pid_controller import Mode
@@ -252,7 +253,7 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     If an arm is given instead of a scenario file, the controller regulates the default start pose of `Scenario`.
 
     Args:
-        arm_or_file: Path of a scenario file, name of an arm, or path of an arm file.
+        arm_or_file: Path of a scenario file, name of an arm, or path of an arm file or a model file.
         settings: Settings "key=value", with the value in YAML. A dot separates a group from a key, e.g.
             "controller.mode=gravity".
 
@@ -266,14 +267,16 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
         (2.0, 'damped')
     """
     path = Path(arm_or_file)
-    if path.suffix.lower() in (".yaml", ".yml"):
+    if path.name.lower().endswith(MODEL_SUFFIXES):
+        content = {"arm": arm_or_file}
+    elif path.suffix.lower() in (".yaml", ".yml"):
         content = load_yaml(path, ScenarioError)
-        if isinstance(content, dict) and "mechanism" in content:
+        if isinstance(content, dict) and content.keys() & {"mechanism", "sdf"}:
             content = {"arm": arm_or_file}
     elif path.suffix:
         raise ScenarioError(
             f"{arm_or_file} is not a scenario: its name does not end in .yaml. Give a scenario file, or an arm: "
-            f"{', '.join(known_arms())}"
+            f"{', '.join(known_arms())}, or a model file"
         )
     else:
         content = {"arm": arm_or_file}

@@ -84,9 +84,66 @@ def load_arm(name: str | Path) -> Arm:
     return _load_arm(str(path))
 
 
+def derived_arm_file(model: str | Path, folder: str | Path) -> str:
+    """Returns the text of an arm file that states what `load_arm` derives from a model file.
+
+    Args:
+        model: Path of a model file (URDF, SDF, MJCF or Drake's model directives).
+        folder: Folder of the arm file, to which the path of the model is relative.
+
+    Raises:
+        ArmError: The model is not that of an arm.
+    """
+    arm = load_arm(model)
+    if not is_from_model_file(arm):
+        raise ArmError(f"{os.fspath(model)} is not a model file; allowed: {', '.join(MODEL_SUFFIXES)}")
+
+    def per_joint(values: NDArray[np.float64]) -> str:
+        return "".join(f"\n  {n}: {np.round(x, 6).tolist()}" for n, x in zip(arm.joint_names, values, strict=True))
+
+    limits = np.column_stack([arm.position_lower, arm.position_upper])
+    first, last = arm.joint_names[0], arm.joint_names[-1]
+    gains = "".join(f"\n  {name}: {[float(f'{x:.3g}') for x in values]}" for name, values in vars(arm.gains).items())
+    return f"""\
+# Derived from a model file. Change what differs for your robot; keys that you delete are derived again.
+format: dvrk_drake arm 1.0
+name: {arm.name}
+sdf: {os.path.relpath(os.path.realpath(model), os.path.realpath(folder))}
+
+# Independent joints, in the order of recordings and messages.
+joints: [{", ".join(arm.joint_names)}]
+
+# Limits of the positions [rad; m if prismatic] and of the efforts [N m; N].
+position_limits:{per_joint(limits)}
+effort_limits:{per_joint(arm.effort_limits)}
+
+# Gravity in the frame of the base [m/s^2].
+gravity: {arm.gravity.tolist()}
+
+# Positions in the model at the recorded positions 0 [rad; m], if the robot's controller has other zeros.
+# position_offsets: {{{first}: 1.5708}}
+
+# Rows of J in a = J q, for recordings in the coordinates of the actuators (a, with tau_joint = J' tau_actuator).
+# transmission:
+#   {last}: {{{first}: 0.0, {last}: 1.0}}
+
+# Gains of the position control [N m/rad, N m s/rad, N m/(rad s)], critically damped for the inertias of the model.
+gains:{gains}
+
+# Cut-off frequencies of the low-pass filters of the accelerations and of the efforts [Hz].
+motion: {{acceleration_cut_off: {list(arm.identification.acceleration_cut_off)}}}
+effort_cut_off: {arm.identification.effort_cut_off}
+"""
+
+
 def is_from_model_file(arm: Arm) -> bool:
     """Returns whether an arm has no arm file, so that nobody stated more than its model file does."""
     return arm.source.lower().endswith(MODEL_SUFFIXES)
+
+
+def has_converted_model(arm: Arm) -> bool:
+    """Returns whether the links of an arm are those of a model file that was converted, e.g. of a URDF."""
+    return is_from_model_file(arm) or not arm.sdf[0].lower().endswith(".sdf")
 
 
 def is_package_arm(arm: Arm | str) -> bool:
@@ -158,10 +215,7 @@ def _resolve_sdf(part: Mechanism | Instrument, path: Path) -> None:
 
 def _accepted() -> str:
     """Returns the accepted arguments of `load_arm`, for messages."""
-    return (
-        f"known arms: {', '.join(known_arms())}, or the path of an arm file (.yaml) or of a model file "
-        f"({', '.join(MODEL_SUFFIXES[:4])})"
-    )
+    return f"known arms: {', '.join(known_arms())}, or the path of a YAML, URDF, SDF or MJCF file"
 
 
 def _build_arm(

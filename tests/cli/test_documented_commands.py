@@ -6,6 +6,7 @@ import shlex
 import pytest
 from cyclopts import CycloptsError
 from repository import ROOT
+from robot_file import write_robot
 
 from dvrk_drake.cli import main
 from dvrk_drake.cli.app import app
@@ -82,17 +83,18 @@ def test_documentation_contains_all_commands():
 
 
 def test_files_and_commands_for_a_new_arm_work(tmp_path, monkeypatch):
-    """The files in docs/add_an_arm.md, whose first lines are their names, describe arms that the commands accept."""
+    """The files in docs/your_robot.md, whose first lines are their names, describe arms that the commands accept."""
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs/add_an_arm.md").read_text()
+    write_robot(tmp_path, name="my_robot.urdf")
+    page = (ROOT / "docs/your_robot.md").read_text()
     for block in re.findall(r"```(?:yaml|xml)\n(.*?)```", page, re.DOTALL):
         name = re.match(r"(?:#|<!--) (\S+)", block)
         (tmp_path / name[1]).write_text(block)
     arms = {path.name for path in tmp_path.glob("*.yaml") if "mechanism:" in path.read_text()}
-    assert arms == {"my_mtml.yaml", "my_arm.yaml", "psm_with_probe.yaml"}
-    assert {load_arm(arm).name for arm in arms} == {"MTML", "MYARM", "PSM"}
+    assert arms == {"my_mtml.yaml", "psm_with_probe.yaml"}
+    assert {load_arm(arm).name for arm in arms} == {"MTML", "PSM"}
     commands = [shlex.split(found["words"], comments=True) for found in LINE.finditer(page)]
     assert {word for words in commands for word in words if word in arms} == arms
     for words in commands:
-        if words[0] in ("model", "simulate"):
+        if words[0] in ("arm-file", "simulate"):
             assert main(words) == 0, f"dvrk-drake {' '.join(words)}"

@@ -7,7 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from robot_file import URDF, write_robot
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_files import derived_arm_file, load_arm
 from dvrk_drake.models.plant import holding_torques, inverse_dynamics
 
 MJCF = """<mujoco model="lever">
@@ -50,10 +50,10 @@ def test_urdf_defines_joints_limits_and_gains(crane):
     assert arm.tree_joint_names == ("turn", "lift", "swing", "level")
     np.testing.assert_array_equal(arm.linkage.matrix[3], [0, 0, -0.8])
     np.testing.assert_array_equal(arm.prismatic, [False, True, False])
-    np.testing.assert_allclose(arm.position_upper, [2 * np.pi, 0.3, 2.0])
+    np.testing.assert_array_equal(arm.position_upper, [2 * np.pi, 0.3, 2.0])
     np.testing.assert_array_equal(arm.effort_limits, [80, 120, 20])
     # Critical damping: kd^2 = 4 kp M, and kp = w^2 M, so that kd = 2 kp / w.
-    np.testing.assert_allclose(np.array(arm.gains.kd) / arm.gains.kp, 0.1)
+    np.testing.assert_allclose(np.array(arm.gains.kd) / arm.gains.kp, 0.1, atol=1e-9)
     assert load_arm(str(crane)) is arm
 
 
@@ -156,5 +156,22 @@ def test_impossible_inertia_is_replaced_with_a_warning(tmp_path):
 def test_other_files_are_refused(tmp_path):
     for name in ("robot.stl", "robot"):
         (tmp_path / name).write_text("solid")
-        with pytest.raises(ArmError, match=r"is not the file of an arm; known arms: .*\.urdf"):
+        with pytest.raises(ArmError, match=r"is not the file of an arm; known arms: .*URDF"):
             load_arm(tmp_path / name)
+
+
+def test_derived_arm_file_describes_the_same_arm(crane, tmp_path):
+    path = tmp_path / "crane.yaml"
+    path.write_text(derived_arm_file(crane, tmp_path))
+    stated, derived = load_arm(path), load_arm(crane)
+    assert stated.joint_names == derived.joint_names
+    np.testing.assert_allclose(stated.position_upper, derived.position_upper, atol=1e-6)
+    np.testing.assert_allclose(np.divide(stated.gains.kp, derived.gains.kp), 1.0, atol=0.01)
+    text = path.read_text().replace("swing: [-1.5, 2.0]", "swing: [-1.0, 1.0]")
+    path.write_text(f"{text}\nposition_offsets: {{swing: 0.5}}\n")
+    changed = load_arm(path)
+    # Limits are those of recorded positions.
+    assert changed.position_upper[2] == 1.0
+    poses = changed.sample_poses(3, np.random.default_rng(0))
+    shifted = poses + np.array([0.0, 0.0, 0.5])
+    np.testing.assert_allclose(holding_torques(changed, poses), holding_torques(derived, shifted), atol=1e-9)

@@ -131,7 +131,11 @@ def test_an_arm_with_a_number_outside_its_range_is_refused(value):
     arm = load_arm("mtml")
     effects = dataclasses.replace(arm.effects, stretch={"outer_yaw": Cable(1000.0, 1.0)})
     whole = dataclasses.replace(
-        arm, effects=effects, friction_coordinates={"pulley": np.eye(7)[0]}, locked_joints={"held": 0.0}
+        arm,
+        effects=effects,
+        friction_coordinates={"pulley": np.eye(7)[0]},
+        locked_joints={"held": 0.0},
+        position_offsets={"outer_yaw": 0.0},
     )
     for name, (path, _) in IN_OBJECTS.items():
         if name.startswith("Arm."):

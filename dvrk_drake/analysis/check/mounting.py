@@ -7,6 +7,7 @@ most cases by multiples of 90 degrees.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,15 @@ from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import is_from_model_file
+from dvrk_drake.models.arm_schema import ANGLES, Gains
 
 #: Gravity in the base frame that is assumed for a model file [m/s^2].
 ASSUMED_GRAVITY = (0.0, 0.0, -9.81)
-#: Smallest gain in log-likelihood of another direction of gravity or another joint zero. It is the gain at which an
-#: exchange of channels is accepted (`channel_check.MIN_GAIN`). On recordings of six robots, the gain of the true
-#: hypotheses is at least 260, and that of all others at most 6.
-MIN_GAIN = 20.0
+#: Smallest gain in log-likelihood of another direction of gravity or another joint zero, in the search and in the
+#: `ChannelFit` that confirms the result and whose priors contain more of a wrong mounting. In this fit, the gain of the
+#: true hypotheses is 260 to 1960 on recordings of two robots and 14 on a simulated one with three joints. That of all
+#: other hypotheses is at most 6 on recordings of five robots.
+MIN_GAIN, MIN_CONFIRMED_GAIN = 20.0, 10.0
 #: Smallest angle of a reported direction from the stated one [rad]. Smaller angles are tilts of the base, which the
 #: identification estimates (`base_may_tilt`).
 MIN_ANGLE = np.deg2rad(30.0)
@@ -55,7 +58,7 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
     if not observations.recording.motion(arm) and len(observations.recording) < MIN_POSES:
         return arm, []
     try:
-        own = segments_of(observations.longest)[0]
+        own = segments_of(Observations(observations.recording, _with_wide_limits(arm)).longest)[0]
         fit = ChannelFit(own)
     except RecordingError:
         return arm, []  # `check_channels` omits the same recordings.
@@ -63,10 +66,22 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
         return arm, []
     gravity, offsets = _Search(fit).best()
     found = _arm_with(arm, gravity, offsets)
-    if found is arm or _log_likelihood(own, found) - fit.log_likelihood < MIN_GAIN:
+    if found is arm or _log_likelihood(own, found) - fit.log_likelihood < MIN_CONFIRMED_GAIN:
         return arm, []
     is_used = is_assumed(arm)
     return (found if is_used else arm), list(_findings(arm, gravity, offsets, is_used))
+
+
+def _with_wide_limits(arm: Arm) -> Arm:
+    """Returns the arm with joint limits that contain the recorded positions also if zeros differ by a half turn."""
+    width = arm.per_joint(np.pi, 0.0)
+    return replace(
+        arm,
+        position_lower=np.maximum(arm.position_lower - width, ANGLES.low),
+        position_upper=np.minimum(arm.position_upper + width, ANGLES.high),
+        coupled_limits=(),
+        gains=Gains(),
+    )
 
 
 def _arm_with(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> Arm:
@@ -77,7 +92,7 @@ def _arm_with(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float6
 
 
 def _log_likelihood(observations: Observations, arm: Arm) -> float:
-    return ChannelFit(Observations(observations.recording, arm)).log_likelihood
+    return ChannelFit(Observations(observations.recording, _with_wide_limits(arm))).log_likelihood
 
 
 def _findings(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64], is_used: bool) -> Iterator[Finding]:

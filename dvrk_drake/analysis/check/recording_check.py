@@ -422,18 +422,18 @@ def _without_contradictions(report: RecordingReport, observations: Observations)
 
     The sign of `check_motion` is that of the friction, which is uncertain for a drive with little friction.
     """
-    if not any(finding.kind == "effort sign" for finding in report.refusals):
+    wrong = [finding for finding in report.refusals if finding.kind == "effort sign"]
+    if not wrong or report.kind != "motion":
         return report
     try:
         fit = ChannelFit(segments_of(observations.longest)[0])
     except RecordingError:
         return report
-
-    def is_contradicted(finding: Finding) -> bool:
-        signs = np.where(np.isin(np.arange(fit.arm.num_joints), finding.joints), -1.0, 1.0)
-        return finding.kind == "effort sign" and fit.gain(fit.in_actuators(np.diag(signs))) < -MIN_GAIN
-
-    return replace(report, findings=tuple(finding for finding in report.findings if not is_contradicted(finding)))
+    signs = np.ones(fit.arm.num_joints)
+    signs[[joint for finding in wrong for joint in finding.joints]] = -1.0
+    if fit.gain(fit.in_actuators(np.diag(signs))) > -MIN_GAIN:
+        return report
+    return replace(report, findings=tuple(finding for finding in report.findings if finding not in wrong))
 
 
 def _refusals_of_identify(observations: Observations) -> tuple[Finding, ...]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
-from dvrk_drake.models.arm_files import is_from_model_file
+from dvrk_drake.models.arm_files import has_converted_model
 
 #: Number of iterations that estimate the base tilt and the loads of the drives. Each iteration uses the parameters of
 #: the previous iteration. A third iteration changes the errors by less than 0.01 %.
@@ -78,7 +78,7 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     tilts = len(problem.columns.tilts)
     mandatory = np.append(np.arange(problem.num_mandatory), problem.num_effects + np.arange(tilts))
     phi = problem.prior
-    if is_from_model_file(problem.regressor.arm):
+    if has_converted_model(problem.regressor.arm):
         problem = _with_link_scale(problem, mandatory)
     # The efforts contain products of the tilt or a friction coefficient and the link parameters. Each iteration is
     # linear, because it uses the previous link parameters in these products.

@@ -43,7 +43,7 @@ REFUSED = {
     "one row": (lambda: poses(1), "1 distinct pose found. Identification requires at least 8"),
     "few poses": (lambda: poses(7), "7 distinct poses found. Identification requires at least 8"),
     "still": (lambda: motion(6, 100, 0.0), "1 distinct pose found"),
-    "short": (lambda: motion(3, 100), "3.0 s at 100 Hz. A dynamic model requires at least 5 s at 50 Hz or more."),
+    "short": (lambda: motion(1.5, 100), "1.5 s at 100 Hz. A dynamic model requires at least 2 s at 50 Hz or more."),
     "slow": (lambda: motion(10, 30), "10.0 s at 30 Hz. A dynamic model requires"),
     "few rows": (lambda: motion(0.5, 100), "the recording has 50 rows of a motion"),
     "no times": (lambda: replace(motion(6, 100), t=None), "Static identification requires poses at rest"),

@@ -279,7 +279,7 @@ def test_identifies_joints_beside_an_unmeasured_one(days):
     cut = dataclasses.replace(whole, tau=tau).select(np.r_[0:1300, 1340 : len(whole)])
     result = dvrk.identify(cut, ARM)
     (motion,) = result.motions
-    assert len(motion.grid.segments) == 2 and len(motion.measured) == len(cut) - 800
+    assert len(motion.grid.segments) == 2 and len(motion.measured) == 0.9 * len(cut)
     errors = motion.held_out_errors
     assert np.all(errors[:6] < 0.15) and np.isnan(errors[6])
     assert [joint.name for joint in result.model.joints if joint.feedforward_scale == 0] == ["jaw"]
