@@ -18,6 +18,7 @@ from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.excluded_measurements import find_excluded
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import has_converted_model
 from dvrk_drake.recordings.recording import Recording
 
 #: Smallest gain in log-likelihood at which a hypothesis of `check_channels` is accepted. On the unmodified public
@@ -34,7 +35,8 @@ MIN_MIRROR_GAIN = 100.0
 MIN_GAIN_AT_REST, MIN_EFFORT_GAIN_AT_REST = 30.0, 40.0
 #: Hypotheses with a gain within this distance of the largest gain are reported as alternatives.
 SIMILAR_GAIN = 10.0
-#: Factors by which the recorded effort is multiplied for a test of the scale.
+#: Factors by which the recorded effort is multiplied for a test of the scale. They are not tested for a converted model
+#: file, whose masses may be wrong by a factor of 2 and which states no friction; see `find_mounting`.
 SCALES = (0.5, 2.0)
 #: Largest accepted ratio of the dissipated friction power to the friction power expected from the arm file. The public
 #: recordings of one PSM on two days have ratios between 0.96 and 1.54.
@@ -281,7 +283,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
                 continue
             what = f"the actuator friction dissipates {ratio:.2g} times the power expected from the arm file"
         else:
-            scale, gain = _best_scale(fit, i)
+            scale, gain = (1.0, 0.0) if has_converted_model(fit.arm) else _best_scale(fit, i)
             if gain < MIN_GAIN:
                 continue
             ratio = 1 / scale

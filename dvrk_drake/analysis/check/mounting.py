@@ -19,7 +19,7 @@ from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import is_from_model_file
+from dvrk_drake.models.arm_files import has_converted_model, is_from_model_file
 from dvrk_drake.models.arm_schema import ANGLES, Gains
 
 #: Gravity in the base frame that is assumed for a model file [m/s^2].
@@ -37,6 +37,12 @@ MIN_ANGLE = np.deg2rad(30.0)
 SNAP_ANGLE = np.deg2rad(10.0)
 #: Differences of the joint zeros of a model and of a controller [rad].
 QUARTER_TURNS = (np.pi / 2, -np.pi / 2, np.pi)
+#: Largest factor between measured and nominal gravity efforts that may be due to inaccurate masses. Currents in A are
+#: about 10 times smaller than torques (10.6 to 14.9 N m/A for a UR10e).
+MAX_SCALE = 4.0
+#: Smallest correlation between measured and nominal gravity efforts for a statement on their ratio. It is above 0.9 for
+#: three robots, and low if the gravity efforts hardly change during the motion.
+MIN_SIMILARITY = 0.8
 #: Number of reweighted fits for the direction of gravity, after which it changes by less than 1 degree.
 _ITERATIONS = 5
 
@@ -64,12 +70,14 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
         return arm, []  # `check_channels` omits the same recordings.
     if not len(fit.used):
         return arm, []
-    gravity, offsets = _Search(fit).best()
+    search = _Search(fit)
+    gravity, offsets = search.best()
+    scale = list(_scale_findings(arm, search.scale(gravity, offsets))) if has_converted_model(arm) else []
     found = _arm_with(arm, gravity, offsets)
     if found is arm or _log_likelihood(own, found) - fit.log_likelihood < MIN_CONFIRMED_GAIN:
-        return arm, []
+        return arm, scale
     is_used = is_assumed(arm)
-    return (found if is_used else arm), list(_findings(arm, gravity, offsets, is_used))
+    return (found if is_used else arm), [*_findings(arm, gravity, offsets, is_used), *scale]
 
 
 def _with_wide_limits(arm: Arm) -> Arm:
@@ -96,7 +104,7 @@ def _log_likelihood(observations: Observations, arm: Arm) -> float:
 
 
 def _findings(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64], is_used: bool) -> Iterator[Finding]:
-    used = "This is used." if is_used else "It is not used."
+    used = "This is used" if is_used else "It is not used"
     if not np.array_equal(gravity, arm.gravity):
         vector, stated = (" ".join(f"{x:.3g}" for x in g + 0.0) for g in (gravity, arm.gravity))
         what = f"gravity acts along ({vector}) m/s^2 in the base frame, not along ({stated}). {used}"
@@ -107,6 +115,16 @@ def _findings(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float6
         what = f"the zero of q{j + 1} differs by {degrees:+.0f} degrees from that of the model. {used}"
         advice = f"State it in the arm file: position_offsets: {{{name}: {offsets[j]:.4f}}}."
         yield Finding("warning", "joint zero", name, what, advice, (int(j),), float(offsets[j]))
+
+
+def _scale_findings(arm: Arm, scale: float) -> Iterator[Finding]:
+    if not 1 / MAX_SCALE < scale < MAX_SCALE:
+        what = f"the efforts are about {scale:.2g} times the gravity efforts of the links in the model"
+        advice = (
+            "Check the unit. Currents must be multiplied by the torque constant and the gear ratio of each joint, and "
+            "torques of motors by the gear ratio, or state the transmission in an arm file."
+        )
+        yield Finding("warning", "effort scale", arm.name, what, advice, size=scale)
 
 
 class _Search:
@@ -139,6 +157,18 @@ class _Search:
                 break
             current, (gravity, offsets) = likelihood, best
         return gravity, offsets
+
+    def scale(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> float:
+        """Returns the common ratio of measured and nominal gravity efforts, 1 if they are not similar."""
+        holding, products = self._fit.holding_efforts(gravity, offsets), np.zeros((2, 2))
+        for i in self._fit.used:
+            X = self._friction[i]
+            own = np.column_stack([self._tau[:, i], holding[:, i]])
+            own -= X @ np.linalg.lstsq(X, own, rcond=None)[0]
+            products += own.T @ own / self._arm.effort_limits[i] ** 2
+        (measured, both), (_, nominal) = products
+        is_similar = both > MIN_SIMILARITY * np.sqrt(measured * nominal) > 0
+        return float(both / nominal) if is_similar else 1.0
 
     def _candidates(
         self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]

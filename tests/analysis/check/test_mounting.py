@@ -57,4 +57,4 @@ def test_mounting_of_an_arm_file_is_not_replaced(path, tmp_path):
     arm = dvrk.load_arm(file)
     report = dvrk.check(robot_motion(arm.with_gravity([0, 9.81, 0])), arm)
     (finding,) = (f for f in report.warnings if f.kind == "gravity direction")
-    assert "It is not used." in finding.what and "--gravity 0 9.81 0" in finding.advice
+    assert "It is not used" in finding.what and "--gravity 0 9.81 0" in finding.advice
