@@ -20,6 +20,7 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 from dvrk_drake.export.gltf import to_obj
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
+from dvrk_drake.models.model_file import inertial_element as spatial_inertia_element
 from dvrk_drake.models.sdf_model import DRAKE, PACKAGE_URL, compose_sdf, local_path
 
 #: Relative change of a parameter below which a link counts as unchanged.
@@ -142,17 +143,7 @@ def inertial_element(inertia: LinkInertia) -> ElementTree.Element:
         raise ModelError(
             f"{inertia.link}: the inertia is not physically consistent; its pseudo-inertia must be positive definite"
         )
-    M_LLo_L = inertia.to_spatial_inertia()
-    p_LoLcm_L = M_LLo_L.get_com()
-    I_LLcm_L = M_LLo_L.Shift(p_LoLcm_L).CalcRotationalInertia()
-    element = ElementTree.Element("inertial")
-    _add(element, "pose", " ".join([*_numbers(p_LoLcm_L), "0 0 0"]))
-    _add(element, "mass", repr(M_LLo_L.get_mass()))
-    inertia_element = ElementTree.SubElement(element, "inertia")
-    values = _numbers([*I_LLcm_L.get_moments(), *I_LLcm_L.get_products()])
-    for name, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), values, strict=True):
-        _add(inertia_element, name, value)
-    return element
+    return spatial_inertia_element(inertia.to_spatial_inertia())
 
 
 def _set_rotor(root: ElementTree.Element, joint: str, inertia: float) -> None:
@@ -167,16 +158,6 @@ def _set_rotor(root: ElementTree.Element, joint: str, inertia: float) -> None:
         if child is None:
             child = ElementTree.SubElement(element, f"{DRAKE}{tag}")
         child.text = repr(value)
-
-
-def _add(parent: ElementTree.Element, tag: str, text: str) -> None:
-    ElementTree.SubElement(parent, tag).text = text
-
-
-def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
-    """Formats numbers in full precision. Numbers below 1e-15 times the largest number become 0."""
-    threshold = 1e-15 * max(abs(x) for x in values)
-    return [repr(float(x)) if abs(x) > threshold else "0" for x in values]
 
 
 def _equal_parameters(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:

@@ -8,6 +8,7 @@ import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +29,7 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.parsing import LoadModelDirectives, Parser
+from pydrake.multibody.parsing import LoadModelDirectives, PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
@@ -181,12 +182,7 @@ class _Model:
         if scene_graph is not None:
             plant.RegisterAsSourceForSceneGraph(scene_graph)
         parser = Parser(plant)
-        parser.package_map().PopulateFromRosPackagePath()
-        parser.package_map().PopulateFromFolder(str(path.parent))
-        # Most ROS packages are one or two folders above their URDF files.
-        for folder in path.parents[:2]:
-            if not parser.package_map().Contains(folder.name):
-                parser.package_map().Add(folder.name, str(folder))
+        _add_packages(parser.package_map(), path.parent)
         parser.AddModels(str(path))
         documents = [read_xml(file) for file in _files(path, parser)]
         _weld_base(plant)
@@ -419,6 +415,22 @@ class _Model:
                     color = properties.GetProperty("phong", "diffuse")
                     material = ElementTree.SubElement(part, "material")
                     add_element(material, "diffuse", _numbers([color.r(), color.g(), color.b(), color.a()]))
+
+
+def _add_packages(packages: PackageMap, folder: Path) -> None:
+    """Adds the packages of ROS and those in a folder, and the folder and its parent, where most packages have models.
+
+    Drake's own search is not used, because it would search all folders below, e.g. of a home folder.
+    """
+    packages.PopulateFromRosPackagePath()
+    parents = folder, folder.parent
+    for file in (*(parent / "package.xml" for parent in parents), *sorted(folder.glob("*/package.xml"))):
+        if file.is_file():
+            with suppress(RuntimeError):  # a package of that name is known already, or the file has no name
+                packages.AddPackageXml(str(file))
+    for parent in parents:
+        if parent.name and not packages.Contains(parent.name):
+            packages.Add(parent.name, str(parent))
 
 
 def _files(path: Path, parser: Parser) -> Iterator[Path]:
