@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import (
     Box,
     Capsule,
@@ -28,7 +28,7 @@ from pydrake.geometry import (
     Shape,
     Sphere,
 )
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import LoadModelDirectives, PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -60,6 +60,8 @@ _CONNECTOR_MASS = 1e-3
 #: Smallest radius of gyration of a link, as a share of the largest distance between two neighbouring joints. A smaller
 #: one (in some files 0) would fix the inertia in an identification, since priors are relative to it.
 _MIN_GYRATION = 0.02
+#: Radius of the shapes of a model without shapes, as a share of the largest distance between two neighbouring joints.
+_STICK = 0.05
 
 
 class _Link(NamedTuple):
@@ -82,7 +84,7 @@ def convert_model(path: Path) -> ElementTree.Element:
     The links are `base_link`, which is the world and all that is welded to it, and one link per moving joint. Bodies
     that are welded to a link become a part of it, and their frames become frames of the link. The origin of a link is
     on the axis of its joint. Joints, mimic joints, limits, rotors, frames and shapes are those of the file. Shapes are
-    omitted if a mesh is missing.
+    omitted if a mesh is missing. Without shapes, sticks show the links.
 
     Raises:
         ArmError: Drake cannot read the file, or the model is not an arm: it has a floating body, a joint with several
@@ -264,6 +266,8 @@ class _Model:
             parent = parents[link.joint.parent_body().index()]
             self._add_joint(model, link, parent, efforts.get(link.joint.name()), mimics.get(link.joint.name()))
         self._add_frames(model)
+        if model.find("link/visual") is None:
+            self._add_sticks(model)
         return root
 
     def _inertias(self) -> list[SpatialInertia]:
@@ -395,6 +399,30 @@ class _Model:
                         names.add(name)
                         element = ElementTree.SubElement(model, "frame", name=name, attached_to=link.name)
                         _add_pose(element, X_LB @ frame.GetFixedPoseInBodyFrame())
+
+    def _add_sticks(self, model: ElementTree.Element) -> None:
+        """Adds visual shapes from the joint of each link to the next joints, to show a model without shapes."""
+        ends: dict[str, list[NDArray[np.float64]]] = {link.name: [] for link in self.links}
+        for link in self.links[1:]:
+            assert link.joint is not None
+            body = link.joint.parent_body().index()
+            parent = next(other for other in self.links if body in other.members)
+            X_LF = parent.members[body] @ link.joint.frame_on_parent().GetFixedPoseInBodyFrame()
+            ends[parent.name].append(X_LF.translation())
+        for link in self.links[1:]:
+            # The last link ends at its farthest part, e.g. the frame of a tool.
+            parts = [X_LB.translation() for X_LB in link.members.values()]
+            ends[link.name] = ends[link.name] or [max(parts, key=np.linalg.norm)]
+        radius = _STICK * max(float(np.linalg.norm(p)) for points in ends.values() for p in points)
+        for element in model.findall("link"):
+            for p_LE in ends[element.get("name", "")]:
+                length = float(np.linalg.norm(p_LE))
+                visual = ElementTree.SubElement(element, "visual", name=f"stick_{len(element)}")
+                if length > radius:
+                    _add_pose(visual, RigidTransform(RotationMatrix.MakeFromOneVector(p_LE, 2), p_LE / 2))
+                shape = _shape(Capsule(radius, length) if length > radius else Sphere(1.5 * radius))
+                assert shape is not None
+                ElementTree.SubElement(visual, "geometry").append(shape)
 
     def _add_shapes(self, element: ElementTree.Element, body: BodyIndex, X_LB: RigidTransform) -> None:
         if self.scene_graph is None:

@@ -9,6 +9,7 @@ from robot_file import URDF, write_robot
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import derived_arm_file, load_arm
 from dvrk_drake.models.plant import holding_torques, inverse_dynamics
+from dvrk_drake.models.sdf_model import compose_sdf
 
 MJCF = """<mujoco model="lever">
   <compiler angle="radian"/>
@@ -85,6 +86,14 @@ def test_frames_of_fixed_links_remain(crane):
         model.SetPositions(context, [0.3, 0.1, 0.5, -0.3])
         poses.append([model.GetFrameByName(name).CalcPoseInWorld(context).GetAsMatrix4() for name in ("tip", "floor")])
     np.testing.assert_allclose(*poses, atol=1e-9)
+
+
+def test_sticks_show_a_model_without_shapes(crane):
+    """The mesh of the file is missing, so its collision shape is omitted, too."""
+    root = compose_sdf(load_arm(crane).sdf)
+    assert {shape.tag for shape in root.iterfind("model/link/*/geometry/*")} == {"capsule"}
+    assert len(root.findall("model/link[visual]")) == len(root.findall("model/link"))
+    assert root.find("model/link/collision") is None
 
 
 def test_mjcf_is_read(tmp_path):
