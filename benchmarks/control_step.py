@@ -41,7 +41,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
-from dvrk_drake.models.sdf_model import DRAKE, compose_sdf
+from dvrk_drake.models.sdf_elements import DRAKE
+from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 

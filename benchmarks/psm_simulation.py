@@ -50,7 +50,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.plant import add_arm, set_arm_positions
-from dvrk_drake.models.sdf_model import DRAKE, compose_sdf
+from dvrk_drake.models.sdf_elements import DRAKE
+from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 

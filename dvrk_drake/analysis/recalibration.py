@@ -82,7 +82,7 @@ class Recalibration(ModelResult):
         actuators: Recalibration of the actuators, in the arm's order.
         shared: Factors by which the friction changes at coordinates that several actuators move [1]. An example of a
             key is "finger_1 dry".
-        seconds: Duration of the motion without the first and the last second [s].
+        seconds: Duration of the motion without both ends (`MotionGrid.inner`) [s].
     """
 
     actuators: list[RecalibratedActuator]

@@ -20,8 +20,9 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 from dvrk_drake.export.gltf import to_obj
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
-from dvrk_drake.models.model_file import inertial_element as spatial_inertia_element
-from dvrk_drake.models.sdf_model import DRAKE, PACKAGE_URL, compose_sdf, local_path
+from dvrk_drake.models.sdf_elements import DRAKE
+from dvrk_drake.models.sdf_elements import inertial_element as spatial_inertia_element
+from dvrk_drake.models.sdf_model import PACKAGE_URL, compose_sdf, local_path
 
 #: Relative change of a parameter below which a link counts as unchanged.
 _UNCHANGED = 1e-12

@@ -18,7 +18,8 @@ from dvrk_drake.export.sdf import MeshFormat, copy_meshes, redirect_meshes, to_t
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import package_map, set_arm_positions
-from dvrk_drake.models.sdf_model import DRAKE, compose_sdf
+from dvrk_drake.models.sdf_elements import DRAKE
+from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.urdf import to_urdf
 
 #: Number of random poses at which collision shapes are tested.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import re
 from contextlib import suppress
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError
@@ -98,20 +100,22 @@ def derived_arm_file(model: str | Path, folder: str | Path) -> str:
     if not is_from_model_file(arm):
         raise ArmError(f"{os.fspath(model)} is not a model file; allowed: {', '.join(MODEL_SUFFIXES)}")
 
+    names = [_yaml_text(name) for name in arm.joint_names]
+
     def per_joint(values: NDArray[np.float64]) -> str:
-        return "".join(f"\n  {n}: {np.round(x, 6).tolist()}" for n, x in zip(arm.joint_names, values, strict=True))
+        return "".join(f"\n  {name}: {np.round(x, 6).tolist()}" for name, x in zip(names, values, strict=True))
 
     limits = np.column_stack([arm.position_lower, arm.position_upper])
-    first, last = arm.joint_names[0], arm.joint_names[-1]
+    first, last = names[0], names[-1]
     gains = "".join(f"\n  {name}: {[float(f'{x:.3g}') for x in values]}" for name, values in vars(arm.gains).items())
     return f"""\
 # Derived from a model file. Change what differs for your robot; keys that you delete are derived again.
 format: dvrk_drake arm 1.0
-name: {arm.name}
-sdf: {os.path.relpath(os.path.realpath(model), os.path.realpath(folder))}
+name: {_yaml_text(arm.name)}
+sdf: {_yaml_text(os.path.relpath(os.path.realpath(model), os.path.realpath(folder)))}
 
 # Independent joints, in the order of recordings and messages.
-joints: [{", ".join(arm.joint_names)}]
+joints: [{", ".join(names)}]
 
 # Limits of the positions [rad; m if prismatic] and of the efforts [N m; N].
 position_limits:{per_joint(limits)}
@@ -134,6 +138,12 @@ gains:{gains}
 motion: {{acceleration_cut_off: {list(arm.identification.acceleration_cut_off)}}}
 effort_cut_off: {arm.identification.effort_cut_off}
 """
+
+
+def _yaml_text(text: str) -> str:
+    """Returns a text as YAML: with quotation marks if it could be read as something else, e.g. `on`."""
+    is_plain = re.fullmatch(r"[\w./-]+", text, re.ASCII) and yaml.safe_load(text) == text
+    return text if is_plain else json.dumps(text)
 
 
 def is_from_model_file(arm: Arm) -> bool:

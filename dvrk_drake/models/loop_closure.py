@@ -12,7 +12,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import LoopClosure
-from dvrk_drake.models.sdf_model import DRAKE
+from dvrk_drake.models.sdf_elements import DRAKE
 
 #: Methods of closing the loops of a linkage: "mimic" couples joints of the tree, "ball" adds constraints at the points
 #: where the loops are cut in the tree.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -12,23 +11,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydrake.geometry import (
-    Box,
-    Capsule,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    Mesh,
-    Role,
-    SceneGraph,
-    Shape,
-    Sphere,
-)
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from numpy.typing import NDArray
+from pydrake.geometry import Capsule, Role, SceneGraph, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import LoadModelDirectives, PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -44,14 +31,18 @@ from pydrake.multibody.tree import (
 )
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.files import MAX_TEXT, read_input
+from dvrk_drake.models.sdf_elements import (
+    DRAKE,
+    add_element,
+    add_pose,
+    inertial_element,
+    numbers_text,
+    read_xml,
+    shape_element,
+)
 
 #: Endings of the names of model files.
 MODEL_SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml", ".dmd.yml")
-#: Prefix of the names of Drake's extensions of SDF and URDF.
-DRAKE = "{http://drake.mit.edu}"
-#: Maximum nesting of elements; the models of the dVRK's arms have 7 levels.
-_MAX_DEPTH = 50
 #: Position limits of a joint that can turn without end [rad]. Most drives of such joints count two turns at most.
 CONTINUOUS = 2 * math.pi
 #: Mass of a massless link between two moving joints, as a share of the mean mass of the links. Such a link only
@@ -64,18 +55,24 @@ _MIN_GYRATION = 0.02
 _STICK = 0.05
 
 
-class _Link(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Link:
     """A body with all bodies that are welded to it.
 
     Attributes:
         name: Name of the link.
         members: Body -> its pose X_LB in the frame of the link.
-        joint: Joint that moves the link, None for the base.
     """
 
     name: str
     members: dict[BodyIndex, RigidTransform]
-    joint: Joint | None
+
+
+@dataclass(frozen=True, eq=False)
+class _MovingLink(_Link):
+    """Link with the joint that moves it."""
+
+    joint: RevoluteJoint | PrismaticJoint
 
 
 def convert_model(path: Path) -> ElementTree.Element:
@@ -94,30 +91,6 @@ def convert_model(path: Path) -> ElementTree.Element:
         return _Model.of(path).to_sdf()
     except ArmError as error:
         raise error if str(error).startswith(str(path)) else ArmError(f"{path}: {error}") from error
-
-
-def read_xml(path: Path) -> ElementTree.Element:
-    """Returns the root element of an XML file.
-
-    Raises:
-        ArmError: The file cannot be read, is not XML, or has more than `_MAX_DEPTH` levels of elements.
-    """
-    parser: Any = ElementTree.XMLPullParser(("start", "end"))
-    depth = 0
-    root: ElementTree.Element | None = None
-    try:
-        parser.feed(read_input(path, ArmError, MAX_TEXT))
-        for event, element in parser.read_events():
-            root = element if root is None else root
-            depth += 1 if event == "start" else -1
-            if depth > _MAX_DEPTH:
-                raise ValueError(f"elements are nested deeper than {_MAX_DEPTH} levels")
-        parser.close()
-        if root is None:
-            raise ValueError("the file has no element")
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ArmError(f"{path}: invalid XML: {error}") from error
-    return root
 
 
 class _DrakeLog(logging.Handler):
@@ -197,13 +170,13 @@ class _Model:
         return [self.plant.get_joint(index) for index in self.plant.GetJointIndices()]
 
     @cached_property
-    def links(self) -> list[_Link]:
-        """Links of the tree, each after its parent."""
+    def links(self) -> tuple[_Link, ...]:
+        """Base, and all other links, each after its parent."""
         children: dict[BodyIndex, list[Joint]] = {}
         for joint in self.joints:
             children.setdefault(joint.parent_body().index(), []).append(joint)
         links: list[_Link] = []
-        open_links = [_Link("base_link", {self.plant.world_body().index(): RigidTransform()}, None)]
+        open_links = [_Link("base_link", {self.plant.world_body().index(): RigidTransform()})]
         while open_links:
             link = open_links.pop(0)
             links.append(link)
@@ -218,13 +191,18 @@ class _Model:
                         link.members[child] = X_LP @ joint.X_FM() @ X_MB
                         todo.append(child)
                     elif isinstance(joint, RevoluteJoint | PrismaticJoint):
-                        open_links.append(_Link(self._name(joint.child_body()), {child: X_MB}, joint))
+                        open_links.append(_MovingLink(self._name(joint.child_body()), {child: X_MB}, joint))
                     else:
                         raise ArmError(
                             f"joint {joint.name()} is of type {joint.type_name()}; allowed: revolute, continuous, "
                             "prismatic and fixed joints"
                         )
-        return links
+        return tuple(links)
+
+    @property
+    def moving(self) -> list[_MovingLink]:
+        """Links without the base."""
+        return [link for link in self.links if isinstance(link, _MovingLink)]
 
     def _name(self, body: RigidBody) -> str:
         """Returns the name of a body, with the name of its model if another body has the same name."""
@@ -236,8 +214,8 @@ class _Model:
 
     def to_sdf(self) -> ElementTree.Element:
         """Returns the root element of the SDF."""
-        moving = self.links[1:]
-        names = [link.joint.name() for link in moving if link.joint]
+        moving = self.moving
+        names = [link.joint.name() for link in moving]
         if not moving:
             raise ArmError("the model has no moving joint")
         if repeated := sorted({name for name in names if names.count(name) > 1}):
@@ -255,14 +233,13 @@ class _Model:
             body, X_LB = next(iter(link.members.items()))
             X_WL = self.plant.get_body(body).EvalPoseInWorld(context) @ X_LB.inverse()
             element = ElementTree.SubElement(model, "link", name=link.name)
-            _add_pose(element, X_WL)
+            add_pose(element, X_WL)
             if inertia is not None:
                 element.append(inertial_element(inertia))
             for body, X_LB in link.members.items():
                 self._add_shapes(element, body, X_LB)
         parents = {body: link.name for link in self.links for body in link.members}
         for link in moving:
-            assert link.joint is not None
             parent = parents[link.joint.parent_body().index()]
             self._add_joint(model, link, parent, efforts.get(link.joint.name()), mimics.get(link.joint.name()))
         self._add_frames(model)
@@ -273,7 +250,7 @@ class _Model:
     def _inertias(self) -> list[SpatialInertia]:
         """Returns the inertia of each moving link about its origin, with `_MIN_GYRATION`."""
         found, sizes = [], [0.0]
-        for link in self.links[1:]:
+        for link in self.moving:
             M_LLo_L = SpatialInertia.Zero()
             for index, X_LB in link.members.items():
                 body = self.plant.get_body(index)
@@ -282,7 +259,6 @@ class _Model:
                     M_LLo_L += M_BBo_B.ReExpress(X_LB.rotation()).Shift(-X_LB.translation())
             found.append(M_LLo_L)
             sizes += [float(np.linalg.norm(X_LB.translation())) for X_LB in link.members.values()]
-            assert link.joint is not None
             sizes.append(float(np.linalg.norm(link.joint.frame_on_parent().GetFixedPoseInBodyFrame().translation())))
         masses = [M.get_mass() for M in found]
         if not max(masses) > 0:
@@ -349,16 +325,20 @@ class _Model:
         return {name: limit for name, limit in limits.items() if 0 < limit < math.inf}
 
     def _add_joint(
-        self, model: ElementTree.Element, link: _Link, parent: str, effort: float | None, mimic: dict[str, str] | None
+        self,
+        model: ElementTree.Element,
+        link: _MovingLink,
+        parent: str,
+        effort: float | None,
+        mimic: dict[str, str] | None,
     ) -> None:
         joint = link.joint
-        assert isinstance(joint, RevoluteJoint | PrismaticJoint)
         slides = isinstance(joint, PrismaticJoint)
         element = ElementTree.SubElement(model, "joint", name=joint.name(), type="prismatic" if slides else "revolute")
         add_element(element, "parent", parent)
         add_element(element, "child", link.name)
         axis = ElementTree.SubElement(element, "axis")
-        add_element(axis, "xyz", _numbers(joint.translation_axis() if slides else joint.revolute_axis()))
+        add_element(axis, "xyz", numbers_text(joint.translation_axis() if slides else joint.revolute_axis()))
         limit = ElementTree.SubElement(axis, "limit")
         lower, upper = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         if not lower < upper:
@@ -398,18 +378,17 @@ class _Model:
                     if name and is_own and name not in names and not name.startswith("__"):
                         names.add(name)
                         element = ElementTree.SubElement(model, "frame", name=name, attached_to=link.name)
-                        _add_pose(element, X_LB @ frame.GetFixedPoseInBodyFrame())
+                        add_pose(element, X_LB @ frame.GetFixedPoseInBodyFrame())
 
     def _add_sticks(self, model: ElementTree.Element) -> None:
         """Adds visual shapes from the joint of each link to the next joints, to show a model without shapes."""
         ends: dict[str, list[NDArray[np.float64]]] = {link.name: [] for link in self.links}
-        for link in self.links[1:]:
-            assert link.joint is not None
+        for link in self.moving:
             body = link.joint.parent_body().index()
             parent = next(other for other in self.links if body in other.members)
             X_LF = parent.members[body] @ link.joint.frame_on_parent().GetFixedPoseInBodyFrame()
             ends[parent.name].append(X_LF.translation())
-        for link in self.links[1:]:
+        for link in self.moving:
             # The last link ends at its farthest part, e.g. the frame of a tool.
             parts = [X_LB.translation() for X_LB in link.members.values()]
             ends[link.name] = ends[link.name] or [max(parts, key=np.linalg.norm)]
@@ -419,8 +398,8 @@ class _Model:
                 length = float(np.linalg.norm(p_LE))
                 visual = ElementTree.SubElement(element, "visual", name=f"stick_{len(element)}")
                 if length > radius:
-                    _add_pose(visual, RigidTransform(RotationMatrix.MakeFromOneVector(p_LE, 2), p_LE / 2))
-                shape = _shape(Capsule(radius, length) if length > radius else Sphere(1.5 * radius))
+                    add_pose(visual, RigidTransform(RotationMatrix.MakeFromOneVector(p_LE, 2), p_LE / 2))
+                shape = shape_element(Capsule(radius, length) if length > radius else Sphere(1.5 * radius))
                 assert shape is not None
                 ElementTree.SubElement(visual, "geometry").append(shape)
 
@@ -431,18 +410,18 @@ class _Model:
         frame = self.plant.GetBodyFrameIdOrThrow(body)
         for tag, role in (("visual", Role.kIllustration), ("collision", Role.kProximity)):
             for geometry in inspector.GetGeometries(frame, role):
-                shape = _shape(inspector.GetShape(geometry))
+                shape = shape_element(inspector.GetShape(geometry))
                 if shape is None:
                     continue
                 name = f"{inspector.GetName(geometry).rpartition('::')[2]}_{len(element)}"
                 part = ElementTree.SubElement(element, tag, name=name)
-                _add_pose(part, X_LB @ inspector.GetPoseInFrame(geometry))
+                add_pose(part, X_LB @ inspector.GetPoseInFrame(geometry))
                 ElementTree.SubElement(part, "geometry").append(shape)
                 properties = inspector.GetIllustrationProperties(geometry) if tag == "visual" else None
                 if properties is not None and properties.HasProperty("phong", "diffuse"):
                     color = properties.GetProperty("phong", "diffuse")
                     material = ElementTree.SubElement(part, "material")
-                    add_element(material, "diffuse", _numbers([color.r(), color.g(), color.b(), color.a()]))
+                    add_element(material, "diffuse", numbers_text([color.r(), color.g(), color.b(), color.a()]))
 
 
 def _add_packages(packages: PackageMap, folder: Path) -> None:
@@ -469,11 +448,7 @@ def _files(path: Path, parser: Parser) -> Iterator[Path]:
     for directive in LoadModelDirectives(str(path)).directives:
         added = directive.add_model or directive.add_directives
         if added is not None:
-            package, _, relative = added.file.removeprefix("package://").partition("/")
-            if added.file.startswith("package://"):
-                yield from _files(Path(parser.package_map().GetPath(package)) / relative, parser)
-            else:
-                yield from _files(Path(re.sub("^file://", "", added.file)), parser)
+            yield from _files(Path(parser.package_map().ResolveUrl(added.file)), parser)
 
 
 def _weld_base(plant: MultibodyPlant) -> None:
@@ -504,64 +479,3 @@ def _with_gyration(M_LLo_L: SpatialInertia, least: float) -> SpatialInertia:
     I_LLcm_L += 2 * m * least**2 * np.eye(3)
     central = RotationalInertia(*np.diag(I_LLcm_L), I_LLcm_L[0, 1], I_LLcm_L[0, 2], I_LLcm_L[1, 2])
     return SpatialInertia.MakeFromCentralInertia(m, p_LoLcm_L, central)
-
-
-def inertial_element(M_LLo_L: SpatialInertia) -> ElementTree.Element:
-    """Returns the element `<inertial>` in full precision, with the rotational inertia about the centre of mass."""
-    p_LoLcm_L = M_LLo_L.get_com()
-    I_LLcm_L = M_LLo_L.Shift(p_LoLcm_L).CalcRotationalInertia()
-    element = ElementTree.Element("inertial")
-    add_element(element, "pose", f"{_numbers(p_LoLcm_L)} 0 0 0")
-    add_element(element, "mass", repr(float(M_LLo_L.get_mass())))
-    inertia_element = ElementTree.SubElement(element, "inertia")
-    values = _numbers([*I_LLcm_L.get_moments(), *I_LLcm_L.get_products()]).split()
-    for name, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), values, strict=True):
-        add_element(inertia_element, name, value)
-    return element
-
-
-def _shape(shape: Shape) -> ElementTree.Element | None:
-    """Returns the SDF element of a shape, None if SDF has no such shape."""
-    match shape:
-        case Box():
-            values = {"size": shape.size()}
-        case Sphere():
-            values = {"radius": [shape.radius()]}
-        case Cylinder() | Capsule():
-            values = {"radius": [shape.radius()], "length": [shape.length()]}
-        case Ellipsoid():
-            values = {"radii": [shape.a(), shape.b(), shape.c()]}
-        case Mesh() | Convex() if shape.source().is_path():
-            element = ElementTree.Element("mesh")
-            add_element(element, "uri", str(shape.source().path()))
-            add_element(element, "scale", _numbers(shape.scale3()))
-            if isinstance(shape, Convex):
-                ElementTree.SubElement(element, f"{DRAKE}declare_convex")
-            return element
-        case _:
-            return None
-    element = ElementTree.Element(type(shape).__name__.lower())
-    for tag, numbers in values.items():
-        add_element(element, tag, _numbers(numbers))
-    return element
-
-
-def _add_pose(element: ElementTree.Element, X: RigidTransform) -> None:
-    """Adds the element `<pose>`, unless it is the identity."""
-    if not X.IsExactlyIdentity():
-        rpy = RollPitchYaw(X.rotation()).vector()
-        add_element(element, "pose", " ".join(repr(float(x) + 0.0) for x in (*X.translation(), *rpy)))
-
-
-def add_element(parent: ElementTree.Element, tag: str, text: str) -> ElementTree.Element:
-    """Adds an element with a text."""
-    element = ElementTree.SubElement(parent, tag)
-    element.text = text
-    return element
-
-
-def _numbers(values: ArrayLike) -> str:
-    """Formats numbers in full precision. Numbers below 1e-15 times the largest number become 0."""
-    array = np.asarray(values, dtype=float).ravel()
-    threshold = 1e-15 * np.abs(array).max()
-    return " ".join(repr(float(x)) if abs(x) > threshold else "0" for x in array)

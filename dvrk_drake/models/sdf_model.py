@@ -12,8 +12,9 @@ from pathlib import Path
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.immutable import cached
-from dvrk_drake.models.model_file import DRAKE, MODEL_SUFFIXES, convert_model, read_xml
+from dvrk_drake.models.model_file import MODEL_SUFFIXES, convert_model
 from dvrk_drake.models.schema_fault import Range
+from dvrk_drake.models.sdf_elements import DRAKE, read_xml
 
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"

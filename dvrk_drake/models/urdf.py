@@ -11,7 +11,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, is_in_degrees, read_sdf_facts
+from dvrk_drake.models.sdf_elements import DRAKE
+from dvrk_drake.models.sdf_model import SdfFacts, is_in_degrees, read_sdf_facts
 
 #: Speed limit of joints for which the SDF has no speed limit [rad/s, m/s]. URDF requires a speed limit.
 NO_SPEED_LIMIT = "1000"

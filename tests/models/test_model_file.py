@@ -184,3 +184,10 @@ def test_derived_arm_file_describes_the_same_arm(crane, tmp_path):
     poses = changed.sample_poses(3, np.random.default_rng(0))
     shifted = poses + np.array([0.0, 0.0, 0.5])
     np.testing.assert_allclose(holding_torques(changed, poses), holding_torques(derived, shifted), atol=1e-9)
+
+
+def test_names_that_yaml_would_convert_are_quoted(tmp_path):
+    path = write_robot(tmp_path, ('"swing"', '"on"'), name="7 axes.urdf")
+    file = tmp_path / "robot.yaml"
+    file.write_text(derived_arm_file(path, tmp_path))
+    assert load_arm(file).joint_names == ("turn", "lift", "on")

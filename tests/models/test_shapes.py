@@ -18,7 +18,8 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions
-from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, compose_sdf
+from dvrk_drake.models.sdf_elements import DRAKE
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 pytestmark = pytest.mark.drake_api
 

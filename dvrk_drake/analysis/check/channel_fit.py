@@ -185,7 +185,7 @@ class ChannelFit:
         values, vectors = np.linalg.eigh(information)
         directions = vectors[:, values > MIN_INFORMATION]
         self._to_parameters = deviation[:, None] * directions
-        tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._unit_gravity_efforts(q)[:, :, :2]
+        tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._unit_gravity_efforts(q)
         self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)
         self._rows = np.array([self.arm.effect_coordinates[effect.coordinate] for effect in drive.effects])
         shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, self._q, self._v)))
@@ -258,7 +258,7 @@ class ChannelFit:
         return np.asarray(change / _STEP)
 
     def _unit_gravity_efforts(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the holding efforts (r, n, 3) for gravity of 1 m/s^2 along the axes of the base."""
+        """Returns the holding efforts (r, n, 2) for gravity of 1 m/s^2 along the x- and y-axis of the base."""
         efforts, zero = [], np.zeros_like(q)
         for regressor in self._tilted:
             torque = regressor.torque(q, zero, zero, regressor.values)
@@ -284,9 +284,9 @@ class ChannelFit:
 
 @cache
 def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor], BaseColumns]:
-    """Returns the regressor, three regressors for unit gravity along the axes of the base, and the base columns."""
+    """Returns the regressor, two regressors for unit gravity along the base x- and y-axes, and the base columns."""
     regressor = DynamicRegressor(arm)
-    tilted = [regressor.with_gravity(axis) for axis in np.eye(3).tolist()]
+    tilted = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
     return regressor, tilted, base_columns([regressor])
 
 

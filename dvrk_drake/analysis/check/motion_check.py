@@ -34,7 +34,7 @@ MIN_EXTRA = 0.05
 MIN_JITTER = 0.05
 #: An effort has the wrong sign in two cases: its Coulomb friction is more than the first number of standard errors
 #: below 0, or it is more than the second number of standard errors below 0 and the relative work of the motor is below
-#: minus the third number. The drives of a robot without friction have estimates within their standard errors of 0.
+#: minus the third number. Within two standard errors of 0, the sign of the friction is uncertain.
 MIN_SIGN_ERRORS, MIN_SIGN_ERRORS_WITH_WORK, MIN_NEGATIVE_WORK = 5.0, 2.0, 0.05
 #: The parameters of two joints are hardly identifiable separately if the correlation of the joint velocities exceeds
 #: this value.

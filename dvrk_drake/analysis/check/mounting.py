@@ -20,10 +20,8 @@ from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import has_converted_model, is_from_model_file
-from dvrk_drake.models.arm_schema import ANGLES, Gains
+from dvrk_drake.models.arm_schema import ANGLES, ArmDescription, Gains
 
-#: Gravity in the base frame that is assumed for a model file [m/s^2].
-ASSUMED_GRAVITY = (0.0, 0.0, -9.81)
 #: Smallest gain in log-likelihood of another direction of gravity or another joint zero, in the search and in the
 #: `ChannelFit` that confirms the result and whose priors contain more of a wrong mounting. In this fit, the gain of the
 #: true hypotheses is 260 to 1960 on recordings of two robots and 14 on a simulated one with three joints. That of all
@@ -49,7 +47,7 @@ _ITERATIONS = 5
 
 def is_assumed(arm: Arm) -> bool:
     """Returns whether the mounting of an arm is that of its model file, because nobody stated another one."""
-    is_unchanged = not arm.position_offsets and np.array_equal(arm.gravity, ASSUMED_GRAVITY)
+    is_unchanged = not arm.position_offsets and np.array_equal(arm.gravity, ArmDescription().gravity)
     return is_from_model_file(arm) and is_unchanged
 
 

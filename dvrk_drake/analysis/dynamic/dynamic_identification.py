@@ -58,7 +58,7 @@ MAX_ROWS = 40_000
 
 @dataclass(frozen=True, eq=False)
 class FittedMotion:
-    """Efforts of one recording in an identification, at r rows. One second at each end is omitted.
+    """Efforts of one recording in an identification, at r rows, without both ends (`MotionGrid.inner`).
 
     Attributes:
         observations: Motion as recorded, and its preparation.

@@ -100,7 +100,7 @@ class DynamicValidation(Validation):
     Attributes:
         actuators: Errors of the actuators, in the arm's order.
         cut_off: Cut-off of the low-pass filter of the compared efforts [Hz].
-        t: Times (r,) of the compared rows [s]. One second at each end is omitted because of filter transients.
+        t: Times (r,) of the compared rows [s]. Both ends are omitted (`MotionGrid.inner`).
         q: Positions (r, n) of the actuators [rad, m].
         v: Velocities (r, n) of the actuators [rad/s, m/s].
         vd: Accelerations (r, n) of the actuators [rad/s^2, m/s^2].
@@ -172,8 +172,8 @@ def validate_motion(model: IdentifiedModel, observations: Observations) -> Dynam
     """Compares predicted and measured efforts of a motion, in actuator coordinates.
 
     The relative error of an actuator is |tau_f - tau_hat| / |tau_f|, with the measured effort tau_f and the predicted
-    effort tau_hat. Both efforts are filtered with the zero-phase low-pass filter, and one second at each end is
-    omitted. Wang et al. (RA-L 2019) use the same metric.
+    effort tau_hat. Both efforts are filtered with the zero-phase low-pass filter, and both ends are omitted
+    (`MotionGrid.inner`). Wang et al. (RA-L 2019) use the same metric.
 
     Raises:
         RecordingError: The recording does not match the arm, has no efforts, or is not a motion.

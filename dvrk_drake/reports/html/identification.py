@@ -142,10 +142,7 @@ def _excluded(result: Identification | Validation, efforts: Efforts) -> list[Blo
     blocks: list[Block] = [Text(f"Reading: {note}") for note in result.recording.notes]
     if isinstance(efforts, MotionEfforts):
         rows, distinct = len(result.recording), len(efforts.grid.clock.rows)
-        used = (
-            f"{len(efforts.t)} of {rows} rows were compared. One second at each end was omitted because of filter "
-            "transients."
-        )
+        used = f"{len(efforts.t)} of {rows} rows were compared. Both ends were omitted because of filter transients."
         repeated = f" {rows - distinct} rows repeat the previous row and were not used." if distinct < rows else ""
         return [*blocks, Text(used + repeated)]
     total = int(np.sum(efforts.drawn))
