@@ -17,6 +17,7 @@ from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.dynamics.friction_compensation import HOLDING_ERROR_FACTOR, HOLDING_TRAVEL
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import has_converted_model
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.recordings.recording import MIN_RANGE, Coordinates
 
@@ -35,6 +36,10 @@ MIN_COVERAGE = 0.5
 #: sides by a short distance, about 12 % of the dry friction remains in the measurement, so the error of a smaller
 #: torque cannot be measured.
 NEGLIGIBLE = 0.15
+#: Smallest assumed torque of the gains at `HOLDING_TRAVEL` for the links of a model file, as a share of the effort
+#: limit. Its gains are derived from inertias that often omit the rotors, and are then too small by a factor of 100 or
+#: more (wrist of a UR10e). The gains of this package's arms have shares from 0.018 (roll of a PSM) to 0.5.
+MIN_STIFFNESS = 0.015
 
 
 class Tolerance(NamedTuple):
@@ -43,7 +48,7 @@ class Tolerance(NamedTuple):
     Attributes:
         friction: Dry friction, which holds the joint at rest despite the error. If the arm file states no friction, it
             is the same as `stiffness`.
-        stiffness: Torque of the joint's proportional gain at a deflection of `HOLDING_TRAVEL`.
+        stiffness: Torque of the joint's proportional gain at a deflection of `HOLDING_TRAVEL`, see `MIN_STIFFNESS`.
     """
 
     friction: float
@@ -57,6 +62,8 @@ def tolerances(arm: Arm, coordinates: Coordinates) -> list[Tolerance]:
     """
     J, rows = arm.transmission.matrix, arm.effect_coordinates
     at_15_mrad = arm.gains.kp * arm.per_joint(*HOLDING_TRAVEL)
+    if has_converted_model(arm):
+        at_15_mrad = np.maximum(at_15_mrad, MIN_STIFFNESS * arm.effort_limits)
     drives = J if coordinates == "actuator" else np.eye(arm.num_joints)
     with np.errstate(divide="ignore"):
         stiffness = np.min(np.where(drives != 0, at_15_mrad / np.abs(drives), np.inf), axis=1)

@@ -12,12 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from command_output import refusal
+from robot_file import write_robot
 
 from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.analysis.verdict import (
     LARGEST_RATIO,
     LARGEST_RATIO_IN_FRICTION,
     MIN_COVERAGE,
+    MIN_STIFFNESS,
     NEGLIGIBLE,
     Tolerance,
     coverage,
@@ -349,3 +351,10 @@ def test_static_model_is_not_validated_on_a_motion(files, tmp_path, capsys):
     write_recording(Recording(q=q, qd=qd, tau=tau), moving)
     assert main(["validate", moving, "--model", model]) == 2
     assert "the arm moves" in refusal(capsys.readouterr().err)
+
+
+def test_derived_gains_do_not_make_the_tolerance_small(tmp_path):
+    """The gains of a model file follow from its links, which may be light compared with the drive."""
+    arm = load_arm(write_robot(tmp_path, ('effort="20"', 'effort="2000"')))
+    assert arm.gains.kp[2] * 0.015 < 1.0
+    assert tolerances(arm, "joint")[2].stiffness == pytest.approx(MIN_STIFFNESS * 2000)
