@@ -61,7 +61,7 @@ def tolerances(arm: Arm, coordinates: Coordinates) -> list[Tolerance]:
     An effort error at one actuator deflects all joints that this actuator drives.
     """
     J, rows = arm.transmission.matrix, arm.effect_coordinates
-    at_15_mrad = arm.gains.kp * arm.per_joint(*HOLDING_TRAVEL)
+    at_15_mrad = np.asarray(arm.gains.kp * arm.per_joint(*HOLDING_TRAVEL))
     if has_converted_model(arm):
         at_15_mrad = np.maximum(at_15_mrad, MIN_STIFFNESS * arm.effort_limits)
     drives = J if coordinates == "actuator" else np.eye(arm.num_joints)
