@@ -227,10 +227,10 @@ def ready_controller(
             reset_fault(link, print_warning)
         status, period = first_status(link)
     controller = ArmController(arm, model, mode, period, friction, gains)
+    settle_memory()
     if controlled.realtime:
         for warning in make_realtime():
             print_warning(warning)
-    settle_memory()
     return controller, lambda: ArmLink(arm, url, key=key, before=status), period
 
 

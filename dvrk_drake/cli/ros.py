@@ -49,10 +49,10 @@ def bridge(
     from dvrk_drake.systems.ros.open_domain import domain_number
 
     def ready() -> None:
+        settle_memory()
         if realtime:
             for warning in make_realtime():
                 print_warning(warning)
-        settle_memory()
 
     quiet_drake()
     domain_number(domain)  # rejects an invalid number before any other step

@@ -107,10 +107,10 @@ def arm(
         simulated = SimulatedArm(simulated_arm, configuration, url, start, effects=simulated_effects)
         stopped = stop_on_signals()
     with live_view(arm, url) if meshcat else nullcontext():
+        settle_memory()
         if realtime:
             for warning in make_realtime():
                 print_warning(warning)
-        settle_memory()
         print(f"simulated {simulated_arm.name} on LCM {url}; press Ctrl-C to end", flush=True)
         pace = simulated.run(stopped, lambda line: print(line, flush=True), EnterKey.of_terminal())
     print(f"ended; {pace.describe()}", flush=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.processes.pace import Pace, make_realtime
+from dvrk_drake.processes.pace import make_realtime
 from dvrk_drake.systems.lcm.dvrk_command import draw_id
 
 
@@ -57,16 +57,6 @@ def main(arguments: list[str]) -> None:
     )
     while True:
         controller.lcm.handle()
-
-
-def tick(arguments: list) -> None:
-    """Counts the periods of a loop with the period and scheduling of an arm. The argument is a shared counter."""
-    (ticks,) = arguments
-    make_realtime()
-    pace = Pace(1e-3)
-    while True:
-        pace.wait()
-        ticks.value += 1
 
 
 def flood(arguments: list) -> None:

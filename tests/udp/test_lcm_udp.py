@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from arm_observer import NETWORK_URL, Observer, accepts_efforts, check_clock, is_holding
 from arm_processes import (
-    FORKSERVER,
     LONG_TIMEOUT_DRIVER,
     POSES,
     CommandLine,
@@ -397,7 +396,7 @@ def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
             controller.end()
         observer.until(is_holding, "hold")
     before, first = observer.last, len(observer.received)
-    assert log.count(name) > 500
+    assert log.count(name) > 50
     log.play()
     enough = before.num_refused + 0.9 * log.count(name)
     observer.until(lambda status: status.num_refused > enough, "refusals", first)
@@ -426,7 +425,7 @@ def test_restarted_arm_ignores_run_and_log(tmp_path):
             assert run.wait() == 2
         assert "no status of MTML for 1 s" in run.output()
         assert observer.last.num_refused == 0
-        assert log.count("mtml") > 500
+        assert log.count("mtml") > 50
         log.play()
         enough = 0.9 * log.count("mtml")
         observer.until(lambda status: status.num_ignored > enough, "ignored commands", first)
@@ -539,13 +538,19 @@ def test_first_of_two_controllers_stays_in_control(arm):
     assert drift(*received) < 1e-3
 
 
+def speed(observer, what, condition):
+    """Returns the speed of the arm's clock until a condition is true, relative to this computer's clock."""
+    begun, of_arm = time.monotonic(), observer.last.utime
+    observer.until(condition, what)
+    return 1e-6 * (observer.last.utime - of_arm) / (time.monotonic() - begun)
+
+
 @pytest.mark.watchdog
 def test_key_protects_from_flood_of_foreign_commands(tmp_path):
     """Floods the arm with valid commands of an unknown sender, as fast as a process can publish them.
 
-    The rate is compared with that of a peer, a process with the same period and scheduling that reads no messages:
-    where the machine stands still, both do. Without real-time scheduling a flood takes computing time from all
-    processes, above all from those that read it, so the rate is judged with real-time scheduling only.
+    The rate of the arm is compared with its rate before the flood. Without real-time scheduling a flood takes computing
+    time from all processes, above all from those that read it, so the rate is judged with real-time scheduling only.
 
     A watchdog test, since the controller holds where the computer stops it for 50 ms.
     """
@@ -556,30 +561,26 @@ def test_key_protects_from_flood_of_foreign_commands(tmp_path):
     arm = start_arm("mtml", *PATIENT, *options)
     observer.until(lambda status: True, "first status", process=arm)
     run = start_run("mtml", "--mode", "hold", "--realtime", *map(str, options))
-    ticks, others = FORKSERVER.Value("q"), []
+    attacker = None
     try:
         first = observer.until(accepts_efforts, "run", process=run)
-        others.append(Forked(lcm_controller.tick, ticks))
-        wait_until(lambda: ticks.value > 100, "the peer", others[0])
+        second_later = observer.last.utime + 1_000_000
+        before = speed(observer, "one second", lambda status: status.utime > second_later)
         ignored = observer.last.num_ignored
-        others.append(Forked(lcm_controller.flood, OTHER_URL, observer.last.encode()))
-        begun = observer.until(lambda status: status.num_ignored > ignored + 100, "flood", process=others[1])
-        of_arm, of_peer = observer.last.utime, ticks.value
-        observer.during(2.0)
-        of_arm, of_peer = (observer.last.utime - of_arm) // 1000, ticks.value - of_peer
+        attacker = Forked(lcm_controller.flood, OTHER_URL, observer.last.encode())
+        begun = observer.until(lambda status: status.num_ignored > ignored + 100, "flood", process=attacker)
+        flooded = speed(observer, "5000 messages", lambda status: status.num_ignored > ignored + 5000)
         received = observer.received[begun:]
     finally:
-        for process in others:
-            process.end()
+        if attacker is not None:
+            attacker.end()
         said = run.end(signal.SIGINT)
         said += arm.end(signal.SIGINT)
     realtime = "no real-time scheduling" not in said
     acting = np.mean([accepts_efforts(status) for status in received])
-    flooded = received[-1].num_ignored - received[0].num_ignored
-    print(f"{of_arm} periods of the arm, {of_peer} of the peer, {flooded} foreign messages; {realtime=}")
+    print(f"speed of the arm {before:.3f} before the flood, {flooded:.3f} during it; {realtime=}")
     print(f"efforts act in {acting:.3f} of the time")
-    assert flooded > of_arm
-    assert of_arm > 0.9 * of_peer or not realtime, said
+    assert flooded > 0.7 * before or not realtime, said
     assert acting == 1.0, said
     assert received[-1].ignored_code == Status.REFUSAL_NOT_AUTHENTIC, said
     assert {status.command_sender_id for status in observer.received[first:]} <= {0, received[0].command_sender_id}
