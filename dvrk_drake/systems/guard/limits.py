@@ -285,8 +285,7 @@ class GuardLimits:
         """Returns a feedforward velocity (n,) that is reduced near the position limits, at `target` (n,)."""
         lead = self._look_ahead * velocity
         ahead, _ = self._inside(target + lead, target)
-        cut = ahead != target + lead
-        share = np.divide(ahead - target, lead, out=np.ones_like(lead), where=cut & (lead != 0))
+        share = np.divide(ahead - target, lead, out=np.ones_like(lead), where=lead != 0)
         return velocity * clip(share, 0, 1)
 
     def _inside(self, target: Vector, last: Vector) -> tuple[Vector, Flags]:

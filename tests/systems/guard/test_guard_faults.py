@@ -524,3 +524,18 @@ def test_oscillation_after_another_fault_starts_the_safe_state():
     reset(bench)
     assert bench.tick().control_mode == Command.HOLD
     np.testing.assert_array_equal(bench.output.position, bench.q)
+
+
+def test_safe_state_without_finite_gravity_holds_the_pose():
+    """The arm's own controller then regulates the pose of that moment, without the model."""
+    model = Inert()
+    bench = Bench(model=model)
+    bench.at_rest().run(Command.EFFORT, 260)
+    bench.guard.report_fault("x", Status.FAULT_OSCILLATION)
+    assert bench.tick().control_mode == Command.EFFORT
+    model.gravity_effort = lambda q: np.full(N, np.nan)
+    assert bench.tick().control_mode == Command.HOLD
+    bench.q = Q + 1e-3
+    for _ in range(3):
+        np.testing.assert_array_equal(bench.tick().position, Q)
+        assert bench.output.control_mode == Command.HOLD

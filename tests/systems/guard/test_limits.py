@@ -326,14 +326,14 @@ def test_conflicting_coupled_limits_stop_target():
 def test_feedforward_velocity_stops_at_limit(joint, side):
     fast, slow = side * LIMITS.speed * E[joint], side * 0.5 * LIMITS.speed * E[joint]
     for velocity in (fast, slow):
-        np.testing.assert_array_equal(LIMITS.limit_velocity(velocity, Q), velocity)
+        np.testing.assert_allclose(LIMITS.limit_velocity(velocity, Q), velocity, atol=1e-12)
     bound = (UPPER if side > 0 else LOWER)[joint]
     lead = KD[joint] / KP[joint] * LIMITS.speed[joint]
     for share in (0.5, 0.25, 0.0):
         target = Q + (bound - side * share * lead - Q[joint]) * E[joint]
         velocity = LIMITS.limit_velocity(fast, target)
         np.testing.assert_allclose(velocity, share * side * LIMITS.speed * E[joint], atol=1e-9)
-        np.testing.assert_array_equal(LIMITS.limit_velocity(-slow, target), -slow)  # inward
+        np.testing.assert_allclose(LIMITS.limit_velocity(-slow, target), -slow, atol=1e-12)  # inward
 
 
 def test_no_feedforward_velocity_with_limited_position():
