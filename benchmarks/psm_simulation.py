@@ -41,7 +41,7 @@ import numpy as np
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, TrajectorySource
+from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 from timing import measured_times, median_ratio, print_table, write_json
 
@@ -54,6 +54,7 @@ from dvrk_drake.models.sdf_elements import DRAKE
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.ideal_drive import add_arm_drive
 
 ARM = load_arm("psm")
 N = ARM.num_joints
@@ -126,24 +127,13 @@ class CenicRow:
     ):
         builder = DiagramBuilder()
         self.plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
-        add_arm(self.plant, ARM, closure)
+        instance = add_arm(self.plant, ARM, closure=closure)
         self.plant.Finalize()
-        nq = self.plant.num_positions()
-        select = np.zeros((nq, N))
-        select[[self.plant.GetJointByName(name).position_start() for name in ARM.joint_names], range(N)] = 1.0
-        state = builder.AddSystem(MatrixGain(D=np.kron(np.eye(2), select.T)))
-        driven = [self.plant.get_joint_actuator(i).joint().name() for i in self.plant.GetJointActuatorIndices()]
-        actuate = builder.AddSystem(MatrixGain(D=np.eye(N)[[ARM.joint_names.index(name) for name in driven]]))
-        builder.Connect(self.plant.get_state_output_port(), state.get_input_port())
-        builder.Connect(actuate.get_output_port(), self.plant.get_actuation_input_port())
+        drive = add_arm_drive(builder, self.plant, ARM, instance)
         if controlled:
-            add_control(builder, trajectory, state.get_output_port(), actuate.get_input_port())
-        else:
-            builder.ExportInput(actuate.get_input_port(), "effort")
+            add_control(builder, trajectory, drive.state_estimated, drive.effort_commanded)
         self.diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
-        if not controlled:
-            self.diagram.GetInputPort("effort").FixValue(self.simulator.get_mutable_context(), np.zeros(N))
         ResetIntegratorFromFlags(self.simulator, "cenic", 0.1)
         integrator = self.simulator.get_mutable_integrator()
         integrator.set_target_accuracy(1e-4)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.locked_joints import lock_joints
+    from dvrk_drake.models.plant import add_arm, set_arm_positions
     from dvrk_drake.recordings.periodic_motion import PeriodicMotion
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+    from dvrk_drake.systems.ideal_drive import add_arm_drive
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
 #: Mapping from a public name to the module that defines it.
@@ -52,6 +54,8 @@ _MODULES = {
     "Recording": "recordings.recording",
     "Scenario": "experiments.scenario",
     "TeleoperatedArms": "systems.teleoperated_arms",
+    "add_arm": "models.plant",
+    "add_arm_drive": "systems.ideal_drive",
     "add_closed_loop": "systems.closed_loop",
     "check": "analysis.check.recording_check",
     "design_excitation": "analysis.excitation.design",
@@ -65,6 +69,7 @@ _MODULES = {
     "predict": "analysis.validation",
     "read_recording": "recordings.reading",
     "recalibrate": "analysis.recalibration",
+    "set_arm_positions": "models.plant",
     "simulate": "experiments.simulation",
     "start_meshcat": "systems.arm_view.page",
     "validate": "analysis.validation",
@@ -85,6 +90,8 @@ __all__ = [
     "Recording",
     "Scenario",
     "TeleoperatedArms",
+    "add_arm",
+    "add_arm_drive",
     "add_closed_loop",
     "check",
     "design_excitation",
@@ -98,6 +105,7 @@ __all__ = [
     "predict",
     "read_recording",
     "recalibrate",
+    "set_arm_positions",
     "simulate",
     "start_meshcat",
     "validate",

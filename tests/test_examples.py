@@ -17,7 +17,7 @@ from dvrk_drake.recordings.samples import SAMPLES_FOLDER
 pytestmark = pytest.mark.drake_api
 
 EXAMPLES = ROOT / "examples"
-PAGE_SCRIPTS = ["hold_an_arm.py", "teleoperation.py"]
+PAGE_SCRIPTS = ["arms_and_table.py", "hold_an_arm.py", "teleoperation.py"]
 
 
 def run(folder, *command):

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import PackageMap, Parser
-from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, MultibodyForces, SpatialInertia
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, MultibodyForces, SpatialInertia
 from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
@@ -38,30 +38,54 @@ def package_map() -> PackageMap:
 
 
 def add_arm(
-    plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic", collision_shapes: bool = True
+    plant: MultibodyPlant,
+    arm: Arm,
+    parent_frame: Frame | None = None,
+    X_PB: RigidTransform | None = None,
+    *,
+    closure: Closure = "mimic",
+    collision_shapes: bool = True,
 ) -> ModelInstanceIndex:
-    """Adds `arm` to a plant that is not finalized, welds its base to the world, and sets gravity and limits.
+    """Adds an arm to a plant that is not finalized, e.g. beside other arms and objects, and welds its base.
 
-    The loop closures require Drake's SAP solver. The contact approximations `sap`, `similar` and `lagged` use this
-    solver. If a discrete plant uses `tamsi`, the function selects `sap`. A continuous plant can be simulated only with
-    the integrator CENIC. For a continuous plant, the closure "ball" requires drake 1.56 or newer.
+    Gravity and contact settings of the plant remain. Models and controllers use `arm.gravity`, in the base frame:
+    choose `arm.with_gravity(...)` for a base that is tilted, see `add_arm_drive`. The loop closures require Drake's SAP
+    solver, i.e. the contact approximation `sap`, `similar` or `lagged` (the default). A continuous plant can be
+    simulated only with the integrator CENIC; for it, the closure "ball" requires drake 1.56 or newer.
 
     Args:
         plant: Plant, with or without a scene graph.
-        arm: Arm to add.
+        arm: Arm to add. Drake appends a number to the name of its model instance if the name exists.
+        parent_frame: Frame P to which the base is welded. None: the world frame.
+        X_PB: Pose of the base frame (`base_link`) in P. None: identity.
         closure: Method of closing the loops of the linkage, see `Closure`.
         collision_shapes: Whether to add collision shapes. Without collision shapes, the arm has no contact, and a plant
             with a scene graph needs less time per step.
 
+    Returns:
+        Model instance of the arm.
+
     Raises:
-        ArmError: The closure is unknown, or Drake cannot load the SDF.
+        ArmError: The closure is unknown, the contact approximation of a discrete plant is `tamsi`, or Drake cannot load
+            the SDF.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from pydrake.math import RigidTransform
+        >>> from pydrake.multibody.plant import MultibodyPlant
+        >>> plant, arm = MultibodyPlant(1e-3), dvrk.load_arm("psm")
+        >>> arms = [dvrk.add_arm(plant, arm, X_PB=RigidTransform([0.0, y, 0.5])) for y in (-0.2, 0.2)]
+        >>> plant.Finalize()
+        >>> [plant.GetModelInstanceName(arm) for arm in arms]
+        ['psm', 'psm_1']
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; allowed: {", ".join(get_args(Closure))}')
     # The approximation is compared by its name, because newer versions of drake have no tamsi.
     if plant.time_step() > 0 and plant.get_discrete_contact_approximation().name == "kTamsi":
-        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+        raise ArmError("the discrete contact approximation is tamsi; a linkage needs sap, similar or lagged")
     parser = Parser(plant)
+    parser.SetAutoRenaming(True)
     parser.package_map().AddMap(package_map())
     model = compose_sdf(arm.sdf, arm.mirrored_links)
     if closure == "ball":
@@ -75,8 +99,8 @@ def add_arm(
         if closure == "ball":
             for loop in arm.loop_closures:
                 pin_loop(plant, instance, loop)
-        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link", instance))
-        plant.mutable_gravity_field().set_gravity_vector(arm.gravity)
+        base = plant.GetFrameByName("base_link", instance)
+        plant.WeldFrames(parent_frame or plant.world_frame(), base, X_PB or RigidTransform())
         for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
             plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
     except RuntimeError as error:
@@ -114,7 +138,8 @@ def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:
     """Returns a finalized plant that contains only `arm`. The unit of `time_step` is s."""
     plant = MultibodyPlant(time_step)
-    add_arm(plant, arm, closure)
+    plant.mutable_gravity_field().set_gravity_vector(arm.gravity)
+    add_arm(plant, arm, closure=closure)
     plant.Finalize()
     return plant
 
@@ -134,7 +159,8 @@ def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> No
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
     """Returns the indices of the joints `arm.tree_joint_names` in the position vector of the plant.
 
-    The indices are also valid for the velocity vector, because all joints have one degree of freedom.
+    In a plant without floating bodies, the indices are also valid for the velocity vector, because all joints of arms
+    have one degree of freedom.
     """
     joints = [plant.GetJointByName(name, instance) for name in arm.tree_joint_names]
     return np.array([joint.position_start() for joint in joints])
@@ -143,7 +169,26 @@ def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex 
 def set_arm_positions(
     plant: MultibodyPlant, context: Context, arm: Arm, q: ArrayLike, instance: ModelInstanceIndex | None = None
 ) -> None:
-    """Sets the positions of all joints, including those of the linkage, from the independent joint positions q (n,)."""
+    """Sets the positions of all joints of an arm, including those of its linkage.
+
+    Args:
+        plant: Finalized plant with the arm.
+        context: Context of the plant.
+        arm: The arm.
+        q: Positions (n,) of the independent joints [rad, m].
+        instance: Model instance that `add_arm` returned. None: the plant contains no joints with the same names.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from pydrake.multibody.plant import MultibodyPlant
+        >>> plant, arm = MultibodyPlant(1e-3), dvrk.load_arm("mtml")
+        >>> mtml = dvrk.add_arm(plant, arm)
+        >>> plant.Finalize()
+        >>> context = plant.CreateDefaultContext()
+        >>> dvrk.set_arm_positions(plant, context, arm, [0, 0.1, 0.2, 0, 0, 0, 0], mtml)
+        >>> plant.GetJointByName("elbow_pitch", mtml).GetOnePosition(context)
+        0.2
+    """
     q_plant = plant.GetPositions(context)
     q_plant[tree_selector(plant, arm, instance)] = arm.linkage.position(q)
     plant.SetPositions(context, q_plant)

@@ -21,7 +21,7 @@ from dvrk_drake.models.plant import add_arm, set_arm_positions, tree_selector
 from dvrk_drake.systems.arm_effects.drive_step import DriveStep
 from dvrk_drake.systems.arm_effects.drive_with_effects import DriveWithEffects, add_drive_with_effects
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
-from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_ideal_drive
+from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_disturbance, add_ideal_drive
 
 
 @dataclass(frozen=True)
@@ -170,8 +170,9 @@ class ArmStation(Diagram):
         builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlant(plant_config, builder)
         # The plant contains only the arm, so the arm has contacts only with bodies that `modify_plant` adds.
+        self._plant.mutable_gravity_field().set_gravity_vector(self._ground_truth_arm.gravity)
         self._instance = add_arm(
-            self._plant, self._ground_truth_arm, closure, collision_shapes=modify_plant is not None
+            self._plant, self._ground_truth_arm, closure=closure, collision_shapes=modify_plant is not None
         )
         if modify_plant is not None:
             modify_plant(self._plant)
@@ -187,7 +188,11 @@ class ArmStation(Diagram):
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
         if effects is None or self._plant_effects is None:
-            ports = add_ideal_drive(builder, self._plant, self._joints, self._instance)
+            ideal = add_ideal_drive(builder, self._plant, self._joints, self._instance)
+            disturbance = add_disturbance(builder, self._plant, self._joints)
+            ports = DrivePorts(
+                ideal.effort_commanded, ideal.effort_measured, ideal.state_estimated, disturbance, ideal.state_estimated
+            )
         else:
             drive = DriveWithEffects(
                 self._ground_truth_arm,

@@ -11,6 +11,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import DiscreteTimeDelay, PassThrough
 
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect
 from dvrk_drake.systems.arm_effects.drive_force import DriveForce, EffortSensor, Motors
@@ -49,7 +50,12 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
 
     Returns:
         Ports of the drive, and the system that computes the measured state.
+
+    Raises:
+        StationError: The plant has a floating body.
     """
+    if drive.plant.num_positions() != drive.plant.num_velocities():
+        raise StationError("with effects, modify_plant must not add floating bodies. Weld them to the arm")
     drive.parts.finish(drive.joints)
     plant, delay = drive.plant, drive.effects.delay or DelayEffect()
     step = builder.AddNamedSystem("drive_step", DriveStep(drive.arm, drive.parts, drive.effects, drive.home))
@@ -71,11 +77,11 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
         _add_delay(builder, "measurement_delay", delay.measurement, at_motors, drive), sensor.get_input_port()
     )
     ports = DrivePorts(
-        commanded.get_input_port(),
-        force.GetInputPort("effort_disturbance"),
-        sensor.get_output_port(),
-        state,
-        step.GetOutputPort("state_estimated"),
+        effort_commanded=commanded.get_input_port(),
+        effort_disturbance=force.GetInputPort("effort_disturbance"),
+        effort_measured=sensor.get_output_port(),
+        state_true=state,
+        state_estimated=step.GetOutputPort("state_estimated"),
     )
     return ports, step
 
