@@ -48,6 +48,7 @@ for (arm, _), instance in zip(arms, instances, strict=True):
     drives.append(drive)
 
 meshcat = StartMeshcat()
+meshcat.SetCameraPose([1.3, 1.5, 1.2], [0.0, 0.1, 0.4])
 MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
 simulator = Simulator(builder.Build())
 root = simulator.get_mutable_context()
