@@ -49,7 +49,15 @@ _MESSAGE_FIELD = re.compile(
 )
 _STAMP_PARTS = dict.fromkeys((".sec", ".secs"), "sec") | dict.fromkeys((".nsec", ".nsecs", ".nanosec"), "nanosec")
 #: Name of a column with its unit, e.g. "q1 [rad]".
-_UNIT = re.compile(r"(?P<name>\S+)\s*[\[(](?P<unit>[^\])]*)[\])]")
+_UNIT = re.compile(r"(?P<name>\S.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
+#: Words for the quantity of a joint in the name of a column, e.g. "elbow_joint position [rad]", and its prefix.
+_QUANTITIES = {
+    **dict.fromkeys(("position", "pos"), "q"),
+    **dict.fromkeys(("velocity", "vel"), "qd"),
+    **dict.fromkeys(("effort", "torque", "force"), "tau"),
+}
+#: Names of the column with the times in a file whose columns have the names of joints.
+_TIME_NAMES = ("t", "time", "timestamp")
 
 
 def read_csv(path: Path, options: FileOptions) -> Recording:
@@ -93,7 +101,7 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
             first = [(line, cells)]
         else:
             header, units = _split_units(cells)
-            blocks = _columns_of_blocks(where, header, options)
+            blocks = _columns_of_blocks(where, _with_numbers(where, header, options), options)
             first = first or list(itertools.islice(reader, 1))
             _check_arm(path, header, first, arm)
             _check_units(where, header, units, blocks, arm)
@@ -251,6 +259,38 @@ def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict
     if path.name.startswith("StateDataCollection"):
         message += f". Files of the cisst collector need their description {path.with_suffix('.desc').name}"
     raise RecordingError(message)
+
+
+def _with_numbers(where: str, header: list[str], options: FileOptions) -> list[str]:
+    """Returns the header with q1, qd1, tau1, ... and t in place of names of joints and quantities.
+
+    Upper case, spaces, dots and underscores make no difference, and the quantity may be the first word.
+
+    Raises:
+        RecordingError: The position of a joint is missing.
+    """
+    if options.arm is None:
+        return header
+    numbered = {}
+    positions = {}
+    for joint, label in zip(options.arm.joint_names, options.joint_labels, strict=True):
+        name = (options.joints or {}).get(joint, joint)
+        positions[f"q{label}"] = f"{name} position"
+        for word, prefix in _QUANTITIES.items():
+            numbered[_plain(f"{name} {word}")] = numbered[_plain(f"{word} {name}")] = f"{prefix}{label}"
+    found = [numbered.get(_plain(name), name) for name in header]
+    if found == header:
+        return header
+    if missing := [name for column, name in positions.items() if column not in found]:
+        raise RecordingError(
+            f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; needs the position of each joint "
+            f"of {options.arm.name}; --joints states other names, and --locked joints that are not recorded"
+        )
+    return ["t" if _plain(name) in _TIME_NAMES else name for name in found]
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\W_]+", " ", name).strip().lower()
 
 
 def _columns_of_blocks(where: str, header: list[str], options: FileOptions) -> dict[str, list[int]]:

@@ -150,6 +150,41 @@ def test_written_recordings_state_coordinates_arm_and_units(tmp_path, coordinate
     assert read_recording(tmp_path / "again.csv").arm_name == "PSM"
 
 
+def named_csv(folder, names, rows):
+    return write_text(folder, "\n".join([",".join(names), *(",".join(map(str, row)) for row in rows)]))
+
+
+def test_columns_may_have_the_names_of_joints(tmp_path):
+    """In any order, with units; the quantity may be abbreviated or the first word."""
+    psm = load_arm("psm")
+    values = np.random.default_rng(0).uniform(-0.1, 0.1, (4, 15))
+    q = [f"{name} position [{'m' if name == 'insertion' else 'rad'}]" for name in psm.joint_names]
+    tau = [f"Effort_{name}" for name in psm.joint_names]
+    names, order = ["Time (s)", *q, *tau], np.random.default_rng(1).permutation(15)
+    values[:, 0] = 0.1 * np.arange(4)
+    path = named_csv(tmp_path, [names[i] for i in order], values[:, order])
+    recording = read_recording(path, psm)
+    np.testing.assert_array_equal(recording.t, values[:, 0])
+    np.testing.assert_array_equal(recording.q, values[:, 1:8])
+    np.testing.assert_array_equal(recording.tau, values[:, 8:])
+    assert recording.qd is None
+
+
+def test_joint_of_a_named_column_is_mapped_or_missed(tmp_path):
+    psm = load_arm("psm")
+    names = [f"{name}.pos" for name in psm.joint_names]
+    names[2] = "z.pos"
+    path = named_csv(tmp_path, names, np.arange(14.0).reshape(2, 7) / 100)
+    assert_refused(
+        r"line 1: missing column insertion position; needs .* --joints states other", read_recording, path, psm
+    )
+    recording = read_recording(path, psm, joints={"insertion": "z"})
+    np.testing.assert_array_equal(recording.q[:, 2], [0.02, 0.09])
+    names[2] = "insertion position [mm]"
+    named_csv(tmp_path, names, np.zeros((2, 7)))
+    assert_refused("the unit of insertion position is mm; allowed: m", read_recording, path, psm)
+
+
 @pytest.mark.parametrize(
     "name, unit, match",
     [
