@@ -158,8 +158,8 @@ def detect_format(path: Path) -> Format:
     found = next((known for known in FORMATS if known.matches(path)), None)
     if found is None:
         raise RecordingError(
-            f"{path} is a folder without a recording; allowed: ROS 2 bag (with metadata.yaml), MATLAB files (.mat), "
-            "NumPy archives (.npz). To read a bag without metadata.yaml, give the path of its .mcap or .db3 file."
+            f"{path} is a folder without a recording; allowed: ROS bag (.mcap, .db3, .bag), MATLAB files (.mat), NumPy "
+            "archives (.npz)"
         )
     if head.startswith(GZIP_MAGIC):
         head = _decompressed(path, head)

@@ -41,11 +41,16 @@ _REPORT = 4096
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Returns whether a path is a ROS bag: a file that begins like one, or a folder with `metadata.yaml`."""
+    """Returns whether a path is a ROS bag: a file that begins like one, or a folder with metadata or with such files."""
     if path.is_dir():
-        return (path / _METADATA).is_file()
+        return (path / _METADATA).is_file() or bool(_parts(path))
     with path.open("rb") as file:
         return file.read(16).startswith(tuple(_MAGIC))
+
+
+def _parts(folder: Path) -> list[Path]:
+    """Returns the files of a bag whose `metadata.yaml` is missing, e.g. since the recorder was killed."""
+    return sorted(path for path in folder.iterdir() if path.suffix in _MAGIC.values() and path.is_file())
 
 
 def read_ros_bag(path: Path, options: FileOptions) -> Recording:
@@ -57,7 +62,8 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
     arm.
 
     Args:
-        path: Path of a `.bag`, `.db3` or `.mcap` file, or of the folder of a ROS 2 bag.
+        path: Path of a `.bag`, `.db3` or `.mcap` file, or of the folder of a ROS 2 bag. Without `metadata.yaml`, all
+            files of the folder are parts of the bag.
         options: Arm (required), topic, names of the joints, and `skip_invalid`. The topic is a JointState topic, e.g.
             "/PSM1/measured_js", or its namespace, "/PSM1". Default: the only topic `/<ARM>/measured_js`, in any
             namespace, where ARM is the name of the arm, optionally followed by a number.
@@ -107,9 +113,10 @@ class _Bag:
                 self._link_folder = TemporaryDirectory()
                 path = Path(self._link_folder.name) / f"bag{suffix}"
                 path.symlink_to(self.path.resolve())
-        self._opened = path
+        parts = _parts(path) if path.is_dir() and not (path / _METADATA).exists() else [path]
+        self._opened = parts[0]
         try:
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+            self._reader = AnyReader(parts, default_typestore=get_typestore(Stores.ROS2_JAZZY))
         except Exception as error:
             raise self._error(error) from error
 

@@ -176,13 +176,18 @@ def test_reads_a_bag_of_two_files(mtm, tmp_path):
     rows, parts = joint_states(stamps(20), mtm.joint_names, q, qd, tau), []
     for number, part in enumerate((rows[:12], rows[12:])):
         (tmp_path / f"{number}").mkdir()
-        parts.append(write_bag(tmp_path / f"{number}", "mcap", {"/MTML/measured_js": part}))
+        parts.append(write_bag(tmp_path / f"{number}", "mcap", {"/MTML/measured_js": part}, begin=12 * number))
     folder = parts[0].parent
     parts[1].rename(folder / "poses_1.mcap")
     metadata = yaml.safe_load((folder / "metadata.yaml").read_text())
     metadata["rosbag2_bagfile_information"]["relative_file_paths"].append("poses_1.mcap")
     (folder / "metadata.yaml").write_text(yaml.safe_dump(metadata))
     np.testing.assert_array_equal(read_recording(folder, mtm).tau, tau)
+    (folder / "metadata.yaml").unlink()  # the recorder was killed
+    np.testing.assert_array_equal(read_recording(folder, mtm).tau, tau)
+    (folder / "poses_2.mcap").write_bytes((folder / "poses_1.mcap").read_bytes()[:500])
+    with pytest.raises(RecordingError, match="the bag cannot be read"):
+        read_recording(folder, mtm)
 
 
 def test_joint_names_of_a_psm_before_2024(psm, tmp_path):

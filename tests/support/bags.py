@@ -20,7 +20,10 @@ def joint_states(stamps, names, q=(), qd=(), tau=()):
 
 
 def write_bag(folder: Path, kind: str, topics: dict[str, list], **options) -> Path:
-    """Writes the rows of each topic; returns the path that a user passes."""
+    """Writes the rows of each topic; returns the path that a user passes.
+
+    The messages are logged at the times `begin`, `begin` + 1, ... [ns] (default: 0).
+    """
     path = folder / {"ros1": "poses.bag", "sqlite3": "poses", "mcap": "poses"}[kind]
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_JAZZY)
     state, header, time = (
@@ -45,5 +48,5 @@ def write_bag(folder: Path, kind: str, topics: dict[str, list], **options) -> Pa
                 sequence = {"seq": number} if kind == "ros1" else {}
                 stamped = header(stamp=time(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="", **sequence)
                 message = state(header=stamped, name=names, position=q, velocity=qd, effort=tau)
-                writer.write(connection, number, serialize(message, state.__msgtype__))
+                writer.write(connection, options.get("begin", 0) + number, serialize(message, state.__msgtype__))
     return next(path.glob("*.mcap")) if kind == "mcap" else path
