@@ -41,7 +41,7 @@ _REPORT = 4096
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Returns whether a path is a ROS bag: a file that begins like one, or a folder with metadata or with such files."""
+    """Returns whether a path is a ROS bag: a file that begins like one, or a folder with metadata or such files."""
     if path.is_dir():
         return (path / _METADATA).is_file() or bool(_parts(path))
     with path.open("rb") as file:
