@@ -25,7 +25,8 @@ class Pace:
     """Periodic ticks of the monotonic clock, which is not affected by changes of the system time.
 
     After a late tick, the next ticks follow immediately until the loop is on time. A loop that is more than 0.1 s late
-    continues from the current time. A loop that is never on time rests for 8 % of the time, in short pieces.
+    continues from the current time. With real-time priority, a loop that is never on time rests for 8 % of the
+    time, in short pieces.
 
     Attributes:
         count: Number of ticks.
@@ -38,7 +39,7 @@ class Pace:
         period: float,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
-        rest: Callable[[float], None] = time.sleep,
+        rest: Callable[[float], None] | None = None,
     ) -> None:
         """Starts the ticks. The first tick is at the current time.
 
@@ -46,9 +47,11 @@ class Pace:
             period: Period of the ticks [s].
             clock: Function that returns a monotonic time [s].
             sleep: Function that waits for a time [s]. It may work meanwhile, e.g. receive messages.
-            rest: Function that waits for a time [s] without any work.
+            rest: Function with which a late loop waits for a time [s] without any work. None: `time.sleep` if this
+                thread has real-time priority, otherwise no rest.
         """
-        self._period, self._clock, self._sleep, self._rest = period, clock, sleep, rest
+        self._period, self._clock, self._sleep = period, clock, sleep
+        self._rest = time.sleep if rest is None and _is_realtime() else rest
         self._next = self._begun = clock()
         self.count = self.late = 0
         self.lost = 0.0
@@ -57,10 +60,10 @@ class Pace:
         """Waits until the next tick."""
         self.count += 1
         now = self._clock()
-        rest = min(_REST * (now - self._begun), self._period)
+        rest = min(_REST * (now - self._begun), self._period) if self._rest else 0.0
         if now + rest < self._next:
             self._sleep(self._next - now)
-        else:
+        elif self._rest:
             self._rest(rest)
         if now > self._next + self._period:
             self.late += 1
@@ -103,6 +106,13 @@ def make_realtime() -> list[str]:
         except (OSError, AttributeError) as error:
             warnings.append(f"{what} ({getattr(error, 'strerror', None) or error})")
     return warnings
+
+
+def _is_realtime() -> bool:
+    try:
+        return os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR)
+    except AttributeError:  # macOS
+        return False
 
 
 def _schedule() -> None:
