@@ -279,8 +279,8 @@ def _with_numbers(where: str, header: list[str], options: FileOptions) -> list[s
         for word, prefix in _QUANTITIES.items():
             numbered[_plain(f"{name} {word}")] = numbered[_plain(f"{word} {name}")] = f"{prefix}{label}"
     found = [numbered.get(_plain(name), name) for name in header]
-    if found == header:
-        return header
+    if found == header or not positions.keys().isdisjoint(header):
+        return header  # other columns of a file with q1, q2, ... are ignored
     if missing := [name for column, name in positions.items() if column not in found]:
         raise RecordingError(
             f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; needs the position of each joint "

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -49,7 +50,7 @@ def is_ros_bag(path: Path) -> bool:
 
 
 def _parts(folder: Path) -> list[Path]:
-    """Returns the files of a bag whose `metadata.yaml` is missing, e.g. since the recorder was killed."""
+    """Returns the files of a bag whose `metadata.yaml` is missing, e.g. because the recorder was killed."""
     return sorted(path for path in folder.iterdir() if path.suffix in _MAGIC.values() and path.is_file())
 
 
@@ -91,7 +92,11 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
                 reader, connections[jaw], skip_invalid, lambda done: progress((before + done) / total)
             )
     progress(1.0)
-    return joint_recording(path, states, jaw_states, options, _sha256(path), "message")
+    recording = joint_recording(path, states, jaw_states, options, _sha256(path), "message")
+    if len(reader.parts) > 1:
+        merged = f"no metadata.yaml: {', '.join(part.name for part in reader.parts)} were read as parts of one bag"
+        recording = replace(recording, notes=(merged, *recording.notes))
+    return recording
 
 
 class _Bag:
@@ -113,10 +118,10 @@ class _Bag:
                 self._link_folder = TemporaryDirectory()
                 path = Path(self._link_folder.name) / f"bag{suffix}"
                 path.symlink_to(self.path.resolve())
-        parts = _parts(path) if path.is_dir() and not (path / _METADATA).exists() else [path]
-        self._opened = parts[0]
+        self.parts = _parts(path) if path.is_dir() and not (path / _METADATA).exists() else [path]
+        self._opened = self.parts[0]
         try:
-            self._reader = AnyReader(parts, default_typestore=get_typestore(Stores.ROS2_JAZZY))
+            self._reader = AnyReader(self.parts, default_typestore=get_typestore(Stores.ROS2_JAZZY))
         except Exception as error:
             raise self._error(error) from error
 

@@ -94,6 +94,7 @@ def add_arm_drive(builder: DiagramBuilder, plant: MultibodyPlant, arm: Arm, inst
         instance: Model instance that `add_arm` returned.
 
     Raises:
+        ArmError: The arm has locked joints.
         StationError: The gravity vector of the arm is not that of the plant, so that a controller would compensate a
             wrong gravity; or a joint has no motor.
 
@@ -110,6 +111,7 @@ def add_arm_drive(builder: DiagramBuilder, plant: MultibodyPlant, arm: Arm, inst
         >>> builder.Connect(drive.state_estimated, controller.GetInputPort("state_estimated"))
         >>> builder.Connect(controller.GetOutputPort("effort"), drive.effort_commanded)
     """
+    arm.refuse_locked_joints("a drive")
     base = plant.GetFrameByName("base_link", instance)
     if plant.IsAnchored(base.body()):
         R_WB = base.CalcPoseInWorld(plant.CreateDefaultContext()).rotation()

@@ -180,6 +180,8 @@ def test_joint_of_a_named_column_is_mapped_or_missed(tmp_path):
     )
     recording = read_recording(path, psm, joints={"insertion": "z"})
     np.testing.assert_array_equal(recording.q[:, 2], [0.02, 0.09])
+    both = named_csv(tmp_path, [*(f"q{i}" for i in range(1, 8)), "yaw.pos"], np.arange(16.0).reshape(2, 8) / 100)
+    assert read_recording(both, psm).q[0, 0] == 0.0  # other columns are ignored
     names[2] = "insertion position [mm]"
     named_csv(tmp_path, names, np.zeros((2, 7)))
     assert_refused("the unit of insertion position is mm; allowed: m", read_recording, path, psm)

@@ -184,7 +184,9 @@ def test_reads_a_bag_of_two_files(mtm, tmp_path):
     (folder / "metadata.yaml").write_text(yaml.safe_dump(metadata))
     np.testing.assert_array_equal(read_recording(folder, mtm).tau, tau)
     (folder / "metadata.yaml").unlink()  # the recorder was killed
-    np.testing.assert_array_equal(read_recording(folder, mtm).tau, tau)
+    merged = read_recording(folder, mtm)
+    np.testing.assert_array_equal(merged.tau, tau)
+    assert merged.notes[0] == "no metadata.yaml: poses.mcap, poses_1.mcap were read as parts of one bag"
     (folder / "poses_2.mcap").write_bytes((folder / "poses_1.mcap").read_bytes()[:500])
     with pytest.raises(RecordingError, match="the bag cannot be read"):
         read_recording(folder, mtm)

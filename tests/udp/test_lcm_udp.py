@@ -240,7 +240,7 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
 @pytest.mark.watchdog
 @pytest.mark.parametrize("mode", ["gravity", "hold"])
 def test_run_starts_ramps_and_ends_in_hold(arm, mode):
-    """A watchdog test, since `run` ends if the computer stops the arm's guard for 40 ms."""
+    """A watchdog test, since `run` ends if the computer stops the arm's guard for 0.5 s (`PATIENT`)."""
     name, _, observer = arm
     expired = observer.last.num_expired
     starts = CommandLine if (name, mode) == ("mtml", "gravity") else dvrk_drake
@@ -552,7 +552,7 @@ def test_key_protects_from_flood_of_foreign_commands(tmp_path):
     The rate of the arm is compared with its rate before the flood. Without real-time scheduling a flood takes computing
     time from all processes, above all from those that read it, so the rate is judged with real-time scheduling only.
 
-    A watchdog test, since the controller holds where the computer stops it for 50 ms.
+    A watchdog test, since the guard holds where the computer stops it for 0.5 s (`PATIENT`).
     """
     key = tmp_path / "a.key"
     create_key_file(key)
