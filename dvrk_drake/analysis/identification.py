@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
@@ -34,7 +33,6 @@ def identify(
     arm: Arm,
     *,
     method: Method = "robust",
-    low_speed_segments: bool = False,
     estimate_gravity: bool = False,
     progress: Progress | None = None,
 ) -> StaticIdentification | DynamicIdentification:
@@ -42,7 +40,7 @@ def identify(
 
     A recording of poses, or a motion with enough static poses, gives a static model with gravity, cables, springs and
     offsets. Any other motion gives a dynamic model with physically consistent inertial parameters, rotor inertias and
-    friction. If `low_speed_segments` is True, such a motion gives a static model instead.
+    friction.
 
     Several motions, for example of different days, give one dynamic model. The links, cables and springs are those of
     all motions. Offsets and friction may differ between the motions, and the model contains their means. The
@@ -56,8 +54,6 @@ def identify(
             several motions, also with one recording of poses.
         arm: Arm that was recorded, with the gravity direction of its mounting, see `Arm.with_gravity`.
         method: Method for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
-        low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
-            poses.
         estimate_gravity: True to estimate the direction of gravity in the base frame, for a base with an unknown tilt.
             The vector of `arm` is the initial estimate. Motions of an MTM always give this estimate.
         progress: Callback that receives the name of the step ("checking the recording" or "identifying") and the
@@ -90,45 +86,39 @@ def identify(
         arm = replace(arm, identification=replace(arm.identification, base_may_tilt=True))
     if not isinstance(recording, Recording):
         if len(recording) != 1:
-            if method != "robust" or low_speed_segments:
-                what = "low-speed segments" if low_speed_segments else f'method "{method}"'
-                raise RecordingError(f"{what}: requires one recording, but {len(recording)} were given")
+            if method != "robust":
+                raise RecordingError(f'method "{method}": requires one recording, but {len(recording)} were given')
             return _identify_several(recording, arm, progress)
         (recording,) = recording
     recording, dropped = with_power(recording, arm)
     if is_assumed(arm):
         arm, mounting = find_mounting(Observations(recording, arm))
         dropped = (*dropped, *mounting)
-    poses = Observations(recording, arm).poses(with_low_speed_segments=low_speed_segments)
+    poses = Observations(recording, arm).poses()
     report = require_usable(poses.observations, progress, channels=True)
     share = step_progress(progress, "identifying")
     try:
         if poses.moves:
             motion = identify_dynamic([poses.observations], share)
             return replace(motion, warnings=(*dropped, *report.warnings, *_unexplained(motion)))
-        direction = None if poses.measured is not None else gravity_direction(poses.recording, arm)
+        direction = gravity_direction(poses.recording, arm)
         if estimate_gravity:
             arm = _with_estimated_gravity(arm, direction, report.source)
-        static = identify_static(poses.recording, arm, method, share, poses.measured)
+        static = identify_static(poses.recording, arm, method, share)
     except DvrkDrakeError as error:
         error.findings = (*dropped, *report.warnings)
         raise
     note = poses.note
     if estimate_gravity:
         note = f"{note} Gravity in the base frame, estimated from the poses: {direction} from the arm file.".strip()
-    tilted = _tilt_warning(direction, report.source) if direction and not estimate_gravity else ()
-    warnings = (*dropped, *report.warnings, *tilted, *_friction_in_segments(static, poses.measured))
+    tilted = () if estimate_gravity else _tilt_warning(direction, report.source)
     if tilted:
         static.model.provenance.base_tilt = f"gravity estimated from the poses: {direction} from the assumed direction"
+    warnings = (*dropped, *report.warnings, *tilted)
     return replace(static, warnings=warnings, note=note, num_rows=len(poses.recording))
 
 
-def _with_estimated_gravity(arm: Arm, direction: GravityDirection | None, source: str) -> Arm:
-    if direction is None:
-        raise IdentificationError(
-            f"{source}: low-speed segments do not determine the direction of gravity, because they contain friction. "
-            "Give the gravity vector, or record poses at rest."
-        )
+def _with_estimated_gravity(arm: Arm, direction: GravityDirection, source: str) -> Arm:
     if not direction.is_determined:
         raise IdentificationError(
             f"{source}: the poses do not determine the direction of gravity: {direction} from the arm file; at most +- "
@@ -213,15 +203,3 @@ def _num_common_rows(a: Recording, b: Recording) -> int:
 def _unexplained(result: DynamicIdentification) -> tuple[Finding, ...]:
     actuators = result.model.dynamic_model.section.actuators
     return unexplained_effort({a.name: a.rms_cross_validation / a.rms_effort for a in actuators if a.rms_effort > 0})
-
-
-def _friction_in_segments(result: StaticIdentification, measured: NDArray[np.bool_] | None) -> tuple[Finding, ...]:
-    commanded = [joint.name for joint in result.model.joints if joint.feedforward_scale > 0]
-    if measured is None or not commanded:
-        return ()
-    what = (
-        "friction in low-speed segments is not separated from gravity, so at other poses, the model torque of "
-        f"{', '.join(commanded)} may be less accurate than zero torque"
-    )
-    advice = "Cross-validation does not detect this error. Validate the model on static poses before you use it."
-    return (Finding("warning", "low-speed segments", result.recording.source or "recording", what, advice),)

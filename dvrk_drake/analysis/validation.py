@@ -21,7 +21,7 @@ from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Coordinates, R
 
 
 def validate(
-    model: IdentifiedModel, recording: Recording, *, low_speed_segments: bool = False, progress: Progress | None = None
+    model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None
 ) -> StaticValidation | DynamicValidation:
     """Compares a model's efforts with the efforts of a recording, as `dvrk-drake validate` does.
 
@@ -31,8 +31,6 @@ def validate(
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
         recording: Poses or a motion with efforts (m, n), not used for the identification of the model.
-        low_speed_segments: True to use the low-speed segments of a motion as poses if the motion has too few static
-            poses.
         progress: Callback that receives the name of the step ("checking the recording" or "validating") and the
             finished share of the step (0 to 1).
 
@@ -43,7 +41,6 @@ def validate(
     Raises:
         RecordingError: The recording does not fit the model's arm, or `check` rejects the recording. The attribute
             `findings` of the error contains the reasons. Or the arm moves, but the model has no dynamics.
-        IdentificationError: `low_speed_segments` is True, but the motion has no low-speed segments.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -56,7 +53,7 @@ def validate(
     """
     arm = model.arm
     recording, dropped = with_power(recording, arm)
-    poses = Observations.for_model(recording, model).poses(with_low_speed_segments=low_speed_segments)
+    poses = Observations.for_model(recording, model).poses()
     report = require_usable(poses.observations, progress)
     share = step_progress(progress, "validating")
     share(0.0)
@@ -67,7 +64,7 @@ def validate(
         found = unexplained_effort({name: errors[name] for name, v in validation.verdicts.items() if v == "do not use"})
     else:
         _refuse_motion(model, poses.recording)
-        validation = validate_static(model, poses.recording, poses.measured)
+        validation = validate_static(model, poses.recording)
         found = ()
     share(1.0)
     if validation.of_same_recording:
@@ -84,7 +81,7 @@ def _refuse_motion(model: IdentifiedModel, recording: Recording) -> None:
             why = f"it is no motion for a dynamic model: {MIN_ROWS} rows with t, less than {MAX_PERIOD} s apart"
         raise RecordingError(
             f"{recording.source or 'recording'}: the arm moves ({motion}), but {why}. Validate with poses at rest, "
-            f"with a recording that has at least {MIN_POSES} static poses, or with --low-speed-segments."
+            f"or with a recording that has at least {MIN_POSES} static poses."
         )
 
 

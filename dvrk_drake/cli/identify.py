@@ -67,9 +67,6 @@ OwnGravity = Annotated[
     ),
 ]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
-LowSpeedSegments = Annotated[
-    bool, Parameter(show_default=False, help="Treat low-speed segments of a motion as static poses.")
-]
 _FILE = FileOptions()
 _STEPS = "reading", "checking the recording"
 _SOURCE = one_of("Source of the model (one is required)")
@@ -84,7 +81,6 @@ def identify(
     output: NewModel,
     file: FileOptions = _FILE,
     method: Literal["robust", "paper"] = "robust",
-    low_speed_segments: LowSpeedSegments = False,
     gravity: OwnGravity = None,
     locked: Locked = None,
     plots: Plots = None,
@@ -119,7 +115,6 @@ def identify(
             read,
             recorded_arm,
             method=method,
-            low_speed_segments=low_speed_segments,
             estimate_gravity=gravity == "estimate",
             progress=steps,
         )
@@ -190,7 +185,6 @@ def validate(
     file: FileOptions = _FILE,
     require: Literal["good", "usable"] | None = None,
     save: Annotated[bool, Parameter(show_default=False)] = False,
-    low_speed_segments: LowSpeedSegments = False,
     json: Json = None,
     plots: Plots = None,
     report: Report = None,
@@ -222,7 +216,7 @@ def validate(
             if loaded.validation is not None and not overwrite:
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
-        validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
+        validation = dvrk.validate(loaded, read, progress=steps)
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if save:
         validation.save(model, overwrite=True)

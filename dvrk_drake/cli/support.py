@@ -236,7 +236,7 @@ def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
 def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
     """Prints one line per warning. Warnings that concern the validity of the result are printed on stderr."""
     for warning in warnings:
-        if warning.kind in ("low-speed segments", "same recording", "other link"):
+        if warning.kind in ("same recording", "other link"):
             print(f"dvrk-drake: {warning}", file=sys.stderr, flush=True)
         else:
             console.print(str(warning), style="yellow", markup=False, soft_wrap=True)

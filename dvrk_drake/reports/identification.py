@@ -344,14 +344,14 @@ def _print_pose_errors(
     console.print(table)
     if num_excluded := sum(j.num_excluded for j in joints):
         lists = "" if verbose else " --verbose lists them."
-        console.print(f"{num_excluded} of {np.sum(result.measured)} measurements were excluded.{lists}")
+        console.print(f"{num_excluded} of {result.usable.size} measurements were excluded.{lists}")
     if poses < result.num_rows:
         console.print(f"The {result.num_rows} rows contain {poses} distinct poses. Samples of one pose were averaged.")
     for j in joints:
         if j.feedforward_scale == 0.0:
             why = "the recording does not separate gravity from friction."
             if j.rms_zero_torque == 0.0:
-                why = "no holding torque was measured."
+                why = "its effort was not measured."
             console.print(f"{j.name}: feedforward disabled, because {why}", style="yellow", markup=False)
     console.print()
 

@@ -84,15 +84,14 @@ def test_torque_errors_are_dots_with_intervals(monkeypatch, tmp_path):
 def test_outliers_do_not_determine_the_range_of_a_panel(monkeypatch, tmp_path):
     measured, predicted = poses()
     measured[3, 1], predicted[5, 2] = 1e3, -1e3
-    excluded = [ExcludedMeasurement(3, (1,), "row 4", "outlier")]
-    mask = np.ones(measured.shape, dtype=bool)
-    mask[:, 6] = False
+    excluded = [ExcludedMeasurement(row, (6,), f"row {row + 1}", "at its stop") for row in range(len(measured))]
+    excluded.append(ExcludedMeasurement(3, (1,), "row 4", "outlier"))
     with checked_figures(monkeypatch) as figures:
         identification.plot_measured_against_predicted(
-            tmp_path / "a.png", MTM, measured, {"held out": (colours.HELD_OUT, predicted)}, mask, excluded, "Torques"
+            tmp_path / "a.png", MTM, measured, {"held out": (colours.HELD_OUT, predicted)}, excluded, "Torques"
         )
     panels = figures[0].axes
-    assert len(panels) == 6  # joint 7 has no measurements
+    assert len(panels) == 6  # all measurements of joint 7 are excluded
     assert "J7" in figures[0].get_suptitle()
     assert all(np.ptp(ax.get_xlim()) < 20 for ax in panels)
     labels = {text.get_text() for text in figures[0].legends[0].get_texts()}

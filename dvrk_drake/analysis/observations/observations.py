@@ -13,7 +13,7 @@ from dvrk_drake.analysis.observations.low_pass import central_difference, low_pa
 from dvrk_drake.analysis.observations.motion_faults import MotionFault, jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MIN_SEGMENT, MotionGrid, even_times
 from dvrk_drake.analysis.observations.repetition import find_period
-from dvrk_drake.analysis.observations.static_segments import low_speed_segments, static_poses
+from dvrk_drake.analysis.observations.static_segments import static_poses
 from dvrk_drake.analysis.observations.true_time import TrueTime, increasing_times, true_time
 from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
@@ -25,11 +25,6 @@ from dvrk_drake.recordings.recording import MAX_LOST, MIN_RATE, MIN_ROWS, Record
 #: Smallest accepted duration of a motion [s]. At the cut-off frequency of 10 Hz that is the default for efforts, it has
 #: 40 independent values of each effort.
 MIN_DURATION = 2.0
-#: Note for models identified from low-speed segments.
-LOW_SPEED_NOTE = (
-    "Low-speed segments are treated as static poses. The torques of these segments contain friction, and other joints "
-    "may move. Evaluate the model by the cross-validated errors or on another recording, not by the errors of the fit."
-)
 
 
 class Observations:
@@ -116,27 +111,20 @@ class Observations:
     def _has_static_poses(self) -> bool:
         return self.static_poses is not None and len(self.static_poses) >= MIN_POSES
 
-    def poses(self, *, with_low_speed_segments: bool = False) -> Poses:
+    def poses(self) -> Poses:
         """Returns the static poses of a motion, or these observations if there are fewer than `MIN_POSES` of them.
-
-        Args:
-            with_low_speed_segments: True to extract low-speed segments if a motion has too few static poses.
 
         Raises:
             RecordingError: The recording does not match the arm, has no efforts, or is a motion with decreasing times
                 or with a fault (`fault`, `jump`).
-            IdentificationError: Low-speed segments are requested, but there are none.
         """
         if (fault := self.fault or self.jump) is not None:
             raise RecordingError(f"{self.source}: refused: {fault.where}: {fault.what}. {fault.advice}")
         poses = self.static_poses
         if poses is not None and len(poses) >= MIN_POSES:
             note = f"Static poses found in the motion: {len(poses)}, in {len(self.recording)} rows."
-            return Poses(Observations(poses, self.arm, self.settings), None, note)
-        if with_low_speed_segments:
-            segments, measured = low_speed_segments(self.recording, self.arm)
-            return Poses(Observations(segments, self.arm, self.settings), measured, LOW_SPEED_NOTE)
-        return Poses(self, None, "", moves=poses is not None and bool(self.recording.motion(self.arm)))
+            return Poses(Observations(poses, self.arm, self.settings), note)
+        return Poses(self, "", moves=poses is not None and bool(self.recording.motion(self.arm)))
 
     def _check_times(self) -> None:
         """Rejects a motion whose times do not increase. Without this check, it would be treated as poses."""
@@ -269,14 +257,12 @@ class Poses(NamedTuple):
 
     Attributes:
         observations: Recording with one row per extracted pose, or the unchanged recording.
-        measured: Mask (m, n) of the efforts that are holding torques, None if all efforts are holding torques.
         note: Note on how poses were extracted from a motion, "" if no poses were extracted.
         moves: True if the recording is a motion with too few static poses, which is suitable for dynamic identification
             only.
     """
 
     observations: Observations
-    measured: NDArray[np.bool_] | None
     note: str
     moves: bool = False
 

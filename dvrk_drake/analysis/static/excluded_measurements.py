@@ -32,9 +32,7 @@ class ExcludedMeasurement:
     reason: str
 
 
-def find_excluded(
-    recording: Recording, arm: Arm, measured: NDArray[np.bool_] | None = None
-) -> list[ExcludedMeasurement]:
+def find_excluded(recording: Recording, arm: Arm) -> list[ExcludedMeasurement]:
     """Returns the measurements to exclude before any fit: poses at a joint stop and efforts beyond their limit.
 
     A joint stop supports part of the load. The torques of the joints at the stop are therefore not holding torques.
@@ -42,8 +40,6 @@ def find_excluded(
     Args:
         recording: Recording in joint coordinates, with efforts.
         arm: Arm whose limits are used.
-        measured: Mask (m, n) of the efforts that are holding torques. Only these efforts can be excluded. None: all
-            efforts are holding torques.
     """
     excluded = []
     A, lower, upper = arm.limit_matrix()
@@ -67,10 +63,6 @@ def find_excluded(
             f"{arm.effort_limits[joint]:.3g} {unit}"
         )
         excluded.append(ExcludedMeasurement(int(row), (int(joint),), recording.where(int(row)), reason))
-    if measured is not None:
-        excluded = [
-            measurement for measurement in excluded if np.any(measured[measurement.row, list(measurement.joints)])
-        ]
     order = np.arange(len(recording)) if recording.lines is None else recording.lines
     return sorted(excluded, key=lambda measurement: order[measurement.row])
 

@@ -44,9 +44,6 @@ MIN_TORQUE, MAX_SMALL_TORQUE_RATIO = 0.02, 0.5
 #: Smallest range of the recorded positions of a joint with a feedforward, as a share of the range between the joint
 #: limits. With a smaller range, most predicted torques would be extrapolated.
 MIN_MOTION = 0.02
-#: Smallest range of the recorded positions for low-speed segments, as a share of the range between the joint limits.
-#: Within a smaller range, friction has the same sign in all segments.
-MIN_SEGMENT_MOTION = 0.05
 #: Largest ratio of the leave-one-out error to the RMS torque for a feedforward scale of 1.
 MAX_ERROR_RATIO = 0.98
 #: Number of folds for cross-validation.
@@ -63,15 +60,13 @@ class StaticIdentification(Identification):
         leave_one_out_residuals: Measured efforts minus predictions (m, n) of a fit to all other poses [N m, N].
         cross_validation_residuals: Measured efforts minus predictions (m, n) for the poses of each held-out fold, see
             `JointStatistics` [N m, N]. For the method "paper", they are `leave_one_out_residuals`.
-        measured: Mask (m, n) of the efforts that are holding torques.
-        usable: Mask (m, n) of the holding torques that are not excluded.
+        usable: Mask (m, n) of the efforts that are not excluded.
     """
 
     excluded: list[ExcludedMeasurement]
     residuals: NDArray[np.float64]
     leave_one_out_residuals: NDArray[np.float64]
     cross_validation_residuals: NDArray[np.float64]
-    measured: NDArray[np.bool_]
     usable: NDArray[np.bool_]
 
 
@@ -80,7 +75,6 @@ def identify_static(
     arm: Arm,
     method: Method = "robust",
     progress: Callable[[float], object] = lambda share: None,
-    measured: NDArray[np.bool_] | None = None,
 ) -> StaticIdentification:
     """Identifies the static model of `arm` from a recording of poses at rest.
 
@@ -97,8 +91,6 @@ def identify_static(
         arm: Arm that was recorded.
         method: "robust" or "paper".
         progress: Callback that receives the finished share, 0 to 1.
-        measured: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None: all efforts are
-            holding torques.
 
     Raises:
         RecordingError: The recording does not match the arm or has no efforts.
@@ -108,16 +100,14 @@ def identify_static(
     if method not in get_args(Method):
         raise IdentificationError(f'method is "{method}"; allowed: {", ".join(get_args(Method))}')
     known = None if recording.tau is None else recording.measured_joints(arm)
-    recording = usable_poses(recording, arm, averaged=method == "robust" and measured is None)
+    recording = usable_poses(recording, arm, averaged=method == "robust")
     tau = recording.measured_effort()
     gravity_model = static_model(arm)
     Y = gravity_model.regressor(recording.q)
-    stacked = Y.reshape(-1, Y.shape[2]) if measured is None else Y[measured]
+    stacked = Y.reshape(-1, Y.shape[2])
     rank = int(np.linalg.matrix_rank(stacked, tol=1e-9 * np.linalg.norm(stacked, 2)))
-    excluded = find_excluded(recording, arm, measured)
-    if measured is None:
-        measured = np.ones(tau.shape, dtype=bool)
-    usable = usable_measurements(tau.shape, excluded) & measured
+    excluded = find_excluded(recording, arm)
+    usable = usable_measurements(tau.shape, excluded)
     if known is not None:
         usable &= known
     effects: tuple[ActuatorEffect, ...] = ()
@@ -128,11 +118,11 @@ def identify_static(
                 f"{recording.source or 'recording'}: {len(recording)} poses determine only {rank} of {Y.shape[2]} base "
                 "parameters, so least squares has no unique solution. Record more varied poses, or use --method robust."
             )
-        fit = weighted_fit(Y, tau, measured.astype(float), np.zeros(Y.shape[2]))
+        fit = weighted_fit(Y, tau, np.ones_like(tau), np.zeros(Y.shape[2]))
         # The weights are 1, so the covariance is multiplied by the residual variance.
-        variance = np.sum(fit.residuals[measured] ** 2) / (np.sum(measured) - Y.shape[2])
+        variance = np.sum(fit.residuals**2) / (tau.size - Y.shape[2])
         validated, sd = fit.leave_one_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
-        freedom = np.full(len(sd), float(np.sum(measured) - Y.shape[2]))
+        freedom = np.full(len(sd), float(tau.size - Y.shape[2]))
     else:
         problem = StaticProblem(arm, recording.q, tau, usable)
         progress(0.0)
@@ -144,8 +134,6 @@ def identify_static(
         usable = usable & ~robust.outliers
         feedforward_scale = _feedforward_scales(problem, fit.leave_one_out_residuals, usable)
         validated = _cross_validate(problem, progress)
-        if not np.all(measured):
-            feedforward_scale = np.where(_segments_support(problem, validated, usable), feedforward_scale, 0.0)
     fit = _scaled(fit, tau, feedforward_scale)
     model = IdentifiedModel(
         arm=arm,
@@ -163,7 +151,7 @@ def identify_static(
                 effects, *(x[Y.shape[2] :] for x in (fit.theta, sd, freedom)), strict=True
             )
         ],
-        joints=_statistics(recording, arm, fit, validated, measured, usable, feedforward_scale),
+        joints=_statistics(recording, arm, fit, validated, usable, feedforward_scale),
         provenance=Provenance(
             recording=recording.source,
             sha256=recording.sha256,
@@ -181,7 +169,6 @@ def identify_static(
         residuals=fit.residuals,
         leave_one_out_residuals=fit.leave_one_out_residuals,
         cross_validation_residuals=validated,
-        measured=measured,
         usable=usable,
     )
 
@@ -230,7 +217,7 @@ def _check_rest(recording: Recording, arm: Arm) -> None:
     if motion := recording.motion(arm):
         raise IdentificationError(
             f"{recording.source or 'recording'}: the arm moves ({motion}). Static identification requires poses at "
-            f"rest (below {REST_SPEED[0]} rad/s) or the low-speed segments of a motion (--low-speed-segments)."
+            f"rest (below {REST_SPEED[0]} rad/s)."
         )
 
 
@@ -272,25 +259,6 @@ def _feedforward_scales(
     return feedforward_scale
 
 
-def _segments_support(
-    problem: StaticProblem, validated: NDArray[np.float64], usable: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the joints that may get a feedforward from low-speed segments.
-
-    Few segments or a small range cannot separate gravity from friction. Leave-one-out cross-validation does not detect
-    this problem, because neighbouring segments have the same friction. A feedforward therefore requires at least
-    `MIN_POSES` segments that cover `MIN_SEGMENT_MOTION` of the joint's range. The cross-validated error must also be
-    below the error of zero torque.
-    """
-    arm = problem.arm
-    supported = np.zeros(arm.num_joints, dtype=bool)
-    for j, min_range in enumerate(MIN_SEGMENT_MOTION * (arm.position_upper - arm.position_lower)):
-        use = usable[:, j]
-        if np.sum(use) >= MIN_POSES and np.ptp(problem.q[use, j]) >= min_range:
-            supported[j] = rms(validated[use, j]) < MAX_ERROR_RATIO * rms(problem.tau[use, j])
-    return supported
-
-
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
     """Returns the residuals (m, n) of a 10-fold cross-validation. The folds are blocks of successive poses.
 
@@ -326,26 +294,25 @@ def _statistics(
     arm: Arm,
     fit: LinearFit,
     validated: NDArray[np.float64],
-    measured: NDArray[np.bool_],
     usable: NDArray[np.bool_],
     feedforward_scale: NDArray[np.float64],
 ) -> list[JointStatistics]:
     tau = recording.measured_effort()
     statistics = []
     for j, name in enumerate(arm.joint_names):
-        every, use = measured[:, j], usable[:, j]
-        lower, upper = (recording.q[every, j].min(), recording.q[every, j].max()) if np.any(every) else (0.0, 0.0)
+        use = usable[:, j]
+        lower, upper = recording.q[:, j].min(), recording.q[:, j].max()
         statistics.append(
             JointStatistics(
                 name=name,
-                rms_zero_torque=rms(tau[every, j]),
-                rms_fit=rms(fit.residuals[every, j]),
-                rms_leave_one_out=rms(fit.leave_one_out_residuals[every, j]),
+                rms_zero_torque=rms(tau[:, j]),
+                rms_fit=rms(fit.residuals[:, j]),
+                rms_leave_one_out=rms(fit.leave_one_out_residuals[:, j]),
                 rms_zero_torque_included=rms(tau[use, j]),
                 rms_fit_included=rms(fit.residuals[use, j]),
                 rms_leave_one_out_included=rms(fit.leave_one_out_residuals[use, j]),
                 rms_cross_validation_included=rms(validated[use, j]),
-                num_excluded=int(np.sum(every & ~use)),
+                num_excluded=int(np.sum(~use)),
                 feedforward_scale=float(feedforward_scale[j]),
                 position_lower=float(lower),
                 position_upper=float(upper),

@@ -62,15 +62,13 @@ class StaticValidation(Validation):
         poses: Number of poses.
         residuals: Measured minus predicted efforts (m, n), in the coordinates of the recording [N m, N].
         excluded: Measurements that the verdicts do not use, and the reasons for the exclusion.
-        measured: Mask (m, n) of the efforts that are holding torques.
-        usable: Mask (m, n) of the holding torques that are not excluded, in the coordinates of the recording.
+        usable: Mask (m, n) of the efforts that are not excluded, in the coordinates of the recording.
     """
 
     joints: list[JointError]
     poses: int
     residuals: NDArray[np.float64]
     excluded: list[ExcludedMeasurement]
-    measured: NDArray[np.bool_]
     usable: NDArray[np.bool_]
 
     @property
@@ -119,16 +117,12 @@ def predict_static(
     return tau
 
 
-def validate_static(
-    model: IdentifiedModel, recording: Recording, measured_joints: NDArray[np.bool_] | None = None
-) -> StaticValidation:
+def validate_static(model: IdentifiedModel, recording: Recording) -> StaticValidation:
     """Compares a model's holding torques with a recording.
 
     Args:
         model: Identified model.
         recording: Poses with efforts, in joint or actuator coordinates.
-        measured_joints: Mask (m, n) of the efforts that are holding torques, from `low_speed_segments`. None: all
-            efforts are holding torques.
 
     Raises:
         RecordingError: The recording does not fit the model's arm, or has no efforts.
@@ -140,17 +134,15 @@ def validate_static(
     predicted = predict_static(model, recording)
     residuals = measured - predicted
     in_joints = recording.in_joint_coordinates(arm)
-    if measured_joints is None:
-        measured_joints = np.ones(measured.shape, dtype=bool)
     check_effort_unit(in_joints, arm)
-    excluded = find_excluded(in_joints, arm, measured_joints)
-    usable = usable_measurements(measured.shape, excluded) & measured_joints
+    excluded = find_excluded(in_joints, arm)
+    usable = usable_measurements(measured.shape, excluded)
     if recording.coordinates == "actuator":
         # An excluded measurement of a joint excludes the measurements of all actuators that drive the joint.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
     usable = usable & ~recording.unmeasured
     covered = coverage(arm, np.ptp(in_joints.q, axis=0), recording.coordinates)
-    errors = _joint_errors(arm, recording, predicted, measured_joints, usable, covered)
+    errors = _joint_errors(arm, recording, predicted, usable, covered)
     return StaticValidation(
         model=model,
         recording=recording,
@@ -158,7 +150,6 @@ def validate_static(
         poses=len(recording),
         residuals=residuals,
         excluded=excluded,
-        measured=measured_joints,
         usable=usable,
     )
 
@@ -167,15 +158,14 @@ def _joint_errors(
     arm: Arm,
     recording: Recording,
     predicted: NDArray[np.float64],
-    measured_joints: NDArray[np.bool_],
     usable: NDArray[np.bool_],
     covered: NDArray[np.float64],
 ) -> list[JointError]:
     measured = recording.measured_effort()
     errors = []
     for j, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, recording.coordinates), strict=True)):
-        every, use = measured_joints[:, j], usable[:, j]
-        torque, error = (rms(tau[every, j]) for tau in (measured, measured - predicted))
+        use = usable[:, j]
+        torque, error = (rms(tau[:, j]) for tau in (measured, measured - predicted))
         torque_used, error_used = (rms(tau[use, j]) for tau in (measured, measured - predicted))
         is_negligible = rms(predicted[:, j]) <= NEGLIGIBLE * tolerance.friction and error_used <= tolerance.friction
         commanded = bool(np.any(predicted[:, j])) and not is_negligible
@@ -188,7 +178,7 @@ def _joint_errors(
                 torque_used,
                 error_used,
                 error_used / torque_used if torque_used > 0 else None,
-                int(np.sum(every & ~use)),
+                int(np.sum(~use)),
                 float(covered[j]),
                 judge(torque_used, error_used, tolerance, float(covered[j]), commanded=commanded),
             )

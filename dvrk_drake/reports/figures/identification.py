@@ -66,7 +66,7 @@ def plot_static_identification(folder: Path, result: StaticIdentification) -> No
     """Writes torque_error.png and predicted.png of an identification."""
     recording, arm = result.recording, result.model.arm
     tau = recording.measured_effort()
-    usable = usable_measurements(tau.shape, result.excluded) & result.measured
+    usable = usable_measurements(tau.shape, result.excluded)
     errors = {
         "zero torque": tau,
         "leave-one-out": result.leave_one_out_residuals,
@@ -87,9 +87,7 @@ def plot_static_identification(folder: Path, result: StaticIdentification) -> No
         "held out (10-fold cross-validation)": (HELD_OUT, tau - result.cross_validation_residuals),
     }
     title = f"{arm.name}: predicted and measured torque at {len(recording)} poses of {name}"
-    plot_measured_against_predicted(
-        folder / "predicted.png", arm, tau, predictions, result.measured, result.excluded, title
-    )
+    plot_measured_against_predicted(folder / "predicted.png", arm, tau, predictions, result.excluded, title)
 
 
 def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
@@ -98,15 +96,14 @@ def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
     arm = model.arm
     recording = validation.recording.in_joint_coordinates(arm)
     tau, predicted = recording.measured_effort(), model.holding_torque(recording.q)
-    usable = usable_measurements(tau.shape, validation.excluded) & validation.measured
+    usable = usable_measurements(tau.shape, validation.excluded)
     is_held_out = not validation.of_same_recording
     role = "held out (the recording was not used to fit)" if is_held_out else "fitted (the recording was used to fit)"
     label = f"model, {role}"
     rms, intervals = _errors_and_intervals({"zero torque": tau, label: tau - predicted}, usable)
     if validation.excluded:
-        squares = np.where(validation.measured, (tau - predicted) ** 2, np.nan)
-        differs = np.any(validation.measured & ~usable, axis=0)
-        rms["model, with excluded measurements"] = np.where(differs, _rms_of_squares(squares), np.nan)
+        every = _rms_of_squares((tau - predicted) ** 2)
+        rms["model, with excluded measurements"] = np.where(np.all(usable, axis=0), np.nan, every)
     name = Path(recording.source).name
     plot_torque_error(
         folder / "torque_error.png",
@@ -121,7 +118,6 @@ def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
         arm,
         tau,
         {role: (HELD_OUT if is_held_out else FITTED, predicted)},
-        validation.measured,
         validation.excluded,
         f"{arm.name}: predicted and measured torque at {validation.poses} poses of {name}",
     )
@@ -217,7 +213,6 @@ def plot_measured_against_predicted(
     arm: Arm,
     measured: NDArray[np.float64],
     predictions: Mapping[str, tuple[str, NDArray[np.float64]]],
-    measured_joints: NDArray[np.bool_],
     excluded: list[ExcludedMeasurement],
     title: str,
 ) -> None:
@@ -230,15 +225,14 @@ def plot_measured_against_predicted(
         arm: Arm of the joints.
         measured: Measured torques (m, n) of the joints [N m, N].
         predictions: Mapping from a label to a colour and predicted torques (m, n) of the joints [N m, N].
-        measured_joints: Mask (m, n), True for measured holding torques. Only these torques are drawn.
         excluded: Excluded measurements, drawn as crosses. They do not affect the range of the panels.
         title: Title of the figure.
     """
-    usable = usable_measurements(measured.shape, excluded) & measured_joints
+    usable = usable_measurements(measured.shape, excluded)
     shown_joints = np.flatnonzero(np.any(usable, axis=0)).tolist()
     figure, panels = panel_grid(max(len(shown_joints), 1), height=3.0)
     for j, ax in zip(shown_joints, panels, strict=False):
-        use, left_out = usable[:, j], measured_joints[:, j] & ~usable[:, j]
+        use, left_out = usable[:, j], ~usable[:, j]
         everything = np.concatenate([measured[use, j], *(tau[use, j] for _, tau in predictions.values())])
         inner, outer = _ranges(np.append(everything, 0.0))
         ax.plot(outer, outer, color=MEASURED, linewidth=0.8, label="predicted = measured")

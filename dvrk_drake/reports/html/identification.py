@@ -145,7 +145,6 @@ def _excluded(result: Identification | Validation, efforts: Efforts) -> list[Blo
         used = f"{len(efforts.t)} of {rows} rows were compared. Both ends were omitted because of filter transients."
         repeated = f" {rows - distinct} rows repeat the previous row and were not used." if distinct < rows else ""
         return [*blocks, Text(used + repeated)]
-    total = int(np.sum(efforts.drawn))
     if isinstance(result, Identification) and len(result.recording) < result.num_rows:
         blocks.append(
             Text(
@@ -153,8 +152,8 @@ def _excluded(result: Identification | Validation, efforts: Efforts) -> list[Blo
                 "averaged."
             )
         )
-    count = int(np.sum(efforts.drawn & ~efforts.usable))
-    blocks.append(Text(f"{count} of {total} measurements were excluded."))
+    count = int(np.sum(~efforts.usable))
+    blocks.append(Text(f"{count} of {efforts.usable.size} measurements were excluded."))
     if efforts.excluded:
         listed = [(measurement.where, measurement.reason) for measurement in efforts.excluded]
         caption = f"Excluded measurements in {len({m.where for m in efforts.excluded})} poses"

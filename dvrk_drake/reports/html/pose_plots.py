@@ -32,12 +32,10 @@ class PoseEfforts(ComparedEfforts):
     """Holding efforts at m poses, in the coordinates of the recording.
 
     Attributes:
-        drawn: Mask (m, n) of the efforts that are holding torques.
-        usable: Mask (m, n) of the efforts that are holding torques and are not excluded.
+        usable: Mask (m, n) of the efforts that are not excluded.
         excluded: Excluded measurements and the reasons.
     """
 
-    drawn: NDArray[np.bool_]
     usable: NDArray[np.bool_]
     excluded: Sequence[ExcludedMeasurement]
 
@@ -51,7 +49,7 @@ class PoseEfforts(ComparedEfforts):
                 "fitted": measured - result.residuals,
                 "held out": measured - result.cross_validation_residuals,
             }
-        return cls(result.model, result.recording, measured, predicted, result.measured, result.usable, result.excluded)
+        return cls(result.model, result.recording, measured, predicted, result.usable, result.excluded)
 
 
 def efforts_of_poses(efforts: PoseEfforts) -> go.Figure:
@@ -71,7 +69,7 @@ def efforts_of_poses(efforts: PoseEfforts) -> go.Figure:
         for name, values in {"measured": efforts.measured, **efforts.predicted}.items():
             use = efforts.usable[:, j]
             figure.add_trace(_dots(name, poses[use], values[use, j], first=j == 0), row=j + 1, col=1)
-        left_out = efforts.drawn[:, j] & ~efforts.usable[:, j]
+        left_out = ~efforts.usable[:, j]
         lower, upper = _range(efforts, j)
         values = efforts.measured[left_out, j]
         excluded = _dots("excluded", poses[left_out], np.clip(values, lower, upper), first=j == 0)

@@ -256,8 +256,6 @@ def test_rejected_lists(days):
         dvrk.identify([first, part], ARM)
     with pytest.raises(RecordingError, match=r'method "paper": requires one recording, but 3 were given'):
         dvrk.identify(days[2], ARM, method="paper")
-    with pytest.raises(RecordingError, match="low-speed segments: requires one recording"):
-        dvrk.identify(days[2], ARM, low_speed_segments=True)
     with pytest.raises(RecordingError, match="no recordings were given"):
         dvrk.identify([], ARM)
 

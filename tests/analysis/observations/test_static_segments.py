@@ -7,11 +7,8 @@ import pytest
 from static_poses import motion_with_pauses
 
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.static_segments import (
-    smooth_velocity,
-    static_poses,
-    stationary_runs,
-)
+from dvrk_drake.analysis.observations.static_segments import SAME_REST, smooth_velocity, static_poses, stationary_runs
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
@@ -73,9 +70,7 @@ def test_poses_are_extracted_or_unchanged():
     np.testing.assert_allclose(found.recording.q, poses, atol=1e-3)
     assert "found in the motion: 12" in found.note and not found.moves
     few = Observations(moving(count=3)[1], ARM).poses()
-    assert few.moves and few.measured is None and len(few.recording) > 100
-    slow = Observations(moving(count=3)[1], ARM).poses(with_low_speed_segments=True)
-    assert np.all(slow.measured.sum(axis=1) == 1) and slow.note
+    assert few.moves and len(few.recording) > 100
     table = Recording(q=poses, tau=np.zeros_like(poses))
     assert Observations(table, ARM).poses().recording is table
 
@@ -86,3 +81,44 @@ def test_motion_with_decreasing_times_is_rejected():
     t[150] = t[148]
     with pytest.raises(RecordingError, match="row 151: time t does not increase"):
         Observations(replace(recording, t=t), ARM).poses()
+
+
+def test_static_segment_ends_at_a_gap_in_the_times():
+    """The motion is unknown where samples are missing."""
+    a, b = ARM.sample_poses(2, np.random.default_rng(1), margin=0.1)
+    recording = motion_with_pauses(ARM, [a, b], np.random.default_rng(2), rest=2.0)
+    late = recording.t >= 5.0  # in the middle of the rest at b
+    sag = 0.9 * ARM.per_joint(*SAME_REST)
+    split = replace(recording, t=recording.t + 5.0 * late, q=recording.q + sag * late[:, None])
+    rests = static_poses(split, ARM)
+    assert len(rests) == 2
+    # Both halves are averaged as samples of one pose, each over its own second half.
+    np.testing.assert_allclose(rests.q[1], b + 0.5 * sag, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+@pytest.mark.parametrize("with_speeds", [True, False])
+def test_static_segments_are_poses_of_all_joints(rate, with_speeds):
+    generator = np.random.default_rng(3)
+    poses = ARM.sample_poses(12, generator, margin=0.1)
+    recording = motion_with_pauses(ARM, [*poses, poses[0]], generator, rest=1.0, rate=rate)
+    noisy = recording.qd + ARM.per_joint(0.01, 0.001) * generator.normal(size=recording.q.shape)
+    rests = static_poses(replace(recording, qd=noisy if with_speeds else None), ARM)
+    assert len(rests) == len(poses), "the last pose is the first again"
+    # A static segment begins when the speed is low, before the arm stops.
+    np.testing.assert_allclose(rests.q, poses, atol=1e-4)
+    truth = IdentifiedModel.from_arm(ARM).holding_torque(poses)
+    assert np.all(np.abs(rests.tau - truth) < 1e-3 * ARM.effort_limits)
+    found = Observations(recording, ARM).poses()
+    assert found.note == f"Static poses found in the motion: 12, in {len(recording)} rows."
+
+
+def test_recording_without_static_segments_is_unchanged():
+    generator = np.random.default_rng(4)
+    poses = ARM.sample_poses(12, generator, margin=0.1)
+    moving = motion_with_pauses(ARM, poses, generator, rest=0.0)
+    assert len(static_poses(moving, ARM)) == 0
+    assert Observations(moving, ARM).poses().recording is moving
+    assert static_poses(replace(moving, t=None, qd=None), ARM) is None
+    assert static_poses(replace(moving, t=0.1 * np.arange(len(moving))), ARM) is None

@@ -12,7 +12,7 @@ from dvrk_drake.analysis.static.excluded_measurements import find_excluded
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import predict_static, validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.identified_model import FORMAT, IdentifiedModel
 from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
@@ -243,8 +243,8 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
         (
-            text.replace("model 5.0", "model 1").replace("\neffects:", "\njoint_effects:"),
-            'model 1"; allowed: "dvrk_drake identified model 5.0" and older, from 2.0 on. Older files cannot be',
+            text.replace(str(FORMAT), "dvrk_drake identified model 1").replace("\neffects:", "\njoint_effects:"),
+            f'model 1"; allowed: "{FORMAT}" and older, from 2.0 on. Older files cannot be',
         ),
         (
             text.replace("feedforward_scale: 1.0", "feedforward_scale: 2.0"),
