@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect
-from dvrk_drake.models.schema_fault import formerly, within
+from dvrk_drake.models.schema_fault import within
 
 #: Allowed range of estimates. It is wide because parameters that a recording does not identify can have any value.
 ESTIMATES = within(-1e5, 1e5, "kg, kg m or kg m^2")
@@ -36,7 +36,7 @@ class LinkEstimate:
     parameters: list[float] = field(default_factory=list, metadata=ESTIMATES)
     least_eigenvalue: float = field(default=0.0, metadata=ESTIMATES)
     standard_errors: list[float] = field(default_factory=list, metadata=STANDARD_ERRORS)
-    mass_identifiability: float = field(default=0.0, metadata=SHARES | formerly("mass_told"))
+    mass_identifiability: float = field(default=0.0, metadata=SHARES)
     bounds: list[str] = field(default_factory=list)
 
 
@@ -51,7 +51,7 @@ class MotionParameterEstimate:
     unit: str = ""
     value: float = field(default=0.0, metadata=ESTIMATES)
     standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
-    identifiability: float = field(default=0.0, metadata=SHARES | formerly("told"))
+    identifiability: float = field(default=0.0, metadata=SHARES)
 
 
 @dataclass

@@ -37,15 +37,14 @@ from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.model_file import MODEL_SUFFIXES
-from dvrk_drake.models.schema_fault import formerly, missing_key, schema_fault, with_current_keys, within
+from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
 #: Format of the files that `IdentifiedModel.save` writes.
-#: Versions 2 to 4 have no locked joints. In version 2, `arm` is a name or an absolute path.
-FORMAT = FileFormat("dvrk_drake identified model", 5, 1, oldest=2)
+FORMAT = FileFormat("dvrk_drake identified model", 1)
 #: Text between the method of an identification and the recording of the last recalibration.
 _RECALIBRATED = ", recalibrated on "
 #: Allowed range of measured positions, which may be beyond the limits of a joint.
@@ -75,11 +74,6 @@ class BaseParameterEstimate:
         return cls(name, float(value), float(standard_error), bool(excludes_0), degrees_of_freedom)
 
 
-def _earlier(name: str) -> dict[str, object]:
-    """Returns the metadata of an RMS effort whose earlier key ended in `_undoubted`."""
-    return RMS_EFFORTS | formerly(f"{name}_undoubted")
-
-
 @dataclass
 class JointStatistics:
     """Statistics of the fit of one joint. RMS torques are in N m (N for a prismatic joint), positions in rad (m).
@@ -106,16 +100,12 @@ class JointStatistics:
     rms_zero_torque: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_fit: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_leave_one_out: float = field(default=0.0, metadata=RMS_EFFORTS)
-    rms_zero_torque_included: float = field(default=0.0, metadata=_earlier("rms_zero_torque"))
-    rms_fit_included: float = field(default=0.0, metadata=_earlier("rms_fit"))
-    rms_leave_one_out_included: float = field(
-        default=0.0, metadata=RMS_EFFORTS | formerly("rms_leave_one_out_undoubted")
-    )
-    rms_cross_validation_included: float = field(
-        default=0.0, metadata=RMS_EFFORTS | formerly("rms_cross_validation_undoubted")
-    )
-    num_excluded: int = field(default=0, metadata=within(0, 10**9) | formerly("num_doubted"))
-    feedforward_scale: float = field(default=1.0, metadata=within(0.0, 1.0) | formerly("trust"))
+    rms_zero_torque_included: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_fit_included: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_leave_one_out_included: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_cross_validation_included: float = field(default=0.0, metadata=RMS_EFFORTS)
+    num_excluded: int = field(default=0, metadata=within(0, 10**9))
+    feedforward_scale: float = field(default=1.0, metadata=within(0.0, 1.0))
     position_lower: float = field(default=0.0, metadata=_POSITIONS)
     position_upper: float = field(default=0.0, metadata=_POSITIONS)
     coverage: float = field(default=0.0, metadata=within(0.0, 10.0))
@@ -272,17 +262,11 @@ class IdentifiedModel(_Identified):
         """
         content = load_yaml(path, ModelError)
         # Reject an unknown version before its keys are checked.
-        version = FORMAT.major
         if isinstance(content, dict) and content.get("format"):
             try:
-                version = FORMAT.major_of(content["format"])
+                FORMAT.check(content["format"])
             except ValueError as error:
                 raise ModelError(f"{path}: {error}") from error
-        content = with_current_keys(ModelFile, content, str(path))
-        if version < 5:
-            content.setdefault("locked_joints", {})
-        if isinstance(content, dict):
-            content.setdefault("position_offsets", {})  # since version 5.1
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A missing number would otherwise silently become 0.
         if key := missing_key(ModelFile, content):

@@ -21,7 +21,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.arm_schema import Gains, load_gains
 from dvrk_drake.models.model_file import MODEL_SUFFIXES
-from dvrk_drake.models.schema_fault import formerly, within
+from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
@@ -53,7 +53,7 @@ class ControllerScenario:
 
     mode: str = "hold"
     model: str = ""
-    compensated_effects: list[str] = field(default_factory=list, metadata=formerly("knows"))
+    compensated_effects: list[str] = field(default_factory=list)
     gains: Gains | None = None
     friction_ratio: float = field(default=0.0, metadata=within(0.0, MAX_RATIO))
     hysteresis_ratio: float = field(default=0.0, metadata=within(0.0, MAX_HYSTERESIS_RATIO))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.effect_kinds import POSITION_KINDS, kind_fault
 from dvrk_drake.models.immutable import Shared
-from dvrk_drake.models.schema_fault import formerly, number_fault, within
+from dvrk_drake.models.schema_fault import number_fault, within
 
 #: Accepted quantization steps and noise of efforts. One bit of a dVRK wrist motor is 1e-5 N m.
 _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
@@ -50,7 +50,7 @@ class DriveEffect(Shared):
     coordinate: str = ""
     kind: str = ""
     scale: float = field(default=0.0, metadata=within(1e-6, 1000.0, also=(0.0,)))
-    coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad") | formerly("value"))
+    coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad"))
     standard_error: float = field(default=0.0, kw_only=True, metadata=within(0.0, 1e9))
     degrees_of_freedom: float | None = field(default=None, kw_only=True, metadata=FREEDOMS)
 

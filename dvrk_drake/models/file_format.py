@@ -21,13 +21,11 @@ class FileFormat:
     Attributes:
         name: Text before the version.
         major, minor: Version of the files that this package writes.
-        oldest: Oldest major version that can be read.
     """
 
     name: str
     major: int
     minor: int = 0
-    oldest: int = 1
 
     @property
     def metadata(self) -> dict[str, FileFormat]:
@@ -43,19 +41,17 @@ class FileFormat:
     def __str__(self) -> str:
         return f"{self.name} {self.major}.{self.minor}"
 
-    def major_of(self, text: Any) -> int:
-        """Returns the major version of a file whose key `format` has the value `text`.
+    def check(self, text: Any) -> None:
+        """Raises ValueError if this package cannot read a file whose key `format` has the value `text`.
 
-        Raises:
-            ValueError: This package cannot read the format. The message states the accepted formats.
+        The message states the accepted formats.
         """
         found = _VERSION.fullmatch(text) if isinstance(text, str) else None
-        accepted = f'allowed: "{self}"' + (f" and older, from {self.oldest}.0 on" if self.oldest < self.major else "")
+        accepted = f'allowed: "{self.name} {self.major}.0"' + (f' to "{self}"' if self.minor else "")
         if found is None or found["name"] != self.name:
             raise ValueError(f"format is {str(text)[:60]!r}; {accepted}")
         major, minor = int(found["major"]), int(found["minor"] or 0)
         if (major, minor) > (self.major, self.minor):
             raise ValueError(f'format is "{text}"; {accepted}. Install a newer version of dvrk_drake to read this file')
-        if major < self.oldest:
+        if major < self.major:
             raise ValueError(f'format is "{text}"; {accepted}. Older files cannot be converted')
-        return major

@@ -11,7 +11,6 @@ import dataclasses
 import difflib
 import math
 import types
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral, Real
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -22,8 +21,6 @@ _ONE = {bool: "true or false", int: "an integer", float: "a number", str: "a str
 _MANY = {bool: "true or false", int: "integers", float: "numbers", str: "strings"}
 #: Metadata key of a field: the `Range` of all numbers in it.
 RANGE = "range"
-#: Metadata key of a field: its name in files of earlier versions.
-FORMERLY = "formerly"
 #: Mapping from a unit to another unit that is often used by mistake, and the factor that converts the other unit to it.
 _MISTAKEN = {
     "rad": ("degrees", math.pi / 180),
@@ -81,43 +78,6 @@ def within(
 ) -> dict[str, object]:
     """Returns metadata of a field whose numbers must be in a range, see `Range`."""
     return {RANGE: Range(low, high, unit, also, either_sign)}
-
-
-def formerly(name: str) -> dict[str, object]:
-    """Returns metadata of a field whose key in files of earlier versions is `name`, see `with_current_keys`."""
-    return {FORMERLY: name}
-
-
-def with_current_keys(schema: Any, content: Any, where: str) -> Any:
-    """Returns the content of a file with the keys of earlier versions renamed, see `formerly`.
-
-    Args:
-        schema: Dataclass that the content is read into.
-        content: Unchecked content of the file. It is not modified.
-        where: Name of the file, for the warning.
-
-    Warns:
-        FutureWarning: Once per renamed key, with its new name.
-    """
-    origin, arguments = get_origin(schema), get_args(schema)
-    if origin in (Union, types.UnionType):
-        (inner,) = (argument for argument in arguments if argument is not types.NoneType)
-        return with_current_keys(inner, content, where)
-    if origin is list and isinstance(content, list):
-        return [with_current_keys(arguments[0], entry, where) for entry in content]
-    if not (dataclasses.is_dataclass(schema) and isinstance(content, dict)):
-        return content
-    hints = get_type_hints(schema)
-    names = {entry.metadata[FORMERLY]: entry.name for entry in dataclasses.fields(schema) if FORMERLY in entry.metadata}
-    current = {}
-    for key, value in content.items():
-        name = names.get(key, key)
-        if name != key and name not in content:
-            warnings.warn(f'{where}: key "{key}" was renamed to "{name}"', FutureWarning, stacklevel=2)
-        else:
-            name = key
-        current[name] = with_current_keys(hints[name], value, where) if name in hints else value
-    return current
 
 
 def number_fault(instance: object) -> str:

@@ -11,7 +11,7 @@ import yaml
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import read_text_input
-from dvrk_drake.models.schema_fault import schema_fault, with_current_keys
+from dvrk_drake.models.schema_fault import schema_fault
 
 Schema = TypeVar("Schema")
 
@@ -57,13 +57,12 @@ def typed_content(schema: type[Schema], content: Any, where: str, error: type[Dv
     """Converts parsed content as `load_typed_yaml` does; `where` names the source of the content."""
     if (expected := FileFormat.of(schema)) is not None and isinstance(content, dict) and "format" in content:
         try:
-            expected.major_of(content["format"])
+            expected.check(content["format"])
         except ValueError as cause:
             raise error(f"{where}: {cause}") from cause
     fixed = getattr(schema, "format", None)
     if fixed and isinstance(content, dict) and content.get("format", fixed) != fixed:
         raise error(f'{where}: format is "{content["format"]}"; allowed: "{fixed}"')
-    content = with_current_keys(schema, content, where)
     if fault := schema_fault(schema, content, what):
         raise error(f"{where}: {fault}")
     try:

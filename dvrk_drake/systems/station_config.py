@@ -23,7 +23,7 @@ from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.schema_fault import formerly, number_fault, schema_fault, with_current_keys, within
+from dvrk_drake.models.schema_fault import number_fault, schema_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, plant_config_fault
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
@@ -50,7 +50,7 @@ class ArmConfig:
     gravity: list[float] | None = field(default=None, metadata=GRAVITIES)
     effects: list[DriveEffect] = field(default_factory=list)
     stretch: dict[str, Cable] = field(default_factory=dict)
-    simulated_effects: list[str] = field(default_factory=list, metadata=formerly("real_arm"))
+    simulated_effects: list[str] = field(default_factory=list)
     seed: int = field(default=0, metadata=within(0, 2**63 - 1))
 
     @cached_property
@@ -134,7 +134,7 @@ def load_station_config(path: str | Path) -> StationConfig:
         StationError: The file cannot be read, or has an unknown key or a value that is not allowed.
         ArmError: The arm cannot be loaded.
     """
-    content = with_current_keys(StationConfig, load_yaml(path, StationError), str(path))
+    content = load_yaml(path, StationError)
     for key, schema in (("driver", DvrkDriver), ("ros_driver", CrtkDriver)):
         section = content.get(key) if isinstance(content, dict) else None
         # Drake's messages name neither the section nor the accepted values.

@@ -1,4 +1,4 @@
-"""Versions of files: older ones are read, newer ones and other files are refused with one line."""
+"""Versions of files: other major versions, newer ones and other files are refused with one line."""
 
 import pytest
 
@@ -8,20 +8,20 @@ from dvrk_drake.models.arm_schema import ArmDescription
 from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.plant import MODELS_FOLDER
 
-FORMAT = FileFormat("dvrk_drake thing", 3, 2, oldest=2)
+FORMAT = FileFormat("dvrk_drake thing", 3, 2)
 
 
-@pytest.mark.parametrize(("version", "major"), [("3.2", 3), ("3.1", 3), ("3", 3), ("2", 2), ("2.7", 2)])
-def test_same_and_older_versions_are_accepted(version, major):
-    assert FORMAT.major_of(f"dvrk_drake thing {version}") == major
+def test_same_and_older_minor_versions_are_accepted():
+    for version in ("3.2", "3.1", "3"):
+        FORMAT.check(f"dvrk_drake thing {version}")
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("dvrk_drake thing 3.3", 'allowed: "dvrk_drake thing 3.2" and older, from 2.0 on. Install a newer version of'),
+        ("dvrk_drake thing 3.3", 'allowed: "dvrk_drake thing 3.0" to "dvrk_drake thing 3.2". Install a newer'),
         ("dvrk_drake thing 4.0", "Install a newer version of dvrk_drake"),
-        ("dvrk_drake thing 1.9", "Older files cannot be converted"),
+        ("dvrk_drake thing 2.9", "Older files cannot be converted"),
         ("dvrk_drake arm 3.2", "format is 'dvrk_drake arm 3.2'; allowed: "),
         ("dvrk_drake thing", "allowed"),
         ("dvrk_drake thing 3.x", "allowed"),
@@ -32,7 +32,7 @@ def test_same_and_older_versions_are_accepted(version, major):
 )
 def test_other_formats_are_refused(text, message):
     with pytest.raises(ValueError, match=r"^format is ") as raised:
-        FORMAT.major_of(text)
+        FORMAT.check(text)
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -42,7 +42,7 @@ def test_arm_of_a_newer_version_is_refused_before_its_keys(tmp_path):
     path = tmp_path / "arm.yaml"
     path.write_text(text)
     assert load_arm(path).name == "PSM"
-    # Files of version 0.1 have no format.
+    # The format may be omitted.
     path.write_text("\n".join(line for line in text.splitlines() if not line.startswith("format:")))
     assert load_arm(path).name == "PSM"
     path.write_text(text.replace("arm 1.0", "arm 2.0") + "\nnew_key: 1\n")

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 import pytest
 from pydrake.common.yaml import yaml_load_typed
 
-from dvrk_drake.errors import ArmError, ScenarioError
-from dvrk_drake.experiments.scenario import load_scenario
+from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.schema_fault import schema_fault
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
@@ -150,26 +149,3 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     ):
         with pytest.raises(ArmError, match=f"{where}:? {message}"):
             load_typed_yaml(Outer, where, ArmError, "a test")
-
-
-def test_keys_of_earlier_versions_are_read_with_a_warning(tmp_path):
-    (tmp_path / "scenario.yaml").write_text(
-        "arm: mtml\nreal_arm: [stops]\ncontroller: {mode: gravity, knows: [cables]}\n"  # an earlier key
-        "effects: [{coordinate: joint.wrist_pitch, kind: offset, value: 0.1}]\n"
-    )
-    with pytest.warns(FutureWarning) as warned:
-        scenario = load_scenario(str(tmp_path / "scenario.yaml"), [])
-    assert scenario.simulated_effects == ["stops"]
-    assert scenario.controller.compensated_effects == ["cables"]
-    assert scenario.effects[0].coefficient == 0.1
-    assert [str(warning.message).partition(": ")[2] for warning in warned] == [
-        'key "real_arm" was renamed to "simulated_effects"',
-        'key "knows" was renamed to "compensated_effects"',  # an earlier key
-        'key "value" was renamed to "coefficient"',
-    ]
-
-
-def test_earlier_and_new_key_together_are_refused(tmp_path):
-    (tmp_path / "scenario.yaml").write_text("arm: mtml\nreal_arm: [stops]\nsimulated_effects: [stops]\n")
-    with pytest.raises(ScenarioError, match='key "real_arm" is unknown'):
-        load_scenario(str(tmp_path / "scenario.yaml"), [])

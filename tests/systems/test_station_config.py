@@ -150,9 +150,3 @@ def test_documentation_example_runs(monkeypatch):
 def test_missing_file_is_reported(tmp_path):
     with pytest.raises(StationError, match=r"nowhere\.yaml: "):
         load_station_config(tmp_path / "nowhere.yaml")
-
-
-def test_a_key_of_an_earlier_version_is_read_with_a_warning(path):
-    path.write_text(path.read_text().replace("simulated_effects:", "real_arm:"))
-    with pytest.warns(FutureWarning, match='station.yaml: key "real_arm" was renamed to "simulated_effects"'):
-        assert load_station_config(path).simulated_effects == ["friction"]

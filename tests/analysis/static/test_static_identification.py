@@ -243,8 +243,8 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
         (
-            text.replace(str(FORMAT), "dvrk_drake identified model 1").replace("\neffects:", "\njoint_effects:"),
-            f'model 1"; allowed: "{FORMAT}" and older, from 2.0 on. Older files cannot be',
+            text.replace(str(FORMAT), "dvrk_drake identified model 0").replace("\neffects:", "\njoint_effects:"),
+            f'model 0"; allowed: "{FORMAT}". Older files cannot be',
         ),
         (
             text.replace("feedforward_scale: 1.0", "feedforward_scale: 2.0"),
@@ -259,7 +259,7 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             IdentifiedModel.load(tmp_path / "bad.yaml")
 
 
-def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
+def test_moved_model_files_are_loaded(tmp_path):
     (tmp_path / "arms").mkdir()
     shutil.copy(MODELS_FOLDER / "arms" / "mtmr.yaml", tmp_path / "arms" / "own.yaml")
     IdentifiedModel.from_arm(load_arm(str(tmp_path / "arms" / "own.yaml"))).save(tmp_path / "model.yaml")
@@ -275,11 +275,8 @@ def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
     model.save(tmp_path / "new.yaml")
     new = (tmp_path / "new.yaml").read_text()
     for name in ("mtmr", f"{moved}/own.yaml"):
-        old = new.replace("model 4", "model 2").replace("package://dvrk_drake/arms/mtmr.yaml", name)
-        old = old.replace("coefficient:", "value:").replace("feedforward_scale:", "trust:")  # an earlier key
-        (tmp_path / "old.yaml").write_text(old.replace("_included:", "_undoubted:"))
-        with pytest.warns(FutureWarning, match='key "trust" was renamed to "feedforward_scale"'):  # an earlier key
-            read = IdentifiedModel.load(tmp_path / "old.yaml")
+        (tmp_path / "own.yaml").write_text(new.replace("package://dvrk_drake/arms/mtmr.yaml", name))
+        read = IdentifiedModel.load(tmp_path / "own.yaml")
         assert (read.arm, read.effects) == (load_arm(name), effects)
     with pytest.raises(ModelError, match=r"new\.yaml: the model is for MTMR, not for PSM"):
         IdentifiedModel.load(tmp_path / "new.yaml", load_arm("psm"))
