@@ -58,7 +58,7 @@ class ExcitationDesign:
             efforts, see `MotionInformation.expected_error`.
         known_parameters: Number of base parameters with a standard error of at most 10 %.
         num_parameters: Number of base parameters.
-        log_determinant: See `MotionInformation.log_determinant` (D-optimality).
+        log_determinant: See `ExpectedError.log_determinant` (D-optimality).
         condition_number: See `MotionInformation.condition_number`.
         random_error: Smallest expected error of the random motions from which the optimisation started.
     """
@@ -162,12 +162,13 @@ def design_excitation(
     share(1.0)
     information = MotionInformation(arm, limits, model)
     state = state_of(motion, INFORMATION_TIMES * harmonics)
+    criterion, matrix = information.criterion, information.matrix(state, period)
     return ExcitationDesign(
         motion=motion,
-        expected_error=information.expected_error(state, period),
-        known_parameters=information.known_parameters(state, period),
+        expected_error=criterion.after(matrix),
+        known_parameters=criterion.known_parameters(matrix),
         num_parameters=information.num_base,
-        log_determinant=information.log_determinant(state, period),
+        log_determinant=criterion.log_determinant(matrix),
         condition_number=information.condition_number(state),
         random_error=min(result[2] for result in results),
     )
@@ -237,7 +238,7 @@ class _Problem:
             state = states_at(values, unit[:, None] * number.reshape(n, size))
             if not is_gradient:
                 return float(np.log(information.expected_error(state, self.period)))
-            value, by_state = information.expected_error_gradient(state, self.period)
+            value, by_state = information.log_error_gradient(state, self.period)
             gradient = np.einsum("kmj,kmb->jb", by_state, values) * unit[:, None]
             return InitializeAutoDiff([value], gradient.reshape(1, -1) @ ExtractGradient(variables))[0, 0]
 

@@ -33,6 +33,48 @@ _STEP = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
+class ExpectedError:
+    """Expected error of the efforts that a linear model predicts after a measurement (V-optimality).
+
+    The `information` of a measurement is the sum (k, k) of x x' / sigma^2 over its independent efforts, with the
+    regressor rows x (k,) and the standard deviation sigma of each effort.
+
+    Attributes:
+        prior: Precision (k, k) of the unknowns before the measurement.
+        target: Mean (k, k) of x x' / s^2 over the efforts to predict, with their regressor rows x and RMS values s.
+        base_values: Expected values (b,) of the base parameters, which are the first unknowns.
+    """
+
+    prior: NDArray[np.float64]
+    target: NDArray[np.float64]
+    base_values: NDArray[np.float64]
+
+    def covariance(self, information: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the covariance (k, k) of the unknowns after a measurement."""
+        H = self.prior + information
+        unit = 1 / np.sqrt(np.diag(H))
+        factor = scipy.linalg.cho_factor(H * np.outer(unit, unit), lower=True)
+        return np.asarray(scipy.linalg.cho_solve(factor, np.diag(unit)) * unit[:, None])
+
+    def after(self, information: NDArray[np.float64]) -> float:
+        """Returns the expected RMS error of the efforts to predict, relative to their RMS values [1].
+
+        Errors that a larger number of unknowns would explain are not included.
+        """
+        return float(np.sqrt(np.sum(self.target * self.covariance(information))))
+
+    def known_parameters(self, information: NDArray[np.float64], share: float = 0.1) -> int:
+        """Returns the number of base parameters whose standard error is at most a share of their absolute value."""
+        errors = np.sqrt(np.diag(self.covariance(information))[: len(self.base_values)])
+        return int(np.sum(errors <= share * np.abs(self.base_values)))
+
+    def log_determinant(self, information: NDArray[np.float64]) -> float:
+        """Returns the gain in log-determinant of the precision over the prior, divided by the number of unknowns."""
+        gain = np.linalg.slogdet(self.prior + information)[1] - np.linalg.slogdet(self.prior)[1]
+        return float(gain) / len(self.prior)
+
+
+@dataclass(frozen=True, eq=False)
 class MotionInformation:
     """Linear model of the efforts of an arm, with the priors of `identify`.
 
@@ -131,13 +173,13 @@ class MotionInformation:
         return columns
 
     @cached_property
-    def prior(self) -> NDArray[np.float64]:
+    def _prior(self) -> NDArray[np.float64]:
         """Precision (k, k) of the unknowns before the motion: of the prior of `identify`, and of `model`."""
         scaled = self._base.base * rigid_deviations(self._regressor, self._base.base.shape[1])
         num_friction = 1 + len(COULOMB_WIDTHS) + len(self._travels)
         of_actuator = [*[EFFECT_KINDS["coulomb"].prior_share] * num_friction, KNOWN_SHARE]
         effects = np.diag(np.tile(of_actuator, self.arm.num_joints) ** -2.0)
-        return np.asarray(scipy.linalg.block_diag(_inverse(scaled @ scaled.T) + self._earlier, effects))
+        return np.asarray(scipy.linalg.block_diag(np.linalg.inv(scaled @ scaled.T) + self._earlier, effects))
 
     @property
     def _earlier(self) -> NDArray[np.float64]:
@@ -157,38 +199,39 @@ class MotionInformation:
         return earlier
 
     @cached_property
-    def _target(self) -> NDArray[np.float64]:
-        """Mean (k, k) of x x' / (n s^2) over the states and the actuators, for columns x and RMS efforts s."""
-        total = np.zeros_like(self.prior)
+    def criterion(self) -> ExpectedError:
+        """Expected error of the efforts in `states`."""
+        target = np.zeros_like(self._prior)
         for (own, X), size in zip(self.columns(self.states), self.effort, strict=True):
-            total[own[:, None], own] += X.T @ X / (len(X) * size**2 * len(self.effort))
-        return total
+            target[own[:, None], own] += X.T @ X / (len(X) * size**2 * len(self.effort))
+        values = self._base.base @ self.predicted.parameters[: self._base.base.shape[1]]
+        return ExpectedError(self._prior, target, values)
 
     def weight(self, period: float, rows: int) -> float:
         """Returns the number of independent measurements per row, for rows that are evenly spread over a period [s]."""
         return period / (CORRELATION_TIME * rows * EFFORT_ERROR**2)
 
-    def precision(self, state: NDArray[np.float64], period: float) -> NDArray[np.float64]:
-        """Returns the precision (k, k) of the unknowns after a motion with states (3, m, n) and a period [s]."""
-        H, weight = self.prior.copy(), self.weight(period, state.shape[1])
+    def matrix(self, state: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+        """Returns the information (k, k) of a motion with states (3, m, n) and a period [s], see `ExpectedError`."""
+        H, weight = np.zeros_like(self._prior), self.weight(period, state.shape[1])
         for (own, X), size in zip(self.columns(state), self.rms_effort(state), strict=True):
             H[own[:, None], own] += weight / size**2 * (X.T @ X)
         return H
 
     def expected_error(self, state: NDArray[np.float64], period: float) -> float:
-        """Returns the expected RMS error of predicted efforts in `states`, relative to the RMS efforts [1].
+        """Returns the expected RMS error of efforts in `states`, relative to the RMS efforts [1], see `matrix`."""
+        return self.criterion.after(self.matrix(state, period))
 
-        Errors that a larger number of parameters would explain are not included. The square is the criterion of
-        V-optimality.
-        """
-        return float(np.sqrt(np.sum(self._target * _inverse(self.precision(state, period)))))
+    def known_parameters(self, state: NDArray[np.float64], period: float) -> int:
+        """Returns the number of base parameters with a standard error of at most 10 %, see `matrix`."""
+        return self.criterion.known_parameters(self.matrix(state, period))
 
-    def expected_error_gradient(self, state: NDArray[np.float64], period: float) -> tuple[float, NDArray[np.float64]]:
-        """Returns the logarithm of the `expected_error` and its derivatives (3, m, n) with respect to the states."""
-        C = _inverse(self.precision(state, period))
-        square = float(np.sum(self._target * C))
+    def log_error_gradient(self, state: NDArray[np.float64], period: float) -> tuple[float, NDArray[np.float64]]:
+        """Returns the logarithm of the expected error and its derivatives (3, m, n) with respect to the states."""
+        C, target = self.criterion.covariance(self.matrix(state, period)), self.criterion.target
+        square = float(np.sum(target * C))
         weight = self.weight(period, state.shape[1])
-        D = -weight / square * (C @ self._target @ C)
+        D = -weight / square * (C @ target @ C)
         tau = self._efforts(state)
         squares = self._mean_squares(tau)
         # Derivatives of log(error) with respect to the columns X of an actuator (X D / s^2), and to the efforts, on
@@ -209,13 +252,6 @@ class MotionInformation:
                 gradient[k, :, j] = change / step
         return 0.5 * float(np.log(square)), gradient
 
-    def known_parameters(self, state: NDArray[np.float64], period: float, share: float = 0.1) -> int:
-        """Returns the number of base parameters whose standard error is at most a share of their absolute value."""
-        C = _inverse(self.precision(state, period))
-        values = self._base.base @ self.predicted.parameters[: self._base.base.shape[1]]
-        b = self.num_base
-        return int(np.sum(np.sqrt(np.diag(C)[:b]) <= share * np.abs(values)))
-
     def condition_number(self, state: NDArray[np.float64]) -> float:
         """Returns the condition number of the base parameters' columns, divided by the efforts and column norms."""
         H = np.zeros((self.num_base, self.num_base))
@@ -227,11 +263,6 @@ class MotionInformation:
             return float("inf")
         values = np.linalg.eigvalsh(H / np.outer(norms, norms))
         return float(np.sqrt(values[-1] / max(values[0], np.finfo(float).tiny)))
-
-    def log_determinant(self, state: NDArray[np.float64], period: float) -> float:
-        """Returns the gain in log-determinant of the precision over the prior, divided by the number of unknowns."""
-        ratio = np.linalg.slogdet(self.precision(state, period))[1] - np.linalg.slogdet(self.prior)[1]
-        return float(ratio) / len(self.prior)
 
 
 def _presliding(v: NDArray[np.float64], vd: NDArray[np.float64], travels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -247,9 +278,3 @@ def _presliding(v: NDArray[np.float64], vd: NDArray[np.float64], travels: NDArra
     sign = np.where(v < 0, -1.0, 1.0)
     x = vd * sign - v**2 / (4 * travels)
     return np.asarray(sign * (1 - (x + np.hypot(x, SMOOTHED_ACCELERATION)) / np.hypot(vd, SMOOTHED_ACCELERATION)))
-
-
-def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
-    unit = 1 / np.sqrt(np.diag(H))
-    factor = scipy.linalg.cho_factor(H * np.outer(unit, unit), lower=True)
-    return np.asarray(scipy.linalg.cho_solve(factor, np.diag(unit)) * unit[:, None])

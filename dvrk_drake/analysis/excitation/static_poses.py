@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector
+from dvrk_drake.analysis.excitation.information import ExpectedError
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import middle_pose
@@ -160,6 +161,10 @@ def design_poses(
     )
 
 
+#: Indices of poses in a pool.
+Indices = list[int] | NDArray[np.int_]
+
+
 @dataclass(frozen=True, eq=False)
 class PoseInformation:
     """Linear model of the holding efforts of an arm, with the priors of `identify` for static poses.
@@ -219,32 +224,35 @@ class PoseInformation:
         )
 
     @cached_property
-    def _target(self) -> NDArray[np.float64]:
-        """Mean (p, p) of x x' / (n s^2) over the random poses and the joints, for rows x and RMS efforts s."""
+    def _criterion(self) -> ExpectedError:
+        """Expected error of the holding efforts at random poses of the workspace."""
         X = _without_efforts(self.arm, self._targets).regressor(self._effects)
         X = (X * self._deviations / self.effort[:, None]).reshape(-1, len(self._deviations))
-        return np.asarray(X.T @ X / len(X))
+        values = self._problem.base_model.gravity.base_values / self._deviations[: self.num_base]
+        return ExpectedError(np.eye(X.shape[1]), X.T @ X / len(X), values)
 
-    def covariance(self, chosen: list[int] | NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns the covariance (p, p) of the scaled unknowns after the measurement of some poses of the pool."""
+    def _information(self, chosen: Indices) -> NDArray[np.float64]:
+        """Returns the information (p, p) of some poses of the pool, see `ExpectedError`."""
         X = self.columns[chosen].reshape(-1, len(self._deviations))
-        return np.asarray(np.linalg.inv(X.T @ X + np.eye(X.shape[1])))
+        return np.asarray(X.T @ X)
 
-    def expected_error(self, chosen: list[int] | NDArray[np.int_]) -> float:
+    def covariance(self, chosen: Indices) -> NDArray[np.float64]:
+        """Returns the covariance (p, p) of the scaled unknowns after the measurement of some poses of the pool."""
+        return self._criterion.covariance(self._information(chosen))
+
+    def expected_error(self, chosen: Indices) -> float:
         """Returns the expected RMS error of predicted holding efforts, relative to the RMS holding efforts [1].
 
-        The square is the mean over the joints and over random poses of the workspace (V-optimality).
+        The square is the mean over the joints and over random poses of the workspace.
 
         Args:
             chosen: Indices of the measured poses in the pool.
         """
-        return float(np.sqrt(np.sum(self._target * self.covariance(chosen))))
+        return self._criterion.after(self._information(chosen))
 
-    def known_parameters(self, chosen: list[int] | NDArray[np.int_], share: float = 0.1) -> int:
-        """Returns the number of base parameters whose standard error is at most a share of their absolute value."""
-        b = self.num_base
-        error = self._deviations[:b] * np.sqrt(np.diag(self.covariance(chosen))[:b])
-        return int(np.sum(error <= share * np.abs(self._problem.base_model.gravity.base_values)))
+    def known_parameters(self, chosen: Indices) -> int:
+        """Returns the number of base parameters whose standard error is at most 10 % of their absolute value."""
+        return self._criterion.known_parameters(self._information(chosen))
 
     def reductions(self, C: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the reduction (k,) of the squared expected error by the measurement of each pose of the pool.
@@ -257,7 +265,7 @@ class PoseInformation:
         X = self.columns
         XC = (X.reshape(-1, len(C)) @ C).reshape(X.shape)
         inner = np.eye(X.shape[1]) + XC @ X.transpose(0, 2, 1)
-        outer = (XC.reshape(-1, len(C)) @ self._target).reshape(X.shape) @ XC.transpose(0, 2, 1)
+        outer = (XC.reshape(-1, len(C)) @ self._criterion.target).reshape(X.shape) @ XC.transpose(0, 2, 1)
         return np.asarray(np.trace(np.linalg.solve(inner, outer), axis1=1, axis2=2))
 
     def select(self, count: int, usable: NDArray[np.bool_], start: list[int] | None = None) -> list[int]:

@@ -51,7 +51,7 @@ def test_expected_error_is_that_of_simulated_estimates(information):
     generator, chosen = np.random.default_rng(0), np.arange(15)
     X = information.columns[chosen].reshape(-1, information.columns.shape[2])
     C = information.covariance(chosen)
-    target = np.linalg.cholesky(information._target + 1e-12 * np.eye(len(C)))
+    target = np.linalg.cholesky(information._criterion.target + 1e-12 * np.eye(len(C)))
     squares = []
     for _ in range(2000):
         x = generator.normal(size=len(C))
