@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
-from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
 from dvrk_drake.analysis.estimation.robust_fit import blocks
 from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
@@ -171,8 +171,8 @@ def _estimator(candidates: list[_Candidate], residual: NDArray[np.float64], usab
     return Estimator(
         NormalEquations.of(columns, len(candidates), tau, fold),
         Prior(np.zeros(len(candidates)), precision, is_friction),
-        np.array([np.sum(tau[fold == f] ** 2, axis=0) for f in range(fold[-1] + 1)]),
-        np.array([np.sum(usable[fold == f], axis=0) for f in range(fold[-1] + 1)], dtype=float),
+        fold_sums(tau**2, fold),
+        fold_sums(usable, fold),
     )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
-from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
 from dvrk_drake.analysis.observations.drive_efforts import (
     FrictionPart,
     drive_efforts,
@@ -249,12 +249,12 @@ class _Fit:
             own = np.flatnonzero(self._loads[:, i])
             columns.append((np.append(own, k + i), np.column_stack([self.friction[:, i, own], np.ones(len(self.tau))])))
         # Rows within the correlation time are not independent.
-        independent = np.bincount(self._fold) / (self.rate * _CORRELATION_TIME)
+        independent = np.full(self.tau.shape, 1 / (self.rate * _CORRELATION_TIME))
         self._estimator = Estimator(
             NormalEquations.of(columns, k + n, self.tau - self.other, self._fold, self._edge),
             Prior(self.unchanged, self._deviation**-2.0, np.arange(k + n) < k),
-            np.array([np.sum(self.tau[self._fold == fold] ** 2, axis=0) for fold in range(folds)]),
-            np.outer(independent, np.ones(n)),
+            fold_sums(self.tau**2, self._fold),
+            fold_sums(independent, self._fold),
         )
 
     def error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -305,7 +305,7 @@ class _Fit:
         H, P = self._estimator.information(), np.diag(self._deviation**-2.0)
         block, weighted = self._blocks(), self._estimator.weights[0] * held_out
         scores = np.hstack([np.einsum("rik,ri->rk", self.friction, weighted), weighted])
-        of_blocks = np.array([np.sum(scores[block == b], axis=0) for b in range(block[-1] + 1)])
+        of_blocks = fold_sums(scores, block)
         A = np.linalg.inv(H[np.ix_(~fixed, ~fixed)])
         middle = (of_blocks.T @ of_blocks + P)[np.ix_(~fixed, ~fixed)]
         errors = np.zeros(k + len(self.names))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, Prior
-from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns, fold_sums
 from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
 from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
@@ -159,14 +159,13 @@ class DynamicProblem:
         )
         dissipative = [effect.dissipative for effect in self.columns.effects]
         non_negative = np.array([False] * num_rigid + dissipative + [False] * tilts)
-        num_folds = int(fold.max()) + 1
         return StepwiseSelection(
             equations=NormalEquations.of(
                 columns, num_rigid + self.num_effects + tilts, residual, fold, edge, self.recording
             ),
             prior=Prior(np.zeros(len(precision)), precision, non_negative),
-            efforts=np.array([np.sum(self.columns.tau[fold == f] ** 2, axis=0) for f in range(num_folds)]),
-            independent=np.outer(np.bincount(fold) * self.independent / self.num_rows, np.ones(len(self.efforts))),
+            efforts=fold_sums(self.columns.tau**2, fold),
+            independent=fold_sums(np.full(residual.shape, self.independent / self.num_rows), fold),
             num_rigid=num_rigid,
         )
 

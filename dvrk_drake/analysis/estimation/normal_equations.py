@@ -18,6 +18,11 @@ MAX_EXCHANGES = 10
 OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
 
 
+def fold_sums(values: NDArray, fold: NDArray[np.int_]) -> NDArray[np.float64]:
+    """Returns the sums (folds, n) of the rows of each fold, for values (r, n) and the fold (r,) of each row."""
+    return np.array([np.sum(values[fold == k], axis=0) for k in range(int(fold.max()) + 1)], dtype=float)
+
+
 @dataclass(frozen=True, eq=False)
 class SquareSums:
     """Products [X tau]'[X tau] of every actuator, summed over a set of rows of each recording.
