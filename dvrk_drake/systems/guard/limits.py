@@ -111,7 +111,7 @@ class GuardLimits:
         self.fault_effort = settings.fault_effort * self.effort_limits
         checks = settings.plausibility
         self.start_gravity = checks.start_gravity * self.effort_limits + arm.dry_friction()
-        self.start_gravity += arm.per_joint(checks.hand_effort, 10 * checks.hand_effort)
+        self.start_gravity += checks.hand_efforts(arm)
         self._look_ahead = self.kd / self.kp
         self._free = 0.5 * width - self.wall_width
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)

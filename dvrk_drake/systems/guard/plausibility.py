@@ -167,8 +167,8 @@ class Response:
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm, model: ArmModel) -> None:
         """Creates the check for the joints of `arm` with the model of that arm."""
-        hand_effort = arm.per_joint(settings.hand_effort, 10 * settings.hand_effort)
-        self._allowed, self._time = settings.response * arm.effort_limits + hand_effort, settings.response_time
+        self._allowed = settings.response * arm.effort_limits + settings.hand_efforts(arm)
+        self._time = settings.response_time
         self._memory, self._model = settings.response_memory, model
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, Vector, NDArray[np.float64], float]:

@@ -7,7 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dvrk_drake.errors import StationError
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.schema_fault import number_fault, within
 
 #: Settings that protect an arm less if they are smaller. All other settings protect it less if they are larger.
@@ -81,6 +85,11 @@ class PlausibilitySettings:
     silent_time: float = field(default=0.02, metadata=within(0.002, 1.0, "s"))
     detection_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))
     bad_samples: int = field(default=20, metadata=within(0, 100))
+
+    def hand_efforts(self, arm: Arm) -> NDArray[np.float64]:
+        """Returns `hand_effort` for each joint (n,) of an arm [N m, N]."""
+        # On a prismatic joint: the force that has this moment at a lever of 0.1 m.
+        return arm.per_joint(self.hand_effort, 10 * self.hand_effort)
 
 
 @dataclass

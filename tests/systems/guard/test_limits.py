@@ -370,6 +370,13 @@ def test_effort_start_requires_gravity_effort(joint, side):
         assert LIMITS.refusal_to_start(command, Q, measured, gravity) == code
 
 
+def test_hand_effort_on_a_prismatic_joint_is_a_force_at_a_tenth_of_a_metre():
+    arm = load_arm("psm")
+    efforts = GuardSettings().plausibility.hand_efforts(arm)
+    np.testing.assert_allclose(efforts * np.where(arm.prismatic, 0.1, 1.0), 0.06, atol=1e-12)
+    assert np.count_nonzero(arm.prismatic) == 1
+
+
 def test_dry_friction_comes_from_arm_file():
     friction = ARM.dry_friction()
     assert friction[0] == pytest.approx(0.061 + 0.034, abs=1e-12)

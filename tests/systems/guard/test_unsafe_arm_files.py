@@ -1,14 +1,18 @@
 """Comparison of arm files with the arm of this package that has the same name."""
 
+import dataclasses
+import re
+
 import pytest
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm_files import known_arms, load_arm
+from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, local_path
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.unsafe_arm import unsafe_difference
 
-KNOWN = load_arm("mtml")
+PSM = load_arm("psm")
 ARM = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text()
 MECHANISM = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
 SDF = local_path("package://dvrk_drake/sdf/mtm.sdf")
@@ -54,6 +58,10 @@ DANGERS = {
         [(YAW, "wrist_yaw: [-7.85398, 7.85398]")],
         "the position limits of wrist_yaw are -7.854..7.854; allowed: inside -1.178..1.178, ",
     ),
+    "wide upper limit": (
+        [(YAW, "wrist_yaw: [-0.785398, 7.85398]")],
+        "the position limits of wrist_yaw are -0.7854..7.854; allowed: inside -1.178..1.178, ",
+    ),
     "deleted coupled limit": (
         [(PARALLELOGRAM, "")],
         "the coupled limit parallelogram is missing; allowed: inside -0.5825..0.9325, ",
@@ -65,7 +73,7 @@ DANGERS = {
 def test_dangerous_arm_file_is_refused_by_the_guard(danger, tmp_path):
     changes, message = DANGERS[danger]
     message += HINT
-    changes = {"arm" if danger == "wide limits" else "mechanism": changes}
+    changes = {"arm" if changes[0][0] == YAW else "mechanism": changes}
     arm = mtml(tmp_path, **changes)
     assert unsafe_difference(arm) == message
     with pytest.raises(StationError) as error:
@@ -97,6 +105,16 @@ MECHANICS = {
         ("{shoulder_pitch: 1.0, elbow_pitch: 1.0}\n    lower", "{shoulder_pitch: 0.1, elbow_pitch: 1.0}\n    lower"),
         "the coefficient of joint shoulder_pitch in the coupled limit parallelogram is 0.1; allowed: 1 +- 0.25, as for",
     ),
+    "missing coefficient": (
+        "mechanism",
+        ("{shoulder_pitch: 1.0, elbow_pitch: 1.0}\n    lower", "{elbow_pitch: 1.0}\n    lower"),
+        "the coefficient of joint shoulder_pitch in the coupled limit parallelogram is 0; allowed: 1 +- 0.25, as for",
+    ),
+    "additional coefficient": (
+        "mechanism",
+        ("elbow_pitch: 1.0}\n    lower", "elbow_pitch: 1.0, outer_yaw: 0.3}\n    lower"),
+        "the coefficient of joint outer_yaw in the coupled limit parallelogram is 0.3; allowed: 0 +- 0.25, as for",
+    ),
     "inverted axis": ("sdf", ("<xyz>-1 0 0</xyz>", "<xyz>1 0 0</xyz>"), "link upper_arm_link is rotated by "),
     "linkage": ("sdf", ('joint="elbow_pitch" multiplier="1"', 'joint="elbow_pitch" multiplier="1.4"'), "link "),
     "gear ratio": ("sdf", (">63.41<", ">6341<"), "the inertia at outer_yaw is "),
@@ -115,8 +133,24 @@ def test_heavy_links_are_refused(tmp_path):
     begin = SDF.read_text().index('<link name="forearm_link"')
     start = SDF.read_text().index("<mass>", begin)
     text = SDF.read_text()[begin : start + 6]
-    difference = unsafe_difference(mtml(tmp_path, sdf=[(text, text + "1")]))
-    assert difference.startswith("the gravity effort of ") and "; allowed: up to " in difference
+    arm = mtml(tmp_path, sdf=[(text, text + "1")])
+    found = []
+    for mounted in (arm, arm.with_gravity((-arm.gravity).tolist())):
+        difference = unsafe_difference(mounted)
+        assert difference.startswith("the gravity effort of ") and "; allowed: up to " in difference
+        joint, value = re.match(r"the gravity effort of (\w+) differs by (\S+)", difference).groups()
+        found.append((joint, float(value)))
+    assert found[0] == (found[1][0], -found[1][1])
+
+
+def test_small_changes_of_a_negative_coefficient_are_accepted():
+    matrix = PSM.transmission.matrix.copy()
+    row = matrix[3]
+    assert row.max() <= 0 and row.min() < -0.6
+    for factor, differs in ((1.2, False), (1.3, True)):
+        matrix[3] = factor * row
+        changed = dataclasses.replace(PSM, transmission=LinearMap(matrix, PSM.transmission.offset))
+        assert bool(unsafe_difference(changed)) == differs
 
 
 @pytest.mark.parametrize("name", ["'MTML '", "MTML2", "mtml"])
