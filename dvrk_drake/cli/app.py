@@ -207,6 +207,15 @@ class FileOptions:
             "files without times contain static poses.",
         ),
     ] = None
+    effort_scale: Annotated[
+        list[str] | None,
+        Parameter(
+            metavar="FACTOR | NAME=FACTOR ..",
+            consume_multiple=True,
+            help="Factors of the recorded efforts, e.g. torque constant times gear ratio for currents: one for all "
+            "joints, or factors of some joints, e.g. elbow=11.8.",
+        ),
+    ] = None
     skip_invalid: Annotated[
         bool, Parameter(show_default=False, help="Omit rows with an empty cell, NaN or an infinite value.")
     ] = False
@@ -222,6 +231,7 @@ class FileOptions:
         return vars(self) | {
             "joints": _named("joints", self.joints, "yaw=outer_yaw"),
             "arrays": _named("arrays", self.arrays, "q=position; names: q, qd, tau, t, poses"),
+            "effort_scale": _factors(self.effort_scale),
         }
 
     def as_text(self) -> str:
@@ -234,16 +244,32 @@ class FileOptions:
         return "".join(f" {word}" for word in words)
 
 
+def _factors(texts: Sequence[str] | None) -> dict[str, float] | float | None:
+    """Returns the factor or the factors of --effort-scale."""
+    from dvrk_drake.errors import RecordingError
+
+    example = "elbow=11.8"
+    try:
+        if texts is not None and len(texts) == 1 and "=" not in texts[0]:
+            return float(texts[0])
+        named = _named("effort-scale", texts, example)
+        return None if named is None else {name: float(factor) for name, factor in named.items()}
+    except ValueError:
+        raise RecordingError(
+            f"--effort-scale {' '.join(texts or ())}: allowed: one number, or NAME=NUMBER, e.g. {example}"
+        ) from None
+
+
 def _named(option: str, texts: Sequence[str] | None, example: str) -> dict[str, str] | None:
-    """Returns the mapping of an option with arguments NAME=NAME_IN_FILE, or None without the option."""
+    """Returns the mapping of an option with arguments NAME=VALUE, or None without the option."""
     from dvrk_drake.errors import RecordingError
 
     if texts is None:
         return None
     pairs = [text.partition("=") for text in texts]
     if wrong := [text for text, (name, sign, value) in zip(texts, pairs, strict=True) if not (name and sign and value)]:
-        raise RecordingError(f"--{option} {wrong[0]}: allowed: NAME=NAME_IN_FILE, e.g. {example}")
+        raise RecordingError(f"--{option} {wrong[0]}: allowed: NAME=VALUE, e.g. {example}")
     names = [name for name, _, _ in pairs]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise RecordingError(f"--{option}: {twice[0]} is given twice; give one name in the file for each")
+        raise RecordingError(f"--{option}: {twice[0]} is given twice; give it once")
     return {name: value for name, _, value in pairs}

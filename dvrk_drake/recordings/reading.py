@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
+
+import numpy as np
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
@@ -72,6 +74,7 @@ def read_recording(
     joints: Mapping[str, str] | None = None,
     arrays: Mapping[str, str] | None = None,
     rate: float | None = None,
+    effort_scale: Mapping[str, float] | float | None = None,
     skip_invalid: bool = False,
     progress: Progress | None = None,
 ) -> Recording:
@@ -96,6 +99,8 @@ def read_recording(
         arrays: Mapping from "q", "qd", "tau" and "t" to the names of arrays, see `read_array_file`.
         rate: Sampling rate [Hz] of a motion in a file without times. Default: 200 Hz for a CSV with 21 columns and no
             header; all other files without times contain static poses.
+        effort_scale: Factor of the recorded efforts, e.g. torque constant times gear ratio for currents: one for all
+            joints, or a mapping from names of joints to factors. The efforts of other joints are not changed.
         skip_invalid: Whether to omit rows and messages that contain an empty cell, a NaN or an infinity, and to list
             them in `notes`. If False, a file with such rows is refused.
         progress: Callback that receives the name of the step ("reading") and the completed fraction (0 to 1).
@@ -136,7 +141,29 @@ def read_recording(
         progress=step_progress(progress, "reading"),
     )
     options.check_joints(path)
-    return file_format.read(path, options)
+    recording = file_format.read(path, options)
+    return recording if effort_scale is None else _scaled(recording, arm, effort_scale)
+
+
+def _scaled(recording: Recording, arm: Arm | None, scale: Mapping[str, float] | float) -> Recording:
+    """Returns the recording with scaled efforts, see `effort_scale` of `read_recording`."""
+    where = f"{recording.source}: --effort-scale"
+    if recording.tau is None:
+        raise RecordingError(f"{where} does not apply, because the file has no efforts")
+    if recording.file_coordinates == "wpi":
+        raise RecordingError(f"{where} does not apply to wpi coordinates, because the efforts are converted to joints")
+    factors, names = np.ones(recording.tau.shape[1]), arm.joint_names if arm else []
+    if not isinstance(scale, Mapping):
+        factors[:] = scale
+    elif unknown := [name for name in scale if name not in names]:
+        allowed = ", ".join(names) or "none without an arm"
+        raise RecordingError(f"{where}: unknown joint {unknown[0]}; allowed: {allowed}")
+    else:
+        factors[[names.index(name) for name in scale]] = list(scale.values())
+    if wrong := [factor for factor in factors if not np.isfinite(factor) or factor == 0]:
+        raise RecordingError(f"{where} is {wrong[0]:g}; allowed: finite numbers except 0")
+    note = f"efforts multiplied by ({', '.join(f'{factor:g}' for factor in factors)})"
+    return replace(recording, tau=recording.tau * factors, notes=(*recording.notes, note))
 
 
 def detect_format(path: Path) -> Format:

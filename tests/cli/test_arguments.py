@@ -8,7 +8,8 @@ import pytest
 from command_output import refusal
 
 from dvrk_drake.cli import main
-from dvrk_drake.cli.app import app
+from dvrk_drake.cli.app import FileOptions, app
+from dvrk_drake.errors import RecordingError
 
 COMMANDS = [name for name in app if not name.startswith("-")]
 
@@ -143,3 +144,11 @@ def test_completion_is_installed(shell, tmp_path, monkeypatch, capsys):
 
 def test_transparency_rejects_a_folder_as_output(capsys):
     assert "figures are written to --plots" in refused(capsys, "transparency", "--arm", "mtml", "--output", "folder")
+
+
+def test_effort_scale_is_one_number_or_some_of_joints():
+    for texts, scale in ((["-2.5"], -2.5), (["yaw=2", "jaw=3"], {"yaw": 2.0, "jaw": 3.0}), (None, None)):
+        assert FileOptions(effort_scale=texts).as_arguments()["effort_scale"] == scale
+    for texts in (["x"], ["yaw=x"], ["yaw="], ["2", "3"]):
+        with pytest.raises(RecordingError, match=r"^--effort-scale .*: allowed: .*, e\.g\. elbow=11\.8$"):
+            FileOptions(effort_scale=texts).as_arguments()

@@ -68,6 +68,27 @@ def test_coordinates_are_those_of_the_user_or_the_default(tmp_path):
     assert read_recording(write_mat(tmp_path, a=team_array()), coordinates="actuator").coordinates == "actuator"
 
 
+def test_efforts_are_scaled(tmp_path):
+    arm, path = load_arm("psm"), tmp_path / "poses.csv"
+    write_recording(Recording(q=np.zeros((3, 7)), tau=np.ones((3, 7)), coordinates="actuator"), path)
+    recording = read_recording(path, arm, effort_scale=2.0)
+    np.testing.assert_allclose(recording.tau, 2.0, atol=1e-12)
+    assert recording.notes[-1] == "efforts multiplied by (2, 2, 2, 2, 2, 2, 2)"
+    some = read_recording(path, arm, effort_scale={"pitch": -3.0, "jaw": 0.5})
+    np.testing.assert_allclose(some.tau[0], [1, -3, 1, 1, 1, 1, 0.5], atol=1e-12)
+    for scale, message in (
+        ({"elbow": 2.0}, "--effort-scale: unknown joint elbow; allowed: yaw, pitch, "),
+        (0.0, "--effort-scale is 0; allowed: "),
+        ({"yaw": np.nan}, "--effort-scale is nan; allowed: "),
+    ):
+        assert_refused(message, read_recording, path, arm, effort_scale=scale)
+    assert_refused("unknown joint yaw; allowed: none without an arm", read_recording, path, effort_scale={"yaw": 1.0})
+    np.savetxt(tmp_path / "wpi.csv", np.random.default_rng(0).normal(size=(200, 21)), delimiter=",")
+    assert_refused("does not apply to wpi", read_recording, tmp_path / "wpi.csv", arm, effort_scale=2.0)
+    write_recording(Recording(q=np.zeros((3, 7))), path)
+    assert_refused("because the file has no efforts", read_recording, path, arm, effort_scale=2.0)
+
+
 def test_a_rate_gives_times_to_files_without_times_only(tmp_path):
     q = wpi_rows(3)[:, :7]
     path = tmp_path / "motion.csv"

@@ -119,8 +119,8 @@ def _scale_findings(arm: Arm, scale: float) -> Iterator[Finding]:
     if not 1 / MAX_SCALE < scale < MAX_SCALE:
         what = f"the efforts are about {scale:.2g} times the gravity efforts of the links in the model"
         advice = (
-            "Check the unit. Currents must be multiplied by the torque constant and the gear ratio of each joint, and "
-            "torques of motors by the gear ratio, or state the transmission in an arm file."
+            "Check the unit. Give --effort-scale: for currents the torque constant times the gear ratio of each joint, "
+            "for torques of motors the gear ratio."
         )
         yield Finding("warning", "effort scale", arm.name, what, advice, size=scale)
 

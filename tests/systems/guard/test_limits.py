@@ -370,7 +370,7 @@ def test_effort_start_requires_gravity_effort(joint, side):
         assert LIMITS.refusal_to_start(command, Q, measured, gravity) == code
 
 
-def test_hand_effort_on_a_prismatic_joint_is_a_force_at_a_tenth_of_a_metre():
+def test_hand_effort_on_a_prismatic_joint_is_a_force():
     arm = load_arm("psm")
     efforts = GuardSettings().plausibility.hand_efforts(arm)
     np.testing.assert_allclose(efforts * np.where(arm.prismatic, 0.1, 1.0), 0.06, atol=1e-12)
