@@ -267,26 +267,33 @@ def _with_numbers(where: str, header: list[str], options: FileOptions) -> list[s
     Upper case, spaces, dots and underscores make no difference, and the quantity may be the first word.
 
     Raises:
-        RecordingError: The position of a joint is missing.
+        RecordingError: A quantity of a joint is missing, or is in two columns.
     """
     if options.arm is None:
         return header
-    numbered = {}
-    positions = {}
+    numbered: dict[str, str] = {}
+    columns: dict[str, dict[str, str]] = {"q": {}, "qd": {}, "tau": {}}
     for joint, label in zip(options.arm.joint_names, options.joint_labels, strict=True):
         name = (options.joints or {}).get(joint, joint)
-        positions[f"q{label}"] = f"{name} position"
         for word, prefix in _QUANTITIES.items():
             numbered[_plain(f"{name} {word}")] = numbered[_plain(f"{word} {name}")] = f"{prefix}{label}"
+            columns[prefix].setdefault(f"{prefix}{label}", f"{name} {word}")
     found = [numbered.get(_plain(name), name) for name in header]
-    if found == header or not positions.keys().isdisjoint(header):
+    if found == header or not columns["q"].keys().isdisjoint(header):
         return header  # other columns of a file with q1, q2, ... are ignored
-    if missing := [name for column, name in positions.items() if column not in found]:
-        raise RecordingError(
-            f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; needs the position of each joint "
-            f"of {options.arm.name}; --joints states other names, and --locked joints that are not recorded"
-        )
-    return ["t" if _plain(name) in _TIME_NAMES else name for name in found]
+    found = ["t" if _plain(name) in _TIME_NAMES else name for name in found]
+    for column in ("t", *numbered.values()):
+        if len(same := [name for name, new in zip(header, found, strict=True) if new == column]) > 1:
+            raise RecordingError(f"{where}: columns {' and '.join(same[:2])} are the same quantity; remove one of them")
+    for prefix, names in columns.items():
+        missing = [name for column, name in names.items() if column not in found]
+        if missing and (prefix == "q" or len(missing) < len(names)):
+            quantity = missing[0].rpartition(" ")[2]
+            raise RecordingError(
+                f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; needs the {quantity} of each "
+                f"joint of {options.arm.name}; --joints states other names, and --locked joints that are not recorded"
+            )
+    return found
 
 
 def _plain(name: str) -> str:

@@ -204,6 +204,13 @@ def test_joint_of_a_named_column_is_mapped_or_missed(tmp_path):
     both = named_csv(tmp_path, [*(f"q{i}" for i in range(1, 8)), "yaw.pos"], np.arange(16.0).reshape(2, 8) / 100)
     assert read_recording(both, psm).q[0, 0] == 0.0  # other columns are ignored
     names[2] = "insertion position [mm]"
+    for more, message in (
+        (["roll velocity", "jaw.vel"], "missing columns yaw velocity, pitch velocity, .*; needs the velocity of each"),
+        (["time", "Timestamp"], "columns time and Timestamp are the same quantity; remove one"),
+        (["roll torque", "force roll"], "columns roll torque and force roll are the same quantity"),
+    ):
+        named_csv(tmp_path, [*names, *more], np.zeros((2, 9)))
+        assert_refused(message, read_recording, path, psm)
     named_csv(tmp_path, names, np.zeros((2, 7)))
     assert_refused("the unit of insertion position is mm; allowed: m", read_recording, path, psm)
 
