@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from functools import cache
 
-import numpy as np
 import sympy
 
 from dvrk_drake.dynamics.gravity_parameters import GravityParameters, gravity_parameters
@@ -32,11 +31,6 @@ class SymbolicGravity(GravityParameters):
     q: tuple[sympy.Symbol, ...]
     regressor: sympy.ImmutableDenseMatrix
     potential: sympy.ImmutableDenseMatrix
-
-    @property
-    def gravity_magnitude(self) -> float:
-        """Magnitude of the arm's gravity vector [m/s^2], the value of `GRAVITY`."""
-        return float(np.linalg.norm(self.arm.gravity))
 
 
 @cache

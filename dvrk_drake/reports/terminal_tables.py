@@ -13,8 +13,6 @@ from rich.table import Table
 from rich.text import Text
 
 TABLE_WIDTH = 80
-#: Width of tables in a file [characters]. The names of base parameters fit on one line.
-WIDTH_OF_FILES = 120
 #: Pattern for a space inside a unit in brackets or before a percent sign.
 _IN_UNIT = re.compile(r" (?=[^\[]*\]|%)")
 _NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"

@@ -109,7 +109,7 @@ class GravityPidController(LeafSystem):
         model.check()
         arm = model.arm
         arm.refuse_locked_joints("a controller")
-        self._arm, self._joint_names = arm, arm.joint_names
+        self._arm = arm
         n = arm.num_joints
         limits = np.asarray(arm.effort_limits if effort_limits is None else effort_limits, float)
         if limits.shape != (n,) or not np.all(limits > 0):

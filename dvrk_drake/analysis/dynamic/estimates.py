@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.signal
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import RecordingEffect
@@ -165,9 +166,7 @@ def parameter_covariance(
         weights = fit.weights[problem.recording[motion.rows.start]]
         for i, (weight, (own, X)) in enumerate(zip(weights, columns, strict=True)):
             covariance = error_covariance(residuals[rows, i], held_out[rows, i], motion.rate / step, motion.period)
-            middle[own[:, None], own] += (weight * step) ** 2 * (
-                X[rows].T @ scipy.linalg.matmul_toeplitz(covariance, X[rows])
-            )
+            middle[own[:, None], own] += (weight * step) ** 2 * (X[rows].T @ toeplitz_product(covariance, X[rows]))
     noise = to_base.T @ middle @ to_base
     factor = np.ones(len(A))
     factor[: problem.num_rigid] = np.sqrt(_deviation_scale(fit, problem.prior, A @ noise @ A))
@@ -263,6 +262,17 @@ def error_covariance(
             end = min(start + width + 1, len(covariance))
             covariance[start - width : end] += near_period[: end - start + width]
     return _nearest_covariance(covariance[:count])
+
+
+def toeplitz_product(covariance: NDArray[np.float64], X: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns C X (r, k) for the symmetric Toeplitz matrix C whose first row is `covariance` (r,), and X (r, k).
+
+    Lags with negligible covariance are omitted. In long motions, this is ten times as fast as
+    `scipy.linalg.matmul_toeplitz`, whose FFTs have twice the length of the motion.
+    """
+    last = int(np.max(np.flatnonzero(np.abs(covariance) > np.finfo(float).eps * covariance[0]), initial=0))
+    kernel = np.concatenate([covariance[last:0:-1], covariance[: last + 1]])
+    return np.asarray(scipy.signal.oaconvolve(X, kernel[:, None], mode="same", axes=0))
 
 
 def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:

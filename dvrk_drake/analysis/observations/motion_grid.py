@@ -45,7 +45,6 @@ class MotionSignals:
         tau: Efforts (m, n), not filtered [N m, N]. Use the same filter for efforts and regressors, see `low_pass`.
         rows: Indices (k,) of the rows of the recording that are used. Rows that repeat the previous row are not used.
         row_times: True times (k,) of these rows, see `true_time` [s].
-        differentiated: Mask (n,) of the joints whose v is dq/dt, because qd is missing or disagrees with dq/dt.
     """
 
     t: NDArray[np.float64]
@@ -55,7 +54,6 @@ class MotionSignals:
     tau: NDArray[np.float64]
     rows: NDArray[np.int_]
     row_times: NDArray[np.float64]
-    differentiated: NDArray[np.bool_]
 
     @property
     def rate(self) -> float:
@@ -97,7 +95,7 @@ def motion_signals(
         agrees = velocity_agreement(q, qd, rate).agrees
         v = np.where(agrees, qd, v)
     vd = low_pass(central_difference(v, rate), rate, acceleration_cut_off)
-    return MotionSignals(t, q, v, vd, resample(clock.t, tau, t), clock.rows, clock.t, ~agrees)
+    return MotionSignals(t, q, v, vd, resample(clock.t, tau, t), clock.rows, clock.t)
 
 
 def even_times(clock: TrueTime, rate: float) -> NDArray[np.float64]:

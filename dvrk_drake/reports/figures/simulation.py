@@ -7,18 +7,15 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import Simulation
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.figures.colours import COMMANDED, FITTED, LIMIT, MEASURED, NEUTRAL, REFERENCE
+from dvrk_drake.reports.figures.colours import COMMANDED, LIMIT, MEASURED, NEUTRAL, REFERENCE
 from dvrk_drake.reports.figures.style import (
     WIDTH,
     add_legend,
     effort_unit,
     joint_title,
-    panel_grid,
     position_unit,
     save_figure,
     set_title,
@@ -80,32 +77,6 @@ def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> N
     figure.align_ylabels(rows)
     quantities = "position and effort" if desired is None else "position, position error and effort"
     set_title(figure, f"{arm.name}, simulated, controller mode {scenario.controller.mode}: {quantities} of each joint")
-    add_legend(figure)
-    save_figure(figure, path)
-
-
-def plot_positions(
-    path: Path, arm: Arm, t: NDArray[np.float64], curves: dict[str, NDArray[np.float64]], title: str
-) -> None:
-    """Plots positions over time, with one panel per joint.
-
-    Args:
-        path: PNG file to write.
-        arm: Arm of the joints.
-        t: Times (m,) [s].
-        curves: Positions (m, n) [rad; m] by label. The second and later curves are dashed.
-        title: Title of the figure.
-    """
-    figure, panels = panel_grid(arm.num_joints, sharex=True)
-    colours = [FITTED, REFERENCE, COMMANDED]
-    for j, ax in enumerate(panels):
-        for i, (label, q) in enumerate(curves.items()):
-            ax.plot(t, q[:, j], "--" if i else "-", color=colours[i % 3], label=label)
-        _widen(ax, _SMALLEST_RANGE * (0.1 if arm.prismatic[j] else 1.0))
-        ax.set_title(joint_title(arm, j))
-        ax.set_ylabel(f"position [{position_unit(arm, j)}]")
-        ax.set_xlabel("time [s]")
-    set_title(figure, title)
     add_legend(figure)
     save_figure(figure, path)
 

@@ -6,11 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from dvrk_drake.analysis.dynamic.estimates import (
     ResidualSeries,
     error_covariance,
     parameter_covariance,
+    toeplitz_product,
 )
 from dvrk_drake.analysis.observations.low_pass import low_pass
 
@@ -118,3 +120,13 @@ def test_uninformed_parameters_keep_the_prior_variance():
     covariance = parameter_covariance(problem, fit, tau, CUT_OFF, [series(None)]).estimates
     assert covariance[1, 1] == pytest.approx(1 / 4.0)
     assert covariance[0, 0] < 0.01
+
+
+@pytest.mark.parametrize("lags", [1, 40, 301])
+def test_product_with_a_covariance_is_that_of_the_matrix(lags):
+    generator = np.random.default_rng(lags)
+    covariance, X = np.zeros(301), generator.normal(size=(301, 3))
+    covariance[:lags] = generator.normal(size=lags)
+    covariance[0] = 3.0
+    expected = scipy.linalg.toeplitz(covariance) @ X
+    np.testing.assert_allclose(toeplitz_product(covariance, X), expected, rtol=0, atol=1e-10)

@@ -113,7 +113,6 @@ def test_signals_reproduce_the_motion(velocities):
     np.testing.assert_allclose(signals.v[inner], v[inner], atol=5e-3)
     np.testing.assert_allclose(signals.vd[inner], vd[inner], atol=0.02 * np.abs(vd).max())
     np.testing.assert_allclose(signals.tau[inner], (2.0 * vd + q)[inner], atol=0.05)
-    assert np.all(signals.differentiated == (velocities != "right"))
     np.testing.assert_array_equal(signals.rows, np.arange(3000))
     with pytest.raises(RecordingError, match="has no efforts"):
         motion_signals(replace(recording, tau=None), true_time(replace(recording, tau=None)), 20.0)
@@ -132,8 +131,7 @@ def delayed(lag, coulomb=0.3):
         return coulomb * np.tanh(v / (0.1 * speed)) + 0.2 * v + 0.05 * vd + np.sin(q)
 
     noise = 0.02 * np.random.default_rng(1).normal(size=(len(t), 3))
-    n = np.zeros(3, bool)
-    return MotionSignals(t, *motion(t), tau(t - lag) + noise, np.arange(len(t)), t, n)
+    return MotionSignals(t, *motion(t), tau(t - lag) + noise, np.arange(len(t)), t)
 
 
 @pytest.mark.parametrize("lag", [-0.01, 0.0, 0.005, 0.018])
