@@ -27,6 +27,7 @@ def convert(
     joints: Mapping[str, str] | None = None,
     arrays: Mapping[str, str] | None = None,
     rate: float | None = None,
+    effort_scale: Mapping[str, float] | float | None = None,
     skip_invalid: bool = False,
     progress: Progress | None = None,
 ) -> Recording:
@@ -37,7 +38,7 @@ def convert(
         output: Path of the file to write: .csv, or .mcap for a bag. An existing file is replaced.
         arm: The data are written in the joint coordinates of this arm. If None, they are written in the coordinates of
             the recording. Required to write a bag, and to read a bag or a file of the cisst collector.
-        coordinates, topic, joints, arrays, rate, skip_invalid, progress: See `read_recording`.
+        coordinates, topic, joints, arrays, rate, effort_scale, skip_invalid, progress: See `read_recording`.
 
     Returns:
         Written recording. Its `source`, `lines` and `notes` refer to the original file.
@@ -59,6 +60,7 @@ def convert(
         joints=joints,
         arrays=arrays,
         rate=rate,
+        effort_scale=effort_scale,
         skip_invalid=skip_invalid,
         progress=progress,
     )

@@ -170,17 +170,12 @@ def test_model_file_restores_the_locked_joints(tmp_path):
         IdentifiedModel.load(tmp_path / "bad.yaml")
 
 
-def test_earlier_model_files_have_no_locked_joints(tmp_path):
+def test_model_files_state_the_locked_joints(tmp_path):
     IdentifiedModel.from_arm(load_arm("psm")).save(tmp_path / "m.yaml")
     text = (tmp_path / "m.yaml").read_text()
-    assert "locked_joints: {}\n" in text
-    text = text.replace("locked_joints: {}\n", "")
-    for version in (2, 3, 4):
-        (tmp_path / "old.yaml").write_text(text.replace("model 5", f"model {version}"))
-        assert IdentifiedModel.load(tmp_path / "old.yaml").arm is load_arm("psm")
-    (tmp_path / "new.yaml").write_text(text)
+    (tmp_path / "m.yaml").write_text(text.replace("locked_joints: {}\n", ""))
     with pytest.raises(ModelError, match="locked_joints is missing"):
-        IdentifiedModel.load(tmp_path / "new.yaml")
+        IdentifiedModel.load(tmp_path / "m.yaml")
 
 
 def controller(arm):

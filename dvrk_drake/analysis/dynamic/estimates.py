@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import RecordingEffect
@@ -270,9 +269,13 @@ def toeplitz_product(covariance: NDArray[np.float64], X: NDArray[np.float64]) ->
     Lags with negligible covariance are omitted. In long motions, this is ten times as fast as
     `scipy.linalg.matmul_toeplitz`, whose FFTs have twice the length of the motion.
     """
+    from scipy.signal import oaconvolve  # imported here, because it takes 0.2 s
+
+    if not X.size:
+        return X  # an effort that was not measured has no columns, which oaconvolve does not accept
     last = int(np.max(np.flatnonzero(np.abs(covariance) > np.finfo(float).eps * covariance[0]), initial=0))
     kernel = np.concatenate([covariance[last:0:-1], covariance[: last + 1]])
-    return np.asarray(scipy.signal.oaconvolve(X, kernel[:, None], mode="same", axes=0))
+    return np.asarray(oaconvolve(X, kernel[:, None], mode="same", axes=0))
 
 
 def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:
