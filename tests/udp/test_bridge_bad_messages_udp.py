@@ -162,6 +162,13 @@ def test_random_commands_of_others_stop_the_bridge(arm, tmp_path):
         efforts = [message.effort for name, _, message in arm.monitor.receive() if name == "servo_jf"]
         assert efforts and not [effort for effort in efforts if effort and np.isfinite(effort[0])]
 
+        # An effort of the other process does not stay: the bridge still commands positions.
+        arm.monitor.forget()
+        publishers[0].publish(arm.m.JointState(arm.m.Header.now(), [], [], [], [0.1] * 7))
+        wait_until(lambda: arm.monitor.first(["servo_jf"], 0), "effort of the other process", bridge)
+        effort = arm.monitor.first(["servo_jf"], 0)
+        wait_until(lambda: arm.monitor.first(["hold", "servo_jp"], effort), "position after the effort", bridge)
+
         # Without the other process, an operator can reset the fault.
         publishers.clear()
         other.close()
