@@ -114,6 +114,7 @@ def test_realtime_sets_scheduler_and_locks_memory():
     """Memory is locked before: with real-time priority, that would delay other processes with this priority."""
     code = (
         "import os; from dvrk_drake.processes import pace; lock = pace._lock_memory; during = []; "
+        "os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)); "  # not that of the process that runs the tests
         "pace._lock_memory = lambda: (during.append(os.sched_getscheduler(0)), lock()); "
         "print(len(pace.make_realtime()), during == [os.SCHED_OTHER], os.sched_getscheduler(0) == os.SCHED_FIFO, "
         "'VmLck:\\t       0 kB' not in open('/proc/self/status').read())"
