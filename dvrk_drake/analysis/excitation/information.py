@@ -63,10 +63,10 @@ class ExpectedError:
         """
         return float(np.sqrt(np.sum(self.target * self.covariance(information))))
 
-    def known_parameters(self, information: NDArray[np.float64], share: float = 0.1) -> int:
-        """Returns the number of base parameters whose standard error is at most a share of their absolute value."""
+    def known_parameters(self, information: NDArray[np.float64]) -> int:
+        """Returns the number of base parameters whose standard error is at most 10 % of their absolute value."""
         errors = np.sqrt(np.diag(self.covariance(information))[: len(self.base_values)])
-        return int(np.sum(errors <= share * np.abs(self.base_values)))
+        return int(np.sum(errors <= 0.1 * np.abs(self.base_values)))
 
     def log_determinant(self, information: NDArray[np.float64]) -> float:
         """Returns the gain in log-determinant of the precision over the prior, divided by the number of unknowns."""
