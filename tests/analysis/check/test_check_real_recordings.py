@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from check_findings import changed
 
-from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.check.recording_check import check_recording, check_with_channels
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
@@ -84,5 +84,5 @@ def test_real_insertion_has_noise_and_effort_lag(real, name):
 def test_refuses_a_wrong_sign_in_a_real_motion(real_motion, name, joint):
     arm = arm_of(name)
     motors = changed(real_motion(name).in_actuator_coordinates(arm), "tau", joint, lambda x: -x)
-    refusals = check_recording(Observations(motors, arm)).refusals
+    refusals = check_with_channels(Observations(motors, arm)).refusals
     assert [(f.kind, f.joints) for f in refusals] == [("effort sign", (joint,))]

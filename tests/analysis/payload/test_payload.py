@@ -301,12 +301,7 @@ def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
 @pytest.mark.parametrize(("file", "link", "mass", "height"), WEIGHTS)
 def test_known_weights_without_reference(unloaded, file, link, mass, height):
     folder, _, model = unloaded
-    (payload,) = point_masses(
-        None,
-        Observations(read_recording(folder / file, model.arm, "actuator"), model.arm, model.section.signals),
-        model,
-        [link],
-    )
+    (payload,) = point_masses(None, read_recording(folder / file, model.arm, "actuator"), model, [link])
     assert payload.found
     assert abs(payload.body.mass - mass) < payload.quantile * payload.mass_error < 0.5 * mass
     assert abs(payload.position_in_base[2] - height) < payload.quantile * payload.position_error[2]
