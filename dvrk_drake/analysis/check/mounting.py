@@ -1,7 +1,8 @@
 """Finds the direction of gravity and the joint zeros with which the links of an arm explain a recording.
 
 A model file does not state how a robot is mounted. Its joint zeros may differ from those of the robot's controller, in
-most cases by multiples of 90 degrees.
+most cases by multiples of 90 degrees. Other differences above 45 degrees are refined multiples. Smaller ones are found
+by `check_channels`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from dvrk_drake.analysis.check.channel_check import segments_of
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
@@ -30,8 +32,9 @@ MIN_GAIN, MIN_CONFIRMED_GAIN = 20.0, 10.0
 #: Smallest angle of a reported direction from the stated one [rad]. Smaller angles are tilts of the base, which the
 #: identification estimates (`base_may_tilt`).
 MIN_ANGLE = np.deg2rad(30.0)
-#: Largest angle between an estimated direction and an axis of the base at which the axis is used [rad]. Robots are
-#: mounted at right angles, and the estimate contains the errors of the nominal masses.
+#: Largest angle between an estimated direction and an axis of the base at which the axis is used, and between an
+#: estimated joint zero and a multiple of 90 degrees at which the multiple is used [rad]. Robots are mounted at right
+#: angles, and the estimate contains the errors of the nominal masses.
 SNAP_ANGLE = np.deg2rad(10.0)
 #: Differences of the joint zeros of a model and of a controller [rad].
 QUARTER_TURNS = (np.pi / 2, -np.pi / 2, np.pi)
@@ -154,7 +157,21 @@ class _Search:
             if likelihood - current < MIN_GAIN:
                 break
             current, (gravity, offsets) = likelihood, best
+        for j in np.flatnonzero(offsets):
+            offsets = self._refined(gravity, offsets, j)
         return gravity, offsets
+
+    def _refined(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64], joint: int) -> NDArray[np.float64]:
+        """Returns offsets (n,) in which that of a joint is the best near a multiple of 90 degrees, or the multiple."""
+        own = np.arange(len(offsets)) == joint
+        turn = float(offsets[joint])
+
+        def cost(offset: float) -> float:
+            return -self._log_likelihood(gravity, np.where(own, offset, offsets))
+
+        best = minimize_scalar(cost, bounds=(turn - np.pi / 4, turn + np.pi / 4), method="bounded")
+        is_better = cost(turn) - best.fun > MIN_GAIN and abs(best.x - turn) > SNAP_ANGLE
+        return np.where(own, best.x, offsets) if is_better else offsets
 
     def scale(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> float:
         """Returns the common ratio of measured and nominal gravity efforts, 1 if they are not similar."""

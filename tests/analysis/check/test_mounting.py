@@ -51,6 +51,21 @@ def test_shifted_zero_is_found_and_stored(path, tmp_path):
     assert rotors[1] == pytest.approx(ROTORS[1], abs=2.0)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("offset", [1.0, 2.2])
+def test_any_zero_that_gravity_shows_is_found(shared_data, offset):
+    folder = shared_data / "other_robots" / "ur10e"
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    arm = dvrk.load_arm(folder / "ur10e.urdf")
+    true = dvrk.read_recording(folder / "motion_30s.csv", arm)
+    shifted = dataclasses.replace(true, q=true.q + offset * np.eye(6)[2])
+    found, (finding,) = find_mounting(Observations(shifted, arm))
+    assert (finding.kind, finding.joints) == ("joint zero", (2,))
+    np.testing.assert_allclose(finding.size, -offset, rtol=0, atol=0.1)
+    assert found.position_offsets == {arm.joint_names[2]: finding.size}
+
+
 def test_mounting_of_an_arm_file_is_not_replaced(path, tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_text(derived_arm_file(path, tmp_path))
