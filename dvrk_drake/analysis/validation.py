@@ -8,7 +8,12 @@ import numpy as np
 
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.dynamic.validation import DynamicValidation, predict_motion, validate_motion
+from dvrk_drake.analysis.dynamic.validation import (
+    DynamicValidation,
+    find_other_robot,
+    predict_motion,
+    validate_motion,
+)
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.results import Prediction
 from dvrk_drake.analysis.static.static_identification import MIN_POSES
@@ -62,6 +67,7 @@ def validate(
         validation = validate_motion(model, poses.observations)
         errors = validation.relative_errors
         found = unexplained_effort({name: errors[name] for name, v in validation.verdicts.items() if v == "do not use"})
+        found += find_other_robot(validation)
     else:
         _refuse_motion(model, poses.recording)
         validation = validate_static(model, poses.recording)

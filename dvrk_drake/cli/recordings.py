@@ -8,7 +8,20 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import IDENTIFY, Arm, FileOptions, Json, Locked, Overwrite, Plots, Recording, Verbose, app
+from dvrk_drake.cli.app import (
+    IDENTIFY,
+    Arm,
+    FileOptions,
+    Json,
+    Locked,
+    Model,
+    Overwrite,
+    Plots,
+    Recording,
+    Verbose,
+    app,
+    one_of,
+)
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
@@ -19,13 +32,14 @@ from dvrk_drake.cli.support import (
     print_written,
     write_json,
 )
-from dvrk_drake.errors import RecordingError
+from dvrk_drake.errors import ModelError, RecordingError
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm as LoadedArm
     from dvrk_drake.recordings.recording import Recording as LoadedRecording
 
 _FILE = FileOptions()
+_SOURCE = one_of("Arm or its model (one is required)")
 
 
 @app.command(group=IDENTIFY)
@@ -50,7 +64,10 @@ def check(
     recording: Recording,
     /,
     *,
-    arm: Arm,
+    arm: Annotated[Arm | None, Parameter(group=_SOURCE)] = None,
+    model: Annotated[
+        Model | None, Parameter(group=_SOURCE, help="Model of the arm. A motion of another individual arm is reported.")
+    ] = None,
     file: FileOptions = _FILE,
     locked: Locked = None,
     json: Json = None,
@@ -66,20 +83,28 @@ def check(
     from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
 
-    recorded_arm = mounted(dvrk.load_arm(arm), None, locked)
+    if model is not None and locked is not None:
+        raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
+    identified = None if model is None else dvrk.IdentifiedModel.load(model)
+    recorded_arm = mounted(dvrk.load_arm(arm or ""), None, locked) if identified is None else identified.arm
     if json is not None:
-        check_output(json, recording, overwrite=overwrite)
+        check_output(json, recording, *([model] if model else []), overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     with Steps("reading", "checking the recording") as steps:
         checked = file.read(recording, recorded_arm, steps)
-        report = dvrk.check(checked, recorded_arm, progress=steps)
+        report = dvrk.check(checked, identified or recorded_arm, progress=steps)
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if json is not None:
         write_json(json, report.as_dict())
-    options = arm + locked_option(recorded_arm) + file.as_text()
+    options = f"--arm {arm}{locked_option(recorded_arm)}" if model is None else f"--model {model}"
     other = _other_arm(checked, recorded_arm)
     print_report(
-        make_console(), report, arm=options, other_arm=f"{other}{file.as_text()}" if other else "", verbose=verbose
+        make_console(),
+        report,
+        source=options + file.as_text(),
+        is_model=model is not None,
+        other_arm=f"{other}{file.as_text()}" if other else "",
+        verbose=verbose,
     )
     if json is not None:
         print_written(json)

@@ -11,7 +11,13 @@ _STYLES = {"refusal": "red", "warning": "yellow", "note": ""}
 
 
 def print_report(
-    console: Console, report: RecordingReport, *, arm: str = "ARM", other_arm: str = "", verbose: bool = False
+    console: Console,
+    report: RecordingReport,
+    *,
+    source: str = "--arm ARM",
+    is_model: bool = False,
+    other_arm: str = "",
+    verbose: bool = False,
 ) -> None:
     """Prints whether a recording is usable, the warnings, and the position range and effort of each joint.
 
@@ -21,11 +27,12 @@ def print_report(
     Args:
         console: Console to print to.
         report: Report to print.
-        arm: Value of --arm and further options, for the suggested next command.
-        other_arm: As `arm`, for another arm to which the recording probably belongs, or "".
+        source: --arm or --model with its value, and further options, for the suggested next command.
+        is_model: Whether `source` is a model.
+        other_arm: Value of --arm and options for another arm to which the recording probably belongs, or "".
         verbose: Whether to print the notes, and the signal properties of each actuator.
     """
-    _print_verdict(console, report, arm, other_arm)
+    _print_verdict(console, report, source, is_model, other_arm)
     notes = [finding for finding in report.findings if finding.severity == "note"]
     for finding in [*report.warnings, *(notes if verbose else [])]:
         console.print(str(finding), style=_STYLES[finding.severity], markup=False, soft_wrap=True)
@@ -41,15 +48,18 @@ def print_report(
         _print_signals(console, report)
 
 
-def _print_verdict(console: Console, report: RecordingReport, arm: str, other_arm: str) -> None:
+def _print_verdict(console: Console, report: RecordingReport, source: str, is_model: bool, other_arm: str) -> None:
     what = f"{report.rows} rows of {report.kind}"
     if report.rate is not None and report.duration is not None:
         what = f"motion of {report.rows} rows, {report.duration:.2f} s at {report.rate:.4g} Hz"
-    next_command = f"dvrk-drake identify {report.source} --arm {arm} --output MODEL.yaml"
+    next_command = f"dvrk-drake identify {report.source} {source} --output MODEL.yaml"
+    if is_model:
+        next_command = f"dvrk-drake validate {report.source} {source}"
     verdict, style, found = "usable", "green", report.warnings
     if report.refusals:
         verdict, style, found = "unusable", "red", report.refusals
-        next_command = f"dvrk-drake check {report.source if other_arm else 'OTHER.csv'} --arm {other_arm or arm}"
+        again = f"--arm {other_arm}" if other_arm else source
+        next_command = f"dvrk-drake check {report.source if other_arm else 'OTHER.csv'} {again}"
     elif report.warnings:
         verdict, style = f"usable with {_count(len(report.warnings), 'warning')}", "yellow"
     kinds = ", ".join(dict.fromkeys(finding.kind for finding in found))

@@ -32,7 +32,10 @@ def refused(capsys, *arguments):
         (["check", "r.csv", "--arm", "psm", "--arm", "psm"], "Parameter --arm specified multiple times; see"),
         (["arm", "--arm", "psm", "--pose", "-0.1", "-2e-1"], "a pose of PSM is 7 finite numbers"),
         (["identify", "--nonsense"], "Unknown option: --nonsense; see dvrk-drake identify --help"),
-        (["check", "a.csv"], "--arm is required: mtml, mtmr, psm, or the path of a YAML, URDF, SDF or MJCF file; see"),
+        (
+            ["identify", "a.csv", "--output", "b.yaml"],
+            "--arm is required: mtml, mtmr, psm, or the path of a YAML, URDF, SDF or MJCF file; see",
+        ),
         (["validate", "a.csv"], "--model is required: the model file that identify wrote; see"),
         (["model", "--arm", __file__], f"{__file__} is not the file of an arm; known arms"),
         (["identify", "a.csv", "--arm", "psm"], "--output is required; see dvrk-drake identify --help"),

@@ -92,7 +92,7 @@ def compared(console, verbose):
 def checked(console, verbose, **changes):
     reference = motions()[0]
     report = dvrk.check(replace(reference, **changes), dvrk.load_arm("psm"))
-    recording_check.print_report(console, report, arm="psm", verbose=verbose)
+    recording_check.print_report(console, report, source="--arm psm", verbose=verbose)
 
 
 def simulated(console, verbose, settings):

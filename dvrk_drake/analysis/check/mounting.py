@@ -158,7 +158,7 @@ class _Search:
                 break
             current, (gravity, offsets) = likelihood, best
         for j in np.flatnonzero(offsets):
-            offsets = self._refined(gravity, offsets, j)
+            offsets = self._refined(gravity, offsets, int(j))
         return gravity, offsets
 
     def _refined(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64], joint: int) -> NDArray[np.float64]:

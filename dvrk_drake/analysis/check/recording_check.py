@@ -13,11 +13,13 @@ from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingR
 from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.pose_check import check_poses
+from dvrk_drake.analysis.dynamic.validation import find_other_robot, validate_motion
 from dvrk_drake.analysis.observations.motion_grid import MIN_SEGMENT
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, usable_poses
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
@@ -259,7 +261,7 @@ def _what_and_advice(error: Exception, source: str) -> tuple[str, str]:
     return what.removesuffix("."), advice
 
 
-def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -> RecordingReport:
+def check(recording: Recording, arm: Arm | IdentifiedModel, *, progress: Progress | None = None) -> RecordingReport:
     """Checks a recording for faults before identification, as `dvrk-drake check` does.
 
     Examples of faults are wrong units or signs, exchanged channels, saturated efforts, decreasing times, late or
@@ -268,7 +270,8 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
 
     Args:
         recording: Poses or motion with efforts (m, n), in joint or actuator coordinates, without preprocessing.
-        arm: Arm that was recorded.
+        arm: Arm that was recorded, or its model. With the model of a motion, `check` also finds out whether a motion is
+            that of another individual arm.
         progress: Callback that receives the name of the step ("checking the recording") and the finished share of the
             step (0 to 1).
 
@@ -287,6 +290,8 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     """
     share = step_progress(progress, "checking the recording")
     share(0.0)
+    model = None if isinstance(arm, Arm) else arm
+    arm = arm if isinstance(arm, Arm) else arm.arm
     recording, dropped = with_power(recording, arm)
     if assumed := is_assumed(arm):
         arm, mounting = find_mounting(Observations(recording, arm))
@@ -295,6 +300,8 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     report = check_with_channels(observations)
     if not report.refusals and not assumed:
         dropped = (*dropped, *find_mounting(observations)[1])
+    if not report.refusals and model is not None and model.dynamics is not None and report.kind == "motion":
+        dropped = (*dropped, *find_other_robot(validate_motion(model, Observations.for_model(recording, model))))
     report = replace(report, findings=(*report.refusals, *dropped, *report.findings[len(report.refusals) :]))
     share(1.0)
     if report.refusals:

@@ -5,6 +5,7 @@ import pytest
 from command_output import refusal
 from motions import fourier_motion, true_dynamics
 
+from dvrk_drake.analysis.check.recording_check import check
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
@@ -35,14 +36,14 @@ ARM = lock_joints(PSM, WRIST)
 TRUTH = true_dynamics(PSM, np.random.default_rng(0), FRICTION)
 
 
-def recorded(seed, noise=NOISE):
+def recorded(seed, noise=NOISE, truth=TRUTH):
     """Returns a recording of the first three joints of the full arm, whose wrist is held at `WRIST`."""
     generator = np.random.default_rng(seed)
     t, *motion = fourier_motion(ARM, generator, 10.0, 20.0, RATE)
     whole = np.zeros((3, len(t), 7))
     whole[:, :, :3] = motion
     whole[0, :, 3:] = list(WRIST.values())
-    tau = TRUTH.effort(*whole)[:, :3]
+    tau = truth.effort(*whole)[:, :3]
     delays = ARM.identification.effort_delay
     tau = np.column_stack([np.interp(t - d, t, x) for d, x in zip(delays, tau.T, strict=True)])
     tau += noise * np.sqrt(np.mean(tau**2, axis=0)) * generator.normal(size=tau.shape)
@@ -64,6 +65,20 @@ def folder(tmp_path_factory):
     command = ["identify", f"{folder}/one.csv", "--arm", "psm", "--locked", *OPTION]
     assert main([*command, "--output", f"{folder}/model.yaml"]) == 0
     return folder
+
+
+def test_other_individual_arm_is_named(result):
+    other = true_dynamics(PSM, np.random.default_rng(1), FRICTION)
+    for truth, expected in ((TRUTH, []), (other, ["other robot"])):
+        kinds = [finding.kind for finding in check(recorded(2, truth=truth), result.model).warnings]
+        assert [kind for kind in kinds if kind == "other robot"] == expected
+
+
+def test_check_with_a_model_continues_with_validate(folder, capsys):
+    assert main(["check", f"{folder}/two.csv", "--model", f"{folder}/model.yaml"]) == 0
+    assert f"Next: dvrk-drake validate {folder}/two.csv --model {folder}/model.yaml" in capsys.readouterr().out
+    assert main(["check", f"{folder}/two.csv", "--model", f"{folder}/model.yaml", "--locked", *OPTION]) == 2
+    assert "--locked requires --arm; with --model" in refusal(capsys.readouterr().err)
 
 
 def test_another_motion_is_predicted_below_the_noise(result):
