@@ -1,9 +1,9 @@
-"""Commands for the control of an arm over LCM: key and run."""
+"""Commands for an arm over LCM: key, run, status and stop."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +13,7 @@ from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Model, Realtime, app
 from dvrk_drake.cli.support import interrupt_ends_process, load_key, print_warning, print_written, quiet_drake
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     import numpy as np
     from numpy.typing import NDArray
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
-
-#: Longest time until a status of the arm arrives [s].
-_SILENCE = 1.0
 
 
 @Parameter(name="*")
@@ -117,6 +114,58 @@ def run(
     finally:
         line.clear()
     print(f"control ended; the guard of {name} regulates the pose", flush=True)
+
+
+@app.command(group=HARDWARE)
+def status(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, watch: bool = False) -> None:
+    """Print the state of an arm over LCM, its reason, and what to do next.
+
+    Args:
+        watch: Repeat until Ctrl-C.
+    """
+    from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.processes.arm_operator import observe
+    from dvrk_drake.reports.arm_status import print_status
+    from dvrk_drake.reports.terminal_tables import make_console
+
+    loaded, console = load_arm(arm), make_console()
+    with suppress(KeyboardInterrupt), _operator_link(arm, lcm_url, key) as link:
+        while True:
+            observation = observe(link)
+            if watch:
+                console.clear()
+            print_status(console, loaded, observation)
+            if not watch:
+                return
+
+
+@app.command(group=HARDWARE)
+def stop(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, power_off: bool = False) -> None:
+    """Stop an arm over LCM: its guard holds the pose until an operator resumes.
+
+    The guard obeys every sender with the key, also while a controller acts. This does not replace the emergency stop
+    button.
+
+    Args:
+        power_off: Also switch the motor power off. An arm without brakes falls.
+    """
+    from dvrk_drake.models.lcm_messages import describe_state
+    from dvrk_drake.processes.arm_operator import stop_arm
+
+    with _operator_link(arm, lcm_url, key) as link:
+        after = stop_arm(link, power_off=power_off)
+        print(f"{after.arm_name} is stopped: {describe_state(after.guard_state, after.fault_text)}", flush=True)
+
+
+@contextmanager
+def _operator_link(name: str, lcm_url: str, key: str | None) -> Iterator[ArmLink]:
+    """Opens the channels of an arm for an operator, whatever its state is."""
+    from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.processes.control import ArmLink
+    from dvrk_drake.processes.lcm_network import open_lcm
+
+    with closing(ArmLink(load_arm(name), open_lcm(lcm_url).get_lcm_url(), key=load_key(key))) as link:
+        yield link
 
 
 def _gains(path: str, mode: Mode, arm: str) -> Gains:
@@ -211,7 +260,8 @@ def ready_controller(
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.arm_controller import ArmController
-    from dvrk_drake.processes.control import ArmLink, first_status, reset_fault
+    from dvrk_drake.processes.arm_operator import reset_fault
+    from dvrk_drake.processes.control import ArmLink, first_status
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.pace import make_realtime, settle_memory
 
@@ -259,9 +309,10 @@ def checked_start(
 
     from dvrk_drake.analysis.excitation.motion_limits import path_obstacle
     from dvrk_drake.errors import CollectionError
+    from dvrk_drake.processes.control import SILENCE
 
     with closing(link()) as opened:
-        q = np.array(opened.next_status(_SILENCE).position)
+        q = np.array(opened.next_status(SILENCE).position)
     if obstacle := path_obstacle(model.arm, q, q_end, environment, model):
         raise CollectionError(
             f"{model.arm.name} cannot move from its present pose to the first pose: {obstacle}. Move the arm by hand "

@@ -9,7 +9,6 @@ from collections.abc import Callable
 import lcm
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
@@ -25,10 +24,9 @@ from dvrk_drake.models.lcm_messages import (
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
-from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 
 #: Time without a status after which an arm is considered absent [s]. Longest time until the first status [s].
-_SILENCE, _FIRST_WAIT = 1.0, 10.0
+SILENCE, FIRST_WAIT = 1.0, 10.0
 
 #: Longest period of the measurements [us]. With the gains of the arm files, a PSM oscillates if this period is 7 ms,
 #: and an MTM oscillates if it is 10 ms.
@@ -43,9 +41,6 @@ _FIRST_STATUSES = 60
 
 #: Longest time until the arm confirms HOLD [s].
 _RELEASE = 1.0
-
-#: Longest time for which a guard ignores new senders after the last command of a sender, plus a margin [s].
-_SENDER_RESERVED = 1.1
 
 #: Longest time without applied commands [s]. The start check of the guard takes 0.25 s.
 _TIMEOUT = 10.0
@@ -158,7 +153,7 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         ControllerError: No status arrives, or the arm has a fault, waits for an operator, measures values that are not
             finite, is outside its limits, does not accept efforts, or measures too infrequently.
     """
-    status, name = link.next_status(_FIRST_WAIT), link.arm.name
+    status, name = link.next_status(FIRST_WAIT), link.arm.name
     _check(status, name)
     if not np.all(np.isfinite([*status.position, *status.velocity, *status.effort_measured])):
         raise ControllerError(f"{name}: a measured position, velocity or effort is not finite. Check its sensors first")
@@ -168,7 +163,7 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         raise ControllerError(f"{name} does not accept efforts now; its state is {describe_state(status.guard_state)}")
     utimes = [status.utime]
     for _ in range(_FIRST_STATUSES):
-        later = link.next_status(_SILENCE)
+        later = link.next_status(SILENCE)
         _check(later, name)
         utimes.append(later.utime)
     if not (later.sequence > status.sequence and later.utime > status.utime):
@@ -184,44 +179,6 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
             "(1 kHz is recommended)"
         )
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
-
-
-def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
-    """Clears the latched fault of the arm, or resumes after a watchdog hold. Afterwards, the arm is in HOLD.
-
-    Args:
-        link: Channels of the arm.
-        report: Function that is called with a description of the fault, or of the reason of the watchdog hold.
-
-    Raises:
-        ControllerError: No status arrives, or the fault remains because its cause persists.
-    """
-    status, name = link.next_status(_FIRST_WAIT), link.arm.name
-    if status.fault_code == lcmt_dvrk_status.FAULT_NONE and not status.fault_text:
-        return
-    fault = status.fault_text
-    if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
-        report(f"the guard of {name} held the arm, and the operator resumes now: {fault}")
-    else:
-        report(f"{name} has a fault, which is reset now: {fault}")
-    sender = DvrkCommandSender(link.arm)
-    context = sender.CreateDefaultContext()
-    start = link.now()
-    # The guard requires a change of the flag from false to true.
-    for reset in [0.0, 0.0, *[1.0] * 20]:
-        context.SetTime(link.now() - start)
-        sender.GetInputPort("reset_fault").FixValue(context, np.array([reset]))
-        sender.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
-        link.send(sender.get_output_port().Eval(context))
-        status = link.next_status(_SILENCE)
-    # The guard ignores a new sender for up to a second after the last command of this sender.
-    end = link.now() + _SENDER_RESERVED
-    while link.now() < end:
-        status = link.next_status(_SILENCE)
-    if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
-        raise ControllerError(f"{name} still has a fault after the reset: {status.fault_text or fault}")
-    if status.fault_text:
-        raise ControllerError(f"{name} does not resume: {status.fault_text}")
 
 
 def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda: "") -> None:
@@ -271,12 +228,12 @@ def control(
             gravity compensation, or applies no commands.
     """
     start = link.now()
-    first = link.next_status(_SILENCE)
+    first = link.next_status(SILENCE)
     live, next_report, acted, before = LiveStatusMaker(controller.sender_id, first), _REPORT_PERIOD, 0.0, first
     answers = AnswerTimes()
     try:
         while not stopped():
-            status = link.next_status(_SILENCE)
+            status = link.next_status(SILENCE)
             now = link.now() - start
             answers.add(now)
             _check(status, link.arm.name, answers.lateness)
@@ -302,7 +259,7 @@ def _release(link: ArmLink, controller: ArmController, start: float) -> None:
     """Commands HOLD until a status shows that the controller is not in control."""
     end = link.now() + _RELEASE
     while link.now() < end:
-        status = link.next_status(_SILENCE)
+        status = link.next_status(SILENCE)
         if status.command_sender_id != controller.sender_id:
             _check(status, link.arm.name)
             return

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, SESSION, N, Q, Weightless
+from guard_bench import ARM, LIMIT, SESSION, N
+from guarded_arm import GuardedArm, after
 from sticky_arm import Disk
 
 from dvrk_drake.cli import main
@@ -16,84 +17,15 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models import files
 from dvrk_drake.models.lcm_messages import MessageKey, describe_refusal, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.control import ArmLink, control, first_status, reset_fault
+from dvrk_drake.processes.arm_operator import reset_fault
+from dvrk_drake.processes.control import ArmLink, control, first_status
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.processes.teacher import Teacher
-from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
-
-
-class GuardedArm:
-    """Link to an arm that does not move, and to its guard. A status arrives every simulated millisecond."""
-
-    def __init__(self):
-        self.arm, self.lost, self.utime = ARM, 0, 10**9
-        self.guard, self.commands, self.status = CommandGuard(ARM, SESSION, Weightless()), [], Status()
-        self.before_step = lambda: None
-        self.status.arm_name, self.status.num_joints = ARM.name, N
-        self.status.position, self.status.velocity = list(Q), [0.0] * N
-        self.status.effort_measured = self.status.effort_commanded = list(0.05 * LIMIT)
-
-    def now(self):
-        return 1e-6 * self.utime
-
-    def next_status(self, seconds):
-        self.utime += 1000
-        self.before_step()
-        status = Status.decode(self.status.encode()) if self.status.session_id else self.status
-        status.utime, status.sequence = self.utime, self.status.sequence + 1
-        self.guard.step(status.utime, status.utime, status.position, status.velocity, status.effort_measured)
-        fill_in_guard(status, self.guard)
-        self.status = status
-        return status
-
-    def send(self, command):
-        self.commands.append(command)
-        self.guard.receive(command, self.utime)
 
 
 @pytest.fixture(scope="module")
 def controller():
     return ArmController(ARM, IdentifiedModel.from_arm(ARM), "hold", 1e-3)
-
-
-def after(count, action):
-    """Returns a function that calls `action` at its call number `count`."""
-    calls = []
-
-    def step():
-        calls.append(None)
-        if len(calls) == count:
-            action()
-
-    return step
-
-
-def test_fault_is_reported_and_cleared():
-    link, output = GuardedArm(), []
-    link.guard.report_fault("the amplifier is hot")
-    with pytest.raises(ControllerError, match=r"has a fault: the amplifier is hot\. Look at the arm, then start again"):
-        first_status(link)
-    assert not link.commands  # a fault is cleared on request only
-    reset_fault(link, lambda text: output.append((text, len(link.commands))))
-    assert output == [("MTML has a fault, which is reset now: the amplifier is hot", 0)]
-    assert (link.guard.state, link.guard.fault_code) == (Status.STATE_HOLD, Status.FAULT_NONE)
-    assert {command.control_mode for command in link.commands} == {Command.HOLD}
-    # A new sender is accepted, even with the longest expiry that a guard may have.
-    assert link.utime - link.commands[-1].status_utime > 10**6
-    status, period = first_status(link)
-    assert status.fault_code == Status.FAULT_NONE
-    assert period == pytest.approx(1e-3)
-
-
-def test_lasting_fault_is_an_error():
-    link = GuardedArm()
-    link.before_step = lambda: link.guard.report_fault("the amplifier is hot")
-    with pytest.raises(ControllerError, match="still has a fault after the reset: the amplifier is hot"):
-        reset_fault(link, lambda text: None)
-    link = GuardedArm()
-    reset_fault(link, pytest.fail)
-    assert not link.commands
 
 
 def pause_controller(link, seconds):
@@ -182,18 +114,6 @@ def test_stopped_controller_ends_and_operator_resumes(controller, seconds):
     assert line.startswith("the guard of MTML held the arm, and the operator resumes now: the last command expired: ")
     first_status(link)
     assert link.guard.hold_reason == ""
-
-
-def test_arm_that_does_not_resume_is_an_error():
-    link = GuardedArm()
-
-    def take_over():
-        link.guard._acted = True
-        link.guard._take_over("its period is 20 ms")
-
-    link.before_step = take_over
-    with pytest.raises(ControllerError, match="MTML does not resume: its period is 20 ms"):
-        reset_fault(link, lambda text: None)
 
 
 def test_takeover_during_release_is_an_error(controller):

@@ -1,0 +1,198 @@
+"""What an operator of an arm does over LCM: look at its state, stop it, and reset a fault."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.lcm_messages import describe_refusal, describe_state
+from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, ArmLink
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
+
+#: Longest time for which a guard ignores new senders after the last command of a sender, plus a margin [s].
+_SENDER_RESERVED = 1.1
+#: States in which commands of a controller act, or are checked before they act.
+_CONTROLLED = (lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION, lcmt_dvrk_status.STATE_EFFORT)
+_EMERGENCY = "Press the emergency stop button"
+#: Time after which an arm that does not stop is reported [s]. A guard examines each message within 1 ms, so this time
+#: allows for lost messages and a busy computer.
+_STOP = 1.0
+#: Time for switching the power off [s]. It includes the time for which another sender is reserved.
+_POWER_OFF = _SENDER_RESERVED + _STOP
+
+
+@dataclass(frozen=True)
+class ArmObservation:
+    """Statuses of an arm during a short time.
+
+    Attributes:
+        first, last: First and last status.
+        count: Number of received statuses after the first.
+        lost: Number of statuses that were not received.
+        seconds: Time between both statuses on the clock of the arm [s].
+    """
+
+    first: lcmt_dvrk_status
+    last: lcmt_dvrk_status
+    count: int
+    lost: int
+    seconds: float
+
+    @property
+    def commands(self) -> int:
+        """Number of commands that the arm accepted."""
+        return int(self.last.num_accepted - self.first.num_accepted)
+
+    def explanation(self) -> tuple[str, str]:
+        """Returns why the arm is in its state, and what the operator can do next ("" if nothing is to be done)."""
+        first, last = self.first, self.last
+        arm = f"--arm {last.arm_name.lower()}"
+        reset = f"look at the arm, remove the cause, then: dvrk-drake run {arm} --reset"
+        if last.fault_code != lcmt_dvrk_status.FAULT_NONE:
+            return f"fault: {last.fault_text}", reset
+        if last.guard_state == lcmt_dvrk_status.STATE_OFF:
+            return "the motors have no power", "switch the power on, as the manual of the arm describes"
+        if last.fault_text:
+            return f"the guard holds the arm until an operator resumes: {last.fault_text}", reset
+        if last.gravity_compensation:
+            why = "the arm adds its own gravity compensation, so controllers of this package do not start"
+            return why, "switch off gravity_compensation in the arm's driver"
+        if not np.all(np.isfinite([*last.position, *last.velocity, *last.effort_measured])):
+            return "a measured position, velocity or effort is not finite", "check the sensors of the arm"
+        if last.num_refused > first.num_refused:
+            return f"commands are refused: {describe_refusal(last.refusal_code)}", "correct or end the controller"
+        if last.num_ignored > first.num_ignored:
+            return (
+                f"messages are ignored: {describe_refusal(last.ignored_code)}",
+                "give the arm's key to the controller",
+            )
+        if not self.commands:
+            return "no controller sends commands", f"dvrk-drake run {arm}"
+        return f"sender {last.command_sender_id} sends {self.commands / self.seconds:.0f} commands per second", ""
+
+
+def observe(link: ArmLink, seconds: float = 0.5) -> ArmObservation:
+    """Receives the statuses of an arm for some time.
+
+    Args:
+        link: Channels of the arm.
+        seconds: Duration [s].
+
+    Raises:
+        ControllerError: No status arrives.
+    """
+    first = last = link.next_status(FIRST_WAIT)
+    lost, count, end = link.lost, 0, link.now() + seconds
+    while link.now() < end:
+        last, count = link.next_status(SILENCE), count + 1
+    return ArmObservation(first, last, count, link.lost - lost, max(1e-6 * (last.utime - first.utime), 1e-6))
+
+
+def stop_arm(link: ArmLink, *, power_off: bool = False) -> lcmt_dvrk_status:
+    """Commands HOLD until no controller moves the arm, then, on request, switches the motor power off.
+
+    The guard obeys HOLD of every sender. If commands of a controller acted, they do not act again until an operator
+    resumes. An arm in a fault or without motor power gets no command, because HOLD would switch the power on.
+
+    Args:
+        link: Channels of the arm.
+        power_off: True to switch the motor power off. An arm without brakes falls.
+
+    Returns:
+        Status after the stop.
+
+    Raises:
+        ControllerError: No status arrives, the arm does not stop, or its power cannot be switched off.
+    """
+    sender, name, status = _Sender(link), link.arm.name, link.next_status(FIRST_WAIT)
+    end = link.now() + _STOP
+    while status.guard_state in _CONTROLLED:
+        if link.now() > end:
+            raise ControllerError(f"{name} does not stop: {_refusal(status)}. {_EMERGENCY}")
+        status = sender.send(status)
+    if not power_off or status.guard_state == lcmt_dvrk_status.STATE_OFF:
+        return status
+    if status.guard_state == lcmt_dvrk_status.STATE_FAULT:
+        raise ControllerError(f"{name} has a fault, in which its guard does not switch the power off. {_EMERGENCY}")
+    if not status.accepted_modes >> lcmt_dvrk_command.OFF & 1:
+        raise ControllerError(f"{name} holds its pose, but its driver does not accept OFF (modes). {_EMERGENCY}")
+    end = link.now() + _POWER_OFF
+    while status.guard_state != lcmt_dvrk_status.STATE_OFF:
+        if link.now() > end:
+            raise ControllerError(f"the power of {name} stays on: {_refusal(status)}. {_EMERGENCY}")
+        # OFF is accepted only after HOLD of the same sender.
+        status = sender.send(status, lcmt_dvrk_command.OFF if sender.accepted(status) else lcmt_dvrk_command.HOLD)
+    return status
+
+
+def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
+    """Clears the latched fault of the arm, or resumes after a watchdog hold. Afterwards, the arm is in HOLD.
+
+    Args:
+        link: Channels of the arm.
+        report: Function that is called with a description of the fault, or of the reason of the watchdog hold.
+
+    Raises:
+        ControllerError: No status arrives, or the fault remains because its cause persists.
+    """
+    status, name = link.next_status(FIRST_WAIT), link.arm.name
+    if status.fault_code == lcmt_dvrk_status.FAULT_NONE and not status.fault_text:
+        return
+    fault = status.fault_text
+    if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
+        report(f"the guard of {name} held the arm, and the operator resumes now: {fault}")
+    else:
+        report(f"{name} has a fault, which is reset now: {fault}")
+    sender = _Sender(link)
+    # The guard requires a change of the flag from false to true.
+    for reset in [False, False, *[True] * 20]:
+        status = sender.send(status, reset_fault=reset)
+    # The guard ignores a new sender for up to a second after the last command of this sender.
+    end = link.now() + _SENDER_RESERVED
+    while link.now() < end:
+        status = link.next_status(SILENCE)
+    if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
+        raise ControllerError(f"{name} still has a fault after the reset: {status.fault_text or fault}")
+    if status.fault_text:
+        raise ControllerError(f"{name} does not resume: {status.fault_text}")
+
+
+class _Sender:
+    """Sender of HOLD and OFF commands."""
+
+    def __init__(self, link: ArmLink) -> None:
+        self._link, self._start = link, link.now()
+        self._system = DvrkCommandSender(link.arm)
+        self._context = self._system.CreateDefaultContext()
+        self._last: lcmt_dvrk_command | None = None
+
+    def send(
+        self, status: lcmt_dvrk_status, mode: int = lcmt_dvrk_command.HOLD, *, reset_fault: bool = False
+    ) -> lcmt_dvrk_status:
+        """Sends the command for a status, and returns the next status."""
+        values = {"control_mode": np.array([float(mode)]), "reset_fault": np.array([float(reset_fault)])}
+        self._context.SetTime(self._link.now() - self._start)
+        for port, value in {**values, "lcmt_dvrk_status": AbstractValue.Make(status)}.items():
+            self._system.GetInputPort(port).FixValue(self._context, value)
+        self._last = self._system.get_output_port().Eval(self._context)
+        self._link.send(self._last)
+        return self._link.next_status(SILENCE)
+
+    def accepted(self, status: lcmt_dvrk_status) -> bool:
+        """Returns whether the last command that the arm accepted is the last one of this sender."""
+        last = self._last
+        return last is not None and (status.command_sequence, status.command_utime) == (last.sequence, last.utime)
+
+
+def _refusal(status: lcmt_dvrk_status) -> str:
+    state = describe_state(status.guard_state)
+    if status.num_refused and status.refusal_code:
+        return f"its state is {state}; last refused command: {describe_refusal(status.refusal_code)}"
+    if status.num_ignored and status.ignored_code:
+        return f"its state is {state}; last ignored message: {describe_refusal(status.ignored_code)}"
+    return f"its state is {state}"

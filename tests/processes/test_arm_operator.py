@@ -1,0 +1,186 @@
+"""State of an arm for its operator, stop and reset, with a simulated clock and without a network."""
+
+from contextlib import nullcontext
+
+import pytest
+from guard_bench import ARM
+from guarded_arm import GuardedArm
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.arm_operator import observe, reset_fault, stop_arm
+from dvrk_drake.processes.control import first_status
+from dvrk_drake.reports.arm_status import print_status
+from dvrk_drake.reports.terminal_tables import make_console
+
+ALL_MODES = (Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT)
+
+
+@pytest.fixture
+def controlled():
+    """Returns a link to an arm on which the efforts of a controller act, and a function that sends its next command."""
+    link, controller = GuardedArm(ALL_MODES), ArmController(ARM, IdentifiedModel.from_arm(ARM), "hold", 1e-3)
+
+    def control():
+        link.send(controller.answer(link.next_status(1.0), link.now()))
+
+    while link.guard.state != Status.STATE_EFFORT:
+        control()
+    return link, control
+
+
+def test_fault_is_reported_and_cleared():
+    link, output = GuardedArm(), []
+    link.guard.report_fault("the amplifier is hot")
+    with pytest.raises(ControllerError, match=r"has a fault: the amplifier is hot\. Look at the arm, then start again"):
+        first_status(link)
+    assert not link.commands  # a fault is cleared on request only
+    reset_fault(link, lambda text: output.append((text, len(link.commands))))
+    assert output == [("MTML has a fault, which is reset now: the amplifier is hot", 0)]
+    assert (link.guard.state, link.guard.fault_code) == (Status.STATE_HOLD, Status.FAULT_NONE)
+    assert {command.control_mode for command in link.commands} == {Command.HOLD}
+    # A new sender is accepted, even with the longest expiry that a guard may have.
+    assert link.utime - link.commands[-1].status_utime > 10**6
+    status, period = first_status(link)
+    assert status.fault_code == Status.FAULT_NONE
+    assert period == pytest.approx(1e-3)
+
+
+def test_lasting_fault_is_an_error():
+    link = GuardedArm()
+    link.before_step = lambda: link.guard.report_fault("the amplifier is hot")
+    with pytest.raises(ControllerError, match="still has a fault after the reset: the amplifier is hot"):
+        reset_fault(link, lambda text: None)
+    link = GuardedArm()
+    reset_fault(link, pytest.fail)
+    assert not link.commands
+
+
+def test_arm_that_does_not_resume_is_an_error():
+    link = GuardedArm()
+
+    def take_over():
+        link.guard._acted = True
+        link.guard._take_over("its period is 20 ms")
+
+    link.before_step = take_over
+    with pytest.raises(ControllerError, match="MTML does not resume: its period is 20 ms"):
+        reset_fault(link, lambda text: None)
+
+
+def fault(link):
+    link.guard.report_fault("the amplifier is hot")
+
+
+def power_off(link):
+    stop_arm(link, power_off=True)
+
+
+def watchdog_hold(link):
+    link.guard._acted = True
+    link.guard._take_over("its period is 20 ms")
+
+
+def own_gravity(link):
+    link.status.gravity_compensation = True
+
+
+def refused(link):
+    wrong = Command()
+    wrong.arm_name, wrong.num_joints, wrong.session_id = ARM.name, ARM.num_joints, link.guard.session_id
+    wrong.control_mode, wrong.sender_id = Command.EFFORT, 7  # its status is too old
+    wrong.position = wrong.velocity = wrong.effort = [0.0] * ARM.num_joints
+    link.before_step = lambda: link.guard.receive(wrong, link.utime)
+
+
+def ignored(link):
+    link.before_step = lambda: link.guard.receive(None, link.utime)
+
+
+@pytest.mark.parametrize(
+    ("prepare", "why", "next_step"),
+    [
+        (fault, "MTML: fault, fault: the amplifier is hot.", "dvrk-drake run --arm mtml --reset"),
+        (power_off, "MTML: off, the motors have no power.", "switch the power on"),
+        (watchdog_hold, "until an operator resumes: its period is 20 ms.", "dvrk-drake run --arm mtml --reset"),
+        (own_gravity, "the arm adds its own gravity compensation", "switch off gravity_compensation"),
+        (lambda link: None, "MTML: hold, no controller sends commands.", "dvrk-drake run --arm mtml"),
+        (refused, "MTML: hold, commands are refused: ", "correct or end the controller"),
+        (ignored, "MTML: hold, messages are ignored: ", "give the arm's key to the controller"),
+    ],
+)
+def test_status_explains_an_arm_that_does_not_move(prepare, why, next_step, capsys):
+    link = GuardedArm(ALL_MODES)
+    prepare(link)
+    print_status(make_console(), ARM, observe(link))
+    text = " ".join(capsys.readouterr().out.split())
+    assert why in text and f"Next: {next_step}" in text.replace("look at the arm, remove the cause, then: ", "")
+
+
+def test_status_shows_controller_and_limits(controlled, capsys):
+    link, control = controlled
+    link.before_step = lambda: None
+    first = observe(link, 0.001).last
+    for _ in range(100):
+        control()
+    seen = observe(link, 0.001)
+    assert seen.last.num_accepted == first.num_accepted + 100
+    print_status(make_console(), ARM, seen)
+    text = capsys.readouterr().out
+    assert all(name in text for name in ARM.joint_names) and " 5 %" in text
+
+
+def test_stop_overrules_a_controller(controlled):
+    link, control = controlled
+    assert stop_arm(link).guard_state == Status.STATE_HOLD
+    assert "commanded HOLD" in link.guard.hold_reason
+    for _ in range(2000):
+        control()
+    assert link.guard.state == Status.STATE_HOLD
+    reset_fault(link, lambda text: None)
+    assert first_status(link)[0].fault_text == ""
+
+
+def test_stop_switches_power_off_but_never_on(controlled):
+    link, _ = controlled
+    assert stop_arm(link, power_off=True).guard_state == Status.STATE_OFF
+    sent = len(link.commands)
+    assert stop_arm(link).guard_state == Status.STATE_OFF and len(link.commands) == sent
+    with pytest.raises(
+        ControllerError, match=r"driver does not accept OFF \(modes\)\. Press the emergency stop button"
+    ):
+        stop_arm(GuardedArm(), power_off=True)
+    link = GuardedArm(ALL_MODES)
+    fault(link)
+    with pytest.raises(ControllerError, match="has a fault, in which its guard does not switch the power off"):
+        stop_arm(link, power_off=True)
+
+
+def test_arm_that_does_not_stop_is_an_error():
+    link = GuardedArm()
+    next_status = link.next_status
+
+    def moving(seconds):
+        status = next_status(seconds)
+        status.guard_state = Status.STATE_EFFORT
+        return status
+
+    link.next_status = moving
+    with pytest.raises(ControllerError, match=r"MTML does not stop: its state is effort.*Press the emergency stop"):
+        stop_arm(link)
+
+
+def test_commands_of_the_operator(monkeypatch, capsys):
+    link = GuardedArm(ALL_MODES)
+    monkeypatch.setattr("dvrk_drake.cli.lcm._operator_link", lambda *_: nullcontext(link))
+    for command, code, text in (
+        (["status"], 0, "MTML: hold, no controller sends commands."),
+        (["stop", "--power-off"], 0, "MTML is stopped: off"),
+        (["status"], 0, "MTML: off, the motors have no power."),
+    ):
+        assert main([*command, "--arm", "mtml"]) == code
+        assert text in capsys.readouterr().out
