@@ -52,9 +52,9 @@ from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 from dvrk_drake.models.sdf_elements import DRAKE
 from dvrk_drake.models.sdf_model import compose_sdf
+from dvrk_drake.systems.arm_drive import add_arm_drive
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.ideal_drive import add_arm_drive
 
 ARM = load_arm("psm")
 N = ARM.num_joints

@@ -34,11 +34,12 @@ if TYPE_CHECKING:
     from dvrk_drake.recordings.samples import write_samples
     from dvrk_drake.recordings.writing import write_recording
     from dvrk_drake.reports.html.write import write_report
+    from dvrk_drake.systems.arm_drive import add_arm_drive
+    from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
     from dvrk_drake.systems.arm_station import ArmStation
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-    from dvrk_drake.systems.ideal_drive import add_arm_drive
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
 #: Mapping from a public name to the module that defines it.
@@ -51,11 +52,12 @@ _MODULES = {
     "IdentifiedModel": "dynamics.identified_model",
     "MotionLimits": "analysis.excitation.motion_limits",
     "PeriodicMotion": "recordings.periodic_motion",
+    "PlantEffects": "systems.arm_effects.dry_friction",
     "Recording": "recordings.recording",
     "Scenario": "experiments.scenario",
     "TeleoperatedArms": "systems.teleoperated_arms",
     "add_arm": "models.plant",
-    "add_arm_drive": "systems.ideal_drive",
+    "add_arm_drive": "systems.arm_drive",
     "add_closed_loop": "systems.closed_loop",
     "check": "analysis.check.recording_check",
     "design_excitation": "analysis.excitation.design",
@@ -87,6 +89,7 @@ __all__ = [
     "IdentifiedModel",
     "MotionLimits",
     "PeriodicMotion",
+    "PlantEffects",
     "Recording",
     "Scenario",
     "TeleoperatedArms",

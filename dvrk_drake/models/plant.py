@@ -48,6 +48,7 @@ def add_arm(
 ) -> ModelInstanceIndex:
     """Adds an arm to a plant that is not finalized, e.g. beside other arms and objects, and welds its base.
 
+    The default pose of the arm is zero, or the nearest pose inside its limits.
     Gravity and contact settings of the plant remain. Models and controllers use `arm.gravity`, in the base frame:
     choose `arm.with_gravity(...)` for a base that is tilted, see `add_arm_drive`. The loop closures require Drake's SAP
     solver, i.e. the contact approximation `sap`, `similar` or `lagged` (the default). A continuous plant can be
@@ -103,6 +104,9 @@ def add_arm(
         plant.WeldFrames(parent_frame or plant.world_frame(), base, X_PB or RigidTransform())
         for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
             plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
+        home = arm.linkage.position(np.clip(0.0, arm.position_lower, arm.position_upper))
+        for name, position in zip(arm.tree_joint_names, home, strict=True):
+            plant.GetJointByName(name, instance).set_default_positions([position])
     except RuntimeError as error:
         raise ArmError(f"{', '.join(arm.sdf)}: Drake cannot load this model: {error}") from error
     return instance

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -17,11 +17,10 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.plant import add_arm, set_arm_positions, tree_selector
-from dvrk_drake.systems.arm_effects.drive_step import DriveStep
-from dvrk_drake.systems.arm_effects.drive_with_effects import DriveWithEffects, add_drive_with_effects
+from dvrk_drake.models.plant import add_arm
+from dvrk_drake.systems.arm_drive import ArmDrive, add_arm_drive
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
-from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_disturbance, add_ideal_drive
+from dvrk_drake.systems.ideal_drive import plant_config_fault
 
 
 @dataclass(frozen=True)
@@ -155,57 +154,29 @@ class ArmStation(Diagram):
         """
         super().__init__()
         arm.refuse_locked_joints("a station")
-        self._arm = arm
-        self._ground_truth_arm = plant_arm or arm
-        self._plant_effects: PlantEffects | None = None
-        self._drive_step: DriveStep | None = None
+        self._arm, simulated = arm, plant_arm or arm
         plant_config = plant_config or arm_plant_config()
         if fault := plant_config_fault(plant_config):
             raise StationError(fault)
-        if self._ground_truth_arm.joint_names != arm.joint_names:
+        if simulated.joint_names != arm.joint_names:
             raise StationError(
                 f"plant_arm must have the joints of {arm.name}: {', '.join(arm.joint_names)}; "
-                f"{self._ground_truth_arm.name} has {', '.join(self._ground_truth_arm.joint_names)}"
+                f"{simulated.name} has {', '.join(simulated.joint_names)}"
             )
         builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlant(plant_config, builder)
         # The plant contains only the arm, so the arm has contacts only with bodies that `modify_plant` adds.
-        self._plant.mutable_gravity_field().set_gravity_vector(self._ground_truth_arm.gravity)
-        self._instance = add_arm(
-            self._plant, self._ground_truth_arm, closure=closure, collision_shapes=modify_plant is not None
-        )
+        self._plant.mutable_gravity_field().set_gravity_vector(simulated.gravity)
+        instance = add_arm(self._plant, simulated, closure=closure, collision_shapes=modify_plant is not None)
         if modify_plant is not None:
             modify_plant(self._plant)
-        if effects is not None:
-            self._plant_effects = PlantEffects(self._plant, self._ground_truth_arm, self._instance, effects)
+        in_plant = None if effects is None else PlantEffects(self._plant, simulated, instance, effects)
         self._plant.Finalize()
-        self._remove_idle_collision_shapes()
-        self._joints = PlantJoints(self._plant, self._ground_truth_arm, self._instance)
-        self._set_default_pose()
-        if meshcat is not None:
-            # At its start, the visualizer deletes its own path, but not the parent path. An earlier SetTransform of the
-            # parent path therefore remains valid.
-            parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
-            MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
-        if effects is None or self._plant_effects is None:
-            ideal = add_ideal_drive(builder, self._plant, self._joints, self._instance)
-            disturbance = add_disturbance(builder, self._plant, self._joints)
-            ports = DrivePorts(
-                ideal.effort_commanded, ideal.effort_measured, ideal.state_estimated, disturbance, ideal.state_estimated
-            )
-        else:
-            drive = DriveWithEffects(
-                self._ground_truth_arm,
-                self._plant,
-                self._instance,
-                self._joints,
-                self._plant_effects,
-                effects,
-                seed,
-                self._home(),
-            )
-            ports, self._drive_step = add_drive_with_effects(builder, drive)
-        self._export(builder, ports)
+        self._drive = add_arm_drive(builder, self._plant, simulated, instance, in_plant, seed=seed)
+        export_arm(builder, arm.name.lower(), self._drive)
+        # At its start, the visualizer deletes its own path, but not the parent path. An earlier SetTransform of the
+        # parent path therefore remains valid.
+        export_scene(builder, self._plant, self._scene_graph, meshcat, f"{arm.name.lower()}/links")
         builder.BuildInto(self)
         self.set_name(f"{arm.name.lower()}_station")
 
@@ -220,7 +191,7 @@ class ArmStation(Diagram):
         return self._plant
 
     def SetPositions(self, context: Context, q: ArrayLike) -> None:
-        """Sets the independent joints to the pose q (n,), the linkage to a consistent pose, and all velocities to zero.
+        """Sets the independent joints to the pose q (n,), the linkage to a consistent pose, and its velocities to zero.
 
         Args:
             context: Context of this station, not of a Diagram that contains it.
@@ -229,25 +200,12 @@ class ArmStation(Diagram):
         Raises:
             StationError: q does not have n finite numbers.
         """
-        q = np.asarray(q, float)
-        if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
-            raise StationError(
-                f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers [rad, m]; got {q.tolist()}"
-            )
-        plant_context = self.GetMutableSubsystemContext(self.plant, context)
-        set_arm_positions(self.plant, plant_context, self._ground_truth_arm, q)
-        q_plant = self.plant.GetPositions(plant_context)
-        if self._plant_effects is not None:
-            self._plant_effects.drive.set_positions(q_plant, q)
-        self.plant.SetPositions(plant_context, q_plant)
-        if self._drive_step is not None:
-            self._drive_step.SetAtRest(self.GetMutableSubsystemContext(self._drive_step, context), q)
-        self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
+        self._drive.set_positions(self, context, q)
 
     def GetPositions(self, context: Context) -> NDArray[np.float64]:
         """Returns the pose (n,) [rad, m] of the independent joints in this station's context."""
         plant_context = self.GetSubsystemContext(self.plant, context)
-        q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._joints.index]
+        q: NDArray[np.float64] = self.plant.GetPositions(plant_context, self._drive.instance)[self._drive.joints.index]
         return q
 
     def SetLinkInertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
@@ -261,61 +219,39 @@ class ArmStation(Diagram):
             StationError: The arm has no link with one of the given names.
         """
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
-        bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._instance)}
+        bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._drive.instance)}
         if unknown := sorted(set(inertias) - set(bodies)):
             raise StationError(f"unknown link {', '.join(unknown)}; known links: {', '.join(bodies)}")
         for name, M_LLo_L in inertias.items():
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
-    def _remove_idle_collision_shapes(self) -> None:
-        """Removes the collision shapes if no two of them can collide. The shapes would slow down every step."""
-        if self._scene_graph.model_inspector().GetCollisionCandidates():
-            return
-        plant = self.plant
-        for body in map(plant.get_body, plant.GetBodyIndices(self._instance)):
-            for shape in plant.GetCollisionGeometriesForBody(body):
-                self._scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
-    def _home(self) -> NDArray[np.float64]:
-        return np.clip(0.0, self._ground_truth_arm.position_lower, self._ground_truth_arm.position_upper)
-
-    def _set_default_pose(self) -> None:
-        home = self._home()
-        q_plant = self.plant.GetDefaultPositions()
-        tree = tree_selector(self.plant, self._ground_truth_arm, self._instance)
-        q_plant[tree] = self._ground_truth_arm.linkage.position(home)
-        if self._plant_effects is not None:
-            self._plant_effects.drive.set_positions(q_plant, home)
-        self.plant.SetDefaultPositions(q_plant)
-
-    def _export(self, builder: DiagramBuilder, ports: DrivePorts) -> None:
-        name, n = self._arm.name.lower(), self._arm.num_joints
-        builder.ExportInput(ports.effort_commanded, f"{name}.effort_commanded")
-        builder.ExportInput(ports.effort_disturbance, f"{name}.effort_disturbance")
-        builder.ExportOutput(ports.effort_measured, f"{name}.effort_measured")
-        builder.ExportOutput(ports.state_true, f"{name}.state_true")
-        builder.ExportOutput(ports.state_estimated, f"{name}.state_estimated")
-        halves = np.split(np.eye(2 * n), 2)
-        for port, D in zip(("position_measured", "velocity_estimated"), halves, strict=True):
-            select = builder.AddNamedSystem(port, MatrixGain(D=D))
-            builder.Connect(ports.state_estimated, select.get_input_port())
-            builder.ExportOutput(select.get_output_port(), f"{name}.{port}")
-        builder.ExportOutput(self.plant.get_state_output_port(), "plant_state")
-        builder.ExportOutput(self.plant.get_body_poses_output_port(), "body_poses")
-        builder.ExportOutput(self._scene_graph.get_query_output_port(), "query_object")
+def export_arm(builder: DiagramBuilder, name: str, drive: ArmDrive) -> None:
+    """Exports the ports of an arm with the prefix `name`; see `ArmStation`."""
+    for port in ("effort_commanded", "effort_disturbance"):
+        builder.ExportInput(getattr(drive, port), f"{name}.{port}")
+    for port in ("effort_measured", "state_true", "state_estimated"):
+        builder.ExportOutput(getattr(drive, port), f"{name}.{port}")
+    halves = np.split(np.eye(2 * drive.arm.num_joints), 2)
+    for port, D in zip(("position_measured", "velocity_estimated"), halves, strict=True):
+        select = builder.AddNamedSystem(f"{name}_{port}", MatrixGain(D=D))
+        builder.Connect(drive.state_estimated, select.get_input_port())
+        builder.ExportOutput(select.get_output_port(), f"{name}.{port}")
 
 
-def plant_config_fault(config: MultibodyPlantConfig) -> str:
-    """Returns the reason why a configuration is not valid for a station's plant, or "" if it is valid."""
-    if not 0 < config.time_step <= 0.01:
-        return (
-            f"time_step must be above 0 and at most 0.01 s (the wrist is unstable with larger steps); "
-            f"got {config.time_step}"
-        )
-    if config.discrete_contact_approximation == "tamsi":
-        return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
-    if config.use_sampled_output_ports:
-        # With sampled output ports, Drake steps the plant before all discrete updates. The discrete updates would then
-        # use measurements from after the step.
-        return "use_sampled_output_ports must be false, so that a command acts after its measurement"
-    return ""
+def export_scene(
+    builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph, meshcat: Meshcat | None, path: str
+) -> None:
+    """Exports the ports of a plant, see `ArmStation`, and draws the plant in Meshcat below a path.
+
+    All collision shapes are removed if no two of them can collide. They would slow down every step.
+    """
+    inspector = scene_graph.model_inspector()
+    if not inspector.GetCollisionCandidates():
+        for shape in inspector.GetAllGeometryIds(Role.kProximity):
+            scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
+    if meshcat is not None:
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, MeshcatVisualizerParams(prefix=path))
+    builder.ExportOutput(plant.get_state_output_port(), "plant_state")
+    builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
+    builder.ExportOutput(scene_graph.get_query_output_port(), "query_object")

@@ -17,6 +17,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, EffortEffect, per_actuator
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
+from dvrk_drake.systems.ideal_drive import PlantJoints
 
 
 class Motors:
@@ -133,38 +134,37 @@ class DriveForce(LeafSystem):
 
     - `effort_commanded` (n): commanded joint efforts [N m, N]; see `Motors`. Unconnected: zero.
     - `effort_disturbance` (n): joint efforts that act in addition to the motors [N m, N]. Unconnected: zero.
-    - `plant_state`: state of the whole plant.
+    - `plant_state`: state of the arm's model instance.
     - `generalized_force`: generalized force (nv) for the plant's port `applied_generalized_force`. The effects of
       cables and springs are defined as the effort that compensates them, so they are subtracted.
     """
 
-    def __init__(self, arm: Arm, motors: Motors, parts: PlantEffects, effects: ArmEffects) -> None:
+    def __init__(self, motors: Motors, parts: PlantEffects, joints: PlantJoints) -> None:
         """Creates the system.
 
         Args:
-            arm: Simulated arm.
             motors: Motors of the arm.
-            parts: Effects in the finalized plant of the arm.
-            effects: Effects of the arm. Only cables and springs are used here.
+            parts: Effects of the arm in the finalized plant. Only cables and springs are used here.
+            joints: Joints of the arm in the plant.
 
         Raises:
             StationError: An effect is not valid for this arm.
         """
         super().__init__()
-        laws = [*effects.cables, *effects.springs]
+        arm, laws = parts.arm, parts.effects.position_dependent
         kinds = tuple(map(ActuatorEffect.of, laws))
         for kind in kinds:
             if fault := effect_fault(arm, kind, POSITION_KINDS):
                 raise StationError(f"{arm.name}: effects: cables, springs: {fault}")
         self._motors, self._from_motors = motors, parts.from_motors
-        self._joints = np.array(parts.joint_index, dtype=np.int64)
+        self._joints = np.array([joints.index, joints.velocity_index], dtype=np.int64)
         self._effects = HoldingArrays.of_effects(arm, kinds, np.array([-law.coefficient for law in laws]))
-        n, nv = arm.num_joints, len(parts.from_motors)
-        for name, size in (("effort_commanded", n), ("effort_disturbance", n), ("plant_state", 2 * nv)):
+        n, state_size = arm.num_joints, 2 * parts.to_actuators.shape[1]
+        for name, size in (("effort_commanded", n), ("effort_disturbance", n), ("plant_state", state_size)):
             self.DeclareVectorInputPort(name=name, size=size)
         self.DeclareVectorOutputPort(
             name="generalized_force",
-            size=nv,
+            size=len(parts.from_motors),
             calc=self._make_calc(n),
             prerequisites_of_calc={self.all_input_ports_ticket()},
         )
@@ -175,6 +175,7 @@ class DriveForce(LeafSystem):
         torque_into, add_at = entry_point(holding_torque_into), entry_point(_add_at)
         constants, to_motors, from_motors = self._motors.constants, self._motors.to_motors, self._from_motors
         joints, effects, has_effects = self._joints, self._effects, len(self._effects.effects) > 0
+        force_index = joints[1]
         zero, q, tau, motors = np.zeros(n), np.empty(n), np.empty(n), np.empty(n)
 
         def calc(context: Context, output: BasicVector) -> None:
@@ -194,32 +195,33 @@ class DriveForce(LeafSystem):
             )
             if has_effects:
                 torque_into(q, effects, tau)
-                add_at(tau, joints, force)
+                add_at(tau, force_index, force)
 
         return calc
 
 
 @numba.njit(
-    "void(float64[::1], float64[::1], float64[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1],"
+    "void(float64[::1], float64[::1], float64[::1], int64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1],"
     " float64[::1], float64[::1], float64[::1])",
     cache=True,
 )
 def _force_into(command, disturbance, state, joints, constants, to_motors, from_motors, q, motors, force):
     """Writes the generalized force of motors and disturbance to `force`.
 
-    The joint positions are written to `q` and the actuator efforts to `motors`.
+    The joint positions are written to `q` and the actuator efforts to `motors`. The rows of `joints` are the indices of
+    the joints in `state` and in `force`.
     """
     motor_effort_into(command, constants, to_motors, motors)
     for i in range(len(force)):
         force[i] = 0.0
         for k in range(len(motors)):
             force[i] += from_motors[i, k] * motors[k]
-    for k in range(len(joints)):
-        force[joints[k]] += disturbance[k]
-        q[k] = state[joints[k]]
+    for k in range(len(q)):
+        force[joints[1, k]] += disturbance[k]
+        q[k] = state[joints[0, k]]
 
 
 @numba.njit("void(float64[::1], int64[::1], float64[::1])", cache=True)
-def _add_at(tau, joints, force):
-    for k in range(len(joints)):
-        force[joints[k]] += tau[k]
+def _add_at(tau, force_index, force):
+    for k in range(len(tau)):
+        force[force_index[k]] += tau[k]

@@ -12,8 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, 
 
 from dvrk_drake.dynamics.actuator_effects import effect_step
 from dvrk_drake.dynamics.compiled import entry_point
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
+from dvrk_drake.models.effects_schema import per_actuator
 from dvrk_drake.systems.arm_effects.drive_force import round_to_step
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 
@@ -30,7 +29,7 @@ class DriveStep(LeafSystem):
         - desired_state
         - state_estimated
 
-    - `plant_state`: state of the plant, which contains the friction elements from `add_friction`.
+    - `plant_state`: state of the arm's model instance, which contains the friction elements from `add_friction`.
     - `desired_state`: desired positions, then desired velocities (zero), of all actuators of the arm's model instance.
       They are for the plant's port `desired_state`. The desired position of a `Slider` is the anchor of its spring.
     - `state_estimated` (2n): measured q, then v of the arm's joints [rad, rad/s; m, m/s on a prismatic joint], delayed
@@ -49,20 +48,20 @@ class DriveStep(LeafSystem):
 
     **Start.** Initialization sets the measurements to those of an arm that has been at rest at its present pose. With a
     delay, systems that read `state_estimated` during initialization still get the measurements at the pose of the last
-    call of `SetAtRest`, or of `q_default`.
+    call of `SetAtRest`, or at the default pose of
+    the plant.
     """
 
-    def __init__(self, arm: Arm, parts: PlantEffects, effects: ArmEffects, q_default: NDArray[np.float64]) -> None:
+    def __init__(self, parts: PlantEffects, num_actuators: int) -> None:
         """Creates the system.
 
         Args:
-            arm: Simulated arm.
-            parts: Effects in the finalized plant of the arm.
-            effects: Effects of the arm. Only encoder and delay are used here.
-            q_default: Initial pose (n,) [rad, m] of the arm at rest.
+            parts: Effects of the arm in the finalized plant. Only encoder and delay are used here.
+            num_actuators: Number of actuators of the arm's model instance.
         """
         super().__init__()
-        n, time_step = arm.num_joints, parts.time_step
+        arm, effects = parts.arm, parts.effects
+        n, time_step = arm.num_joints, parts.plant.time_step()
         encoder, delay = effects.encoder, effects.delay.measurement if effects.delay else 0
         resolution = per_actuator(encoder.resolution if encoder else {}, arm.joint_names, 0.0)
         decay = math.exp(-2.0 * math.pi * encoder.velocity_cut_off * time_step) if encoder else -1.0
@@ -77,9 +76,9 @@ class DriveStep(LeafSystem):
         self._measure_into = entry_point(_measure_into)
         self.DeclareVectorInputPort(name="plant_state", size=2 * exact.shape[1])
         self._queue_length = max(delay - 1, 0)
-        anchors = self.DeclareDiscreteState(num_state_variables=2 * parts.num_actuators)
+        anchors = self.DeclareDiscreteState(num_state_variables=2 * num_actuators)
         self.DeclareStateOutputPort(name="desired_state", state_index=anchors)
-        out, memory = self._at_rest(q_default)
+        out, memory = self._at_rest(parts.home)
         self.DeclareDiscreteState(out)
         self.DeclareDiscreteState(memory)
         if delay:

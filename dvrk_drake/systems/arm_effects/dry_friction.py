@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import Joint, JointActuator, ModelInstanceIndex, PdControllerGains
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault
@@ -16,7 +16,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import FRICTION_KINDS, ArmEffects, FrictionEffect
 from dvrk_drake.systems.arm_effects.drive_joints import DriveJoints
-from dvrk_drake.systems.ideal_drive import PlantJoints
+from dvrk_drake.systems.ideal_drive import PlantJoints, plant_config_fault
 
 #: Relaxation time of the presliding springs [s], i.e. damping divided by stiffness. The damping reduces oscillations
 #: after an impact. Drake limits the sum of spring effort and damper effort to the friction coefficient. The damping
@@ -31,7 +31,7 @@ class Slider:
     Attributes:
         code: Code of the kind of friction, for `effect_step`.
         actuator: Index of the actuator in the model instance.
-        position: Index of the joint's position in the plant.
+        position: Index of the joint's position in the q of the model instance.
         travel: Travel of the joint until the element slips [rad, m].
         fall_speed: Speed at which the slip limit is 1/e of the slip limit at rest [rad/s, m/s]; 0 for a constant slip
             limit.
@@ -46,19 +46,19 @@ class Slider:
     side: float
 
     @staticmethod
-    def from_element(element: tuple[JointActuator, FrictionEffect, float], order: Sequence[object]) -> Slider:
+    def from_element(element: tuple[JointActuator, FrictionEffect, float], joints: PlantJoints) -> Slider:
         """Creates the slider of an element that `add_friction` returned.
 
         Args:
             element: Actuator, effect, and ratio of the coordinate to the position of the actuator's joint.
-            order: Indices of the actuators of the model instance, in Drake's order.
+            joints: Joints of the arm in the plant.
         """
         actuator, effect, ratio = element
         side = 1.0 if effect.coefficient * ratio > 0 else -1.0
         return Slider(
             EFFECT_KINDS[effect.kind].code,
-            order.index(actuator.index()),
-            actuator.joint().position_start(),
+            [other.index() for other in joints.actuators].index(actuator.index()),
+            joints.position_index(actuator.joint()),
             effect.scale / abs(ratio),
             effect.fall_speed / abs(ratio),
             side,
@@ -134,30 +134,54 @@ def _add_damping(joint: Joint, damping: float) -> None:
 
 
 class PlantEffects:
-    """Adds effects to a plant that is not finalized. After Finalize, `finish` computes indices and matrices.
+    """Friction, stops and elastic cables of an arm in a plant, which may contain other arms and objects.
+
+    Create it before the plant is finalized, and give it to `add_arm_drive`, which adds the other effects.
 
     Attributes:
+        plant: Plant with the arm.
+        arm: The arm.
+        instance: Model instance of the arm.
+        effects: All effects of the arm.
         drive: Joints of the coordinates of the drive.
-        to_actuators: Matrix (n, nq) from plant positions to positions of the arm's actuators; after `finish`.
+        home: Pose (n,) [rad, m] of the arm before a pose is set; after `finish`.
+        to_actuators: Matrix (n, nq) from positions of the instance to positions of the arm's actuators; after `finish`.
         from_motors: Matrix (nv, n) from motor efforts to generalized forces of the plant; after `finish`.
-        joint_index: Indices (n,) of the joints in the plant's q and v; after `finish`.
         sliders: Friction elements with a moving anchor; after `finish`.
-        num_actuators: Number of actuators of the plant's instance; after `finish`.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+        >>> from pydrake.systems.framework import DiagramBuilder
+        >>> builder, arm = DiagramBuilder(), dvrk.load_arm("mtml")
+        >>> config = MultibodyPlantConfig(time_step=1e-3, use_sampled_output_ports=False)
+        >>> plant, scene_graph = AddMultibodyPlant(config, builder)
+        >>> mtml = dvrk.add_arm(plant, arm)
+        >>> effects = dvrk.PlantEffects(plant, arm, mtml, arm.effects.only(["friction", "encoder"]))
+        >>> plant.Finalize()
+        >>> drive = dvrk.add_arm_drive(builder, plant, arm, mtml, effects)
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex, effects: ArmEffects) -> None:
         """Adds the effects `friction`, `stops` and `stretch` to the plant.
 
         Args:
-            plant: Plant that is not finalized.
+            plant: Plant that is not finalized. A command acts after its measurement only if the sampled output ports of
+                the plant are disabled.
             arm: Arm that `add_arm` added to the plant.
-            instance: Model instance of the arm.
-            effects: Effects of the arm.
+            instance: Model instance that `add_arm` returned.
+            effects: Effects of the arm, e.g. `arm.effects` or `arm.effects.only(["friction"])`.
 
         Raises:
-            StationError: An effect is not valid for this arm.
+            StationError: An effect is not valid for this arm, or the plant has no discrete time step of up to 10 ms, or
+                sampled output ports.
         """
-        self._plant, self._arm = plant, arm
+        sampled = plant.has_sampled_output_ports()
+        if fault := plant_config_fault(
+            MultibodyPlantConfig(time_step=plant.time_step(), use_sampled_output_ports=sampled)
+        ):
+            raise StationError(fault)
+        self.plant, self.arm, self.instance, self.effects = plant, arm, instance, effects
         self.drive = DriveJoints(plant, arm, instance)
         for actuator, cable in effects.stretch.items():
             self.drive.add_motor(actuator, cable)
@@ -171,22 +195,19 @@ class PlantEffects:
                 ends = np.sort([lower[i] / ratio, upper[i] / ratio])
                 joint.set_position_limits(ends[:1], ends[1:])
 
-    @property
-    def time_step(self) -> float:
-        """Time step of the plant [s]."""
-        step: float = self._plant.time_step()
-        return step
-
     def finish(self, joints: PlantJoints) -> None:
-        """Computes the indices and matrices. Must be called after the plant is finalized."""
-        order = [actuator.index() for actuator in joints.actuators]
-        self.num_actuators = len(order)
-        self.sliders = [Slider.from_element(element, order) for element in self._elements]
-        J = self._arm.transmission.matrix
+        """Computes the matrices and the default pose. Must be called after the plant is finalized."""
+        plant, J = self.plant, self.arm.transmission.matrix
+        self.sliders = [Slider.from_element(element, joints) for element in self._elements]
+        self.home: NDArray[np.float64] = plant.GetDefaultPositions(self.instance)[joints.index]
+        q_plant = plant.GetDefaultPositions()
+        self.drive.set_positions(q_plant, self.home)
+        plant.SetDefaultPositions(q_plant)
         self.to_actuators: NDArray[np.float64] = np.ascontiguousarray(J @ joints.selection.T)
-        self.from_motors: NDArray[np.float64] = np.ascontiguousarray(joints.selection @ J.T)
-        self.joint_index = joints.index
-        for i, name in enumerate(self._arm.joint_names):
+        self.from_motors: NDArray[np.float64] = np.zeros((plant.num_velocities(), self.arm.num_joints))
+        self.from_motors[joints.velocity_index] = J.T
+        for i, name in enumerate(self.arm.joint_names):
             if (motor := self.drive.motors.get(name)) is not None:
-                own = np.eye(self._plant.num_positions())[motor.joint().position_start()]
-                self.to_actuators[i] = self.from_motors[:, i] = own
+                self.to_actuators[i] = self.from_motors[:, i] = 0.0
+                self.to_actuators[i, joints.position_index(motor.joint())] = 1.0
+                self.from_motors[motor.joint().velocity_start(), i] = 1.0

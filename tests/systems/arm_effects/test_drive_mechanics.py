@@ -18,7 +18,7 @@ def test_joints_of_drive_coordinates_follow_the_arm(name):
     run = Run(arm, arm.effects.only(["friction", "stops"]))
     plant = run.station.plant
     plant_context = plant.GetMyContextFromRoot(run.context)
-    added = run.station._plant_effects.drive._added
+    added = run.station._drive.effects.drive._added
     assert len(added) == {"mtml": 2, "mtmr": 2, "psm": 4}[name]
     moved = run.q
     for _ in range(100):
@@ -73,13 +73,18 @@ def test_coupled_stop_adds_no_energy(direction):
     assert energy[1][-1] < 0.8 * energy[1][0] < energy[0][100]
 
 
+def drive_force(run):
+    prefix = run.station.plant.GetModelInstanceName(run.station._drive.instance)
+    return run.station.GetSubsystemByName(f"{prefix}_drive_force")
+
+
 def test_cable_effort_has_opposite_sign_of_identified_effect():
     arm, q = load_arm("mtml"), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
     sine = DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.2)
     offset = DriveEffect("actuator.elbow_pitch", "offset", 0.0, 0.1)
     run = Run(arm, ArmEffects(cables=[sine], springs=[offset]), q)
-    force = run.station.GetSubsystemByName("drive_force")
-    effort = force.get_output_port().Eval(force.GetMyContextFromRoot(run.context))[run.station._joints.index]
+    force = drive_force(run)
+    effort = force.get_output_port().Eval(force.GetMyContextFromRoot(run.context))[run.station._drive.joints.index]
     np.testing.assert_allclose(effort, [0, -0.1, -0.1, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-12)
 
 
@@ -88,8 +93,8 @@ def test_cables_and_springs_are_conservative(name):
     """Their work on a closed path of the joints is zero."""
     arm = weightless(name)
     run = Run(arm, arm.effects.only(["cables", "springs"]))
-    system = run.station.GetSubsystemByName("drive_force")
-    context, index = system.CreateDefaultContext(), run.station._joints.index
+    system = drive_force(run)
+    context, index = system.CreateDefaultContext(), run.station._drive.joints.index
     phase = np.linspace(0, 2 * np.pi, 2001)
     ranges = 0.4 * (arm.position_upper - arm.position_lower)
     q = middle(arm) + ranges * np.sin(np.outer(phase, np.arange(1, arm.num_joints + 1)) + 0.3)
