@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import HalfSpace, Role
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
+from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.errors import ExcitationError
+from dvrk_drake.errors import DvrkDrakeError, ExcitationError
 from dvrk_drake.models.files import read_text_input
 from dvrk_drake.models.plant import package_map
 from dvrk_drake.models.schema_fault import number_fault, within
@@ -83,18 +83,9 @@ class Environment:
                 plant.world_body(), RigidTransform([0.0, 0.0, self.table]), HalfSpace(), "table", CoulombFriction()
             )
         if self.directives:
-            parser = Parser(plant)
-            parser.package_map().AddMap(package_map())
-            try:
-                parser.AddModelsFromString(self.directives, "dmd.yaml")
-            except RuntimeError as error:
-                reason = str(error).splitlines()[0][:300]
-                raise ExcitationError(f"environment: Drake cannot load the directives: {reason}") from error
+            add_directives(plant, self.directives, package_map(), "environment", ExcitationError)
 
     def _check_directives(self) -> None:
-        # Drake ends the process for some wrong directives and shapes, so these are found before Drake reads them.
-        if fault := _fault(parse_yaml(self.directives, "environment", ExcitationError)):
-            raise ExcitationError(f"environment: {fault}")
         plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
         self.add_to(plant)
         plant.Finalize()
@@ -116,7 +107,33 @@ class Environment:
             raise ExcitationError("environment: no object in the directives has a collision shape")
 
 
-def _fault(content: Any) -> str:
+def add_directives(
+    plant: MultibodyPlant, directives: str, packages: PackageMap, where: str, error: type[DvrkDrakeError]
+) -> None:
+    """Adds the objects in Drake model directives to a plant that is not finalized.
+
+    Args:
+        plant: Plant, with or without a scene graph.
+        directives: Text of a .dmd.yaml file.
+        packages: Packages of the URLs in the directives.
+        where: Source of the text, for messages.
+        error: Type of error to raise.
+
+    Raises:
+        DvrkDrakeError: The directives are not valid, or Drake cannot load them. The exception has the type `error`.
+    """
+    # Drake ends the process for some wrong directives and shapes, so these are found before Drake reads them.
+    if fault := _fault(parse_yaml(directives, where, error), packages):
+        raise error(f"{where}: {fault}")
+    parser = Parser(plant)
+    parser.package_map().AddMap(packages)
+    try:
+        parser.AddModelsFromString(directives, "dmd.yaml")
+    except RuntimeError as cause:
+        raise error(f"{where}: Drake cannot load the directives: {str(cause).splitlines()[0][:300]}") from cause
+
+
+def _fault(content: Any, packages: PackageMap) -> str:
     """Returns why the parsed content of directives is not valid, or ""."""
     if not isinstance(content, dict) or set(content) != {"directives"} or not isinstance(content["directives"], list):
         return "the file must have the key directives with a list"
@@ -128,7 +145,7 @@ def _fault(content: Any) -> str:
         scheme, _, rest = url.partition("://")
         if scheme not in ("package", "file") or (scheme == "file" and not rest.startswith("/")):
             return f'directive {number}: file is "{url}"; allowed: package://dvrk_drake/... or file:///...'
-        if scheme == "package" and not package_map().Contains(package := rest.partition("/")[0]):
+        if scheme == "package" and not packages.Contains(package := rest.partition("/")[0]):
             return f'directive {number}: unknown package "{package}"; allowed: dvrk_drake, or an absolute file:/// URL'
         if fault := number_fault(values):
             return f"directive {number}: {fault.removeprefix('.')}"

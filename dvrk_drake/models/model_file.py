@@ -157,7 +157,7 @@ class _Model:
         if scene_graph is not None:
             plant.RegisterAsSourceForSceneGraph(scene_graph)
         parser = Parser(plant)
-        _add_packages(parser.package_map(), path.parent)
+        add_packages(parser.package_map(), path.parent)
         parser.AddModels(str(path))
         documents = [read_xml(file) for file in _files(path, parser)]
         _weld_base(plant)
@@ -424,7 +424,7 @@ class _Model:
                     add_element(material, "diffuse", numbers_text([color.r(), color.g(), color.b(), color.a()]))
 
 
-def _add_packages(packages: PackageMap, folder: Path) -> None:
+def add_packages(packages: PackageMap, folder: Path) -> None:
     """Adds the packages of ROS and those in a folder, and the folder and its parent, where most packages have models.
 
     Drake's own search is not used, because it would search all folders below, e.g. of a home folder.

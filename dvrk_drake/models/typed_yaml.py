@@ -36,6 +36,10 @@ class _Loader(_FastLoader):
         return super().construct_mapping(node, deep)
 
 
+# Rotation in Drake's model directives, e.g. `rotation: !Rpy {deg: [0, 0, 90]}`. All other tags are refused.
+_Loader.add_constructor("!Rpy", lambda loader, node: loader.construct_mapping(node, deep=True))
+
+
 def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrakeError], what: str) -> Schema:
     """Returns the content of the file at `path` as an object of the schema.
 
