@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+    from dvrk_drake.systems.station import Station
+    from dvrk_drake.systems.station_config import load_station_config
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
 #: Mapping from a public name to the module that defines it.
@@ -55,6 +57,7 @@ _MODULES = {
     "PlantEffects": "systems.arm_effects.dry_friction",
     "Recording": "recordings.recording",
     "Scenario": "experiments.scenario",
+    "Station": "systems.station",
     "TeleoperatedArms": "systems.teleoperated_arms",
     "add_arm": "models.plant",
     "add_arm_drive": "systems.arm_drive",
@@ -67,6 +70,7 @@ _MODULES = {
     "load_arm": "models.arm_files",
     "lock_joints": "models.locked_joints",
     "load_scenario": "experiments.scenario",
+    "load_station_config": "systems.station_config",
     "payload": "analysis.payload.payload",
     "predict": "analysis.validation",
     "read_recording": "recordings.reading",
@@ -92,6 +96,7 @@ __all__ = [
     "PlantEffects",
     "Recording",
     "Scenario",
+    "Station",
     "TeleoperatedArms",
     "add_arm",
     "add_arm_drive",
@@ -103,6 +108,7 @@ __all__ = [
     "identify",
     "load_arm",
     "load_scenario",
+    "load_station_config",
     "lock_joints",
     "payload",
     "predict",

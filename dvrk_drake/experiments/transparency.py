@@ -21,7 +21,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.closed_loop import connect_controller
+from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
@@ -164,7 +164,7 @@ def simulate_operator(
     station = builder.AddSystem(ArmStation(arm, effects=effects, seed=seed))
     if compensation.model is not None:
         controller = GravityPidController(compensation.model, mode="gravity")
-        connect_controller(builder, station, controller, friction=_friction(arm, compensation))
+        add_closed_loop(builder, station, controller, friction=_friction(arm, compensation))
     hand = builder.AddSystem(Hand(arm, frame_name, grip))
     handle_path = PiecewisePose.MakeLinear(knots, poses)
     source = builder.AddSystem(PoseTrajectorySource(handle_path))

@@ -1,22 +1,22 @@
-"""Configuration of a station, as a schema for Drake's yaml_load_typed, and creation of the station.
+"""Configuration of a station, as a schema for Drake's yaml_load_typed.
 
 This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Optional, cast, get_args
+from typing import Optional, get_args
 
 import yaml
 from pydrake.common.yaml import yaml_load_typed
-from pydrake.geometry import Meshcat
-from pydrake.lcm import DrakeLcmInterface
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault
-from dvrk_drake.errors import ArmError, StationError
+from dvrk_drake.errors import ArmError, DvrkDrakeError, StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
@@ -25,8 +25,8 @@ from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.schema_fault import number_fault, schema_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml
-from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, plant_config_fault
-from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
+from dvrk_drake.systems.arm_station import arm_plant_config
+from dvrk_drake.systems.ideal_drive import plant_config_fault
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 
@@ -96,35 +96,93 @@ class ArmConfig:
 
 
 @dataclass
-class StationConfig(ArmConfig):
-    """Schema of a station file: one arm, simulated or real.
+class BasePose:
+    """Pose X_PB of an arm's base frame in a frame P.
 
     Attributes:
-        plant: Configuration of the simulated plant. The default is `arm_plant_config()`.
-        simulator: Configuration of the simulator. The caller applies it with `ApplySimulatorConfig`.
+        parent_frame: Name of the frame P in the directives of the station, e.g. "table::top". If it is empty, P is the
+            world frame.
+        translation: Position of the base (3,) [m].
+        rpy: Roll, pitch and yaw angle (3,) [rad], as in Drake's `RollPitchYaw`.
+    """
+
+    parent_frame: str = ""
+    # Distances within a room, and angles of up to a full turn of either sign.
+    translation: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0], metadata=within(-100.0, 100.0, "m"))
+    rpy: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0], metadata=within(-6.3, 6.3, "rad"))
+
+    def transform(self) -> RigidTransform:
+        """Returns the pose.
+
+        Raises:
+            StationError: A field does not have three numbers.
+        """
+        for name, values in (("translation", self.translation), ("rpy", self.rpy)):
+            if len(values) != 3:
+                raise StationError(f"X_PB.{name} has {len(values)} numbers; allowed: 3")
+        return RigidTransform(RollPitchYaw(self.rpy), self.translation)
+
+
+@dataclass
+class StationArm(ArmConfig):
+    """One arm of a station. Real arms of the same kind need arm files with different names, or ROS namespaces.
+
+    Attributes:
+        X_PB: Pose of the base. The gravity vector in the base frame follows from it. `gravity` and the arm's file must
+            not state another one.
         driver: Configuration of the hardware driver over LCM. Its paths are relative to the station file.
         ros_driver: Configuration of the hardware driver over ROS 2, which then replaces `driver`. None: LCM is used.
     """
 
-    plant: MultibodyPlantConfig = field(default_factory=arm_plant_config)
-    simulator: SimulatorConfig = field(default_factory=SimulatorConfig)
+    X_PB: BasePose = field(default_factory=BasePose)
     driver: DvrkDriver = field(default_factory=DvrkDriver)
     ros_driver: Optional[CrtkDriver] = None  # noqa: UP045, yaml_load_typed does not support "|"
+
+    def check(self) -> None:
+        """Checks the values, as `StationConfig.check` does."""
+        if fault := self.arm_fault():
+            raise StationError(fault)
+        self.X_PB.transform()
+        self.driver.check()
+        if self.ros_driver is not None:
+            self.ros_driver.check()
+
+
+@dataclass
+class StationConfig:
+    """Schema of a station file: arms, simulated or real, and other objects; see `Station`.
+
+    Attributes:
+        arms: The arms. Their names are the prefixes of the station's ports.
+        directives: File with Drake model directives of other objects, e.g. "table.dmd.yaml", relative to the station
+            file. `package://` is searched beside this file and in ROS_PACKAGE_PATH. Empty: there are no other objects.
+        plant: Configuration of the simulated plant. The default is `arm_plant_config()`.
+        simulator: Configuration of the simulator. The caller applies it with `ApplySimulatorConfig`.
+    """
+
+    arms: dict[str, StationArm] = field(default_factory=dict)
+    directives: str = ""
+    plant: MultibodyPlantConfig = field(default_factory=arm_plant_config)
+    simulator: SimulatorConfig = field(default_factory=SimulatorConfig)
 
     def check(self) -> None:
         """Checks the values.
 
         Raises:
             StationError: A value is not allowed. The message states the field, the value and the allowed range.
-            ArmError: The arm cannot be loaded.
+            ArmError: An arm cannot be loaded.
         """
-        if fault := self.arm_fault():
-            raise StationError(fault)
+        if not self.arms:
+            raise StationError("arms is empty; give the arms by name, e.g. arms: {left: {arm: mtml}}")
         if fault := plant_config_fault(self.plant):
             raise StationError(f"plant.{fault}")
-        self.driver.check()
-        if self.ros_driver is not None:
-            self.ros_driver.check()
+        for name, arm in self.arms.items():
+            if not re.fullmatch(r"\w+", name):
+                raise StationError(f'arms: the name "{name}" is not valid; allowed: letters, digits and _')
+            try:
+                arm.check()
+            except DvrkDrakeError as error:
+                raise type(error)(f"arms.{name}: {error}") from error
 
 
 def load_station_config(path: str | Path) -> StationConfig:
@@ -132,53 +190,34 @@ def load_station_config(path: str | Path) -> StationConfig:
 
     Raises:
         StationError: The file cannot be read, or has an unknown key or a value that is not allowed.
-        ArmError: The arm cannot be loaded.
+        ArmError: An arm cannot be loaded.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from pathlib import Path
+        >>> file = Path("station.yaml")
+        >>> _ = file.write_text("arms: {left: {arm: mtml, simulated_effects: [friction]}, right: {arm: mtmr}}")
+        >>> list(dvrk.load_station_config(file).arms)
+        ['left', 'right']
     """
     content = load_yaml(path, StationError)
-    for key, schema in (("driver", DvrkDriver), ("ros_driver", CrtkDriver)):
-        section = content.get(key) if isinstance(content, dict) else None
+    arms = content.get("arms") if isinstance(content, dict) else None
+    for name, section in arms.items() if isinstance(arms, dict) else ():
         # Drake's messages name neither the section nor the accepted values.
-        if section is not None and (fault := schema_fault(schema, section, key)):
-            raise StationError(f"{path}: {key}: {fault}")
+        if fault := schema_fault(StationArm, section, f"arms.{name}"):
+            raise StationError(f"{path}: arms.{name}: {fault}")
     try:
-        config: StationConfig = yaml_load_typed(schema=StationConfig, data=yaml.safe_dump(content))
+        config: StationConfig = yaml_load_typed(schema=StationConfig, data=yaml.safe_dump(content, sort_keys=False))
         config.check()
     except ArmError as error:
         raise ArmError(f"{path}: {error}") from error
     except Exception as error:  # exceptions of Drake, YAML and the operating system
         raise StationError(f"{path}: {' '.join(str(error).split())}") from error
-    for driver in (config.driver, config.ros_driver):
-        if driver is not None:
-            driver.relative_to(Path(path).parent)
+    folder = Path(path).parent
+    if config.directives:
+        config.directives = str(folder / config.directives)
+    for arm in config.arms.values():
+        arm.driver.relative_to(folder)
+        if arm.ros_driver is not None:
+            arm.ros_driver.relative_to(folder)
     return config
-
-
-def make_arm_station(
-    config: StationConfig,
-    *,
-    hardware: bool = False,
-    meshcat: Meshcat | None = None,
-    lcm: DrakeLcmInterface | None = None,
-) -> ArmStation | HardwareArmStation:
-    """Creates a station. As with Drake's MakeHardwareStation, the simulated and the real arm have the same ports.
-
-    Args:
-        config: Configuration of the station; `simulator` is not used here.
-        hardware: True for the real arm, False for a simulated arm.
-        meshcat: Meshcat in which the simulated arm is drawn. None: the arm is not drawn.
-        lcm: LCM interface for the real arm; see `HardwareArmStation`.
-
-    Raises:
-        StationError, ArmError: The configuration is not allowed.
-    """
-    config.check()
-    if hardware:
-        return HardwareArmStation(config.mounted_arm, driver=config.ros_driver or config.driver, lcm=lcm)
-    return ArmStation(
-        config.mounted_arm,
-        plant_config=config.plant,
-        meshcat=meshcat,
-        closure=cast(Closure, config.closure),
-        effects=config.all_effects,
-        seed=config.seed,
-    )

@@ -13,6 +13,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import set_joint_damping
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Hand
 from dvrk_drake.systems.teleoperation import FOLLOWER_FRAME, MASTER_FRAME, Teleoperation
@@ -74,16 +75,13 @@ class TeleoperatedArms(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         damping = partial(set_joint_damping, arm=master, damping=MASTER_DAMPING * master.effort_limits)
-        self.master = builder.AddSystem(ArmStation(master, meshcat=meshcat, modify_plant=damping))
-        self.follower = builder.AddSystem(ArmStation(follower, meshcat=meshcat))
+        self.master = ArmStation(master, meshcat=meshcat, modify_plant=damping)
+        self.follower = ArmStation(follower, meshcat=meshcat)
+        controller = GravityPidController(IdentifiedModel.from_arm(follower))
+        add_closed_loop(builder, self.master, GravityPidController(IdentifiedModel.from_arm(master), mode="gravity"))
+        add_closed_loop(builder, self.follower, controller)
         self.teleoperation = builder.AddNamedSystem(
             "teleoperation", Teleoperation(master, follower, scale=scale, R_FM=R_FM)
-        )
-        master_controller = builder.AddNamedSystem(
-            "master_controller", GravityPidController(IdentifiedModel.from_arm(master), mode="gravity")
-        )
-        follower_controller = builder.AddNamedSystem(
-            "follower_controller", GravityPidController(IdentifiedModel.from_arm(follower))
         )
         hand = builder.AddNamedSystem("hand", Hand(master, MASTER_FRAME))
 
@@ -93,17 +91,13 @@ class TeleoperatedArms(Diagram):
             self.follower.GetOutputPort(f"{F}.state_estimated"),
         )
         connect = builder.Connect
-        connect(state_M, master_controller.GetInputPort("state_estimated"))
         connect(state_M, hand.GetInputPort("state_estimated"))
-        connect(master_controller.GetOutputPort("effort"), self.master.GetInputPort(f"{M}.effort_commanded"))
         connect(hand.GetOutputPort("effort_disturbance"), self.master.GetInputPort(f"{M}.effort_disturbance"))
         connect(self.master.GetOutputPort(f"{M}.position_measured"), self.teleoperation.GetInputPort("master_position"))
         connect(
             self.follower.GetOutputPort(f"{F}.position_measured"), self.teleoperation.GetInputPort("follower_position")
         )
-        connect(self.teleoperation.GetOutputPort("desired_state"), follower_controller.GetInputPort("desired_state"))
-        connect(state_F, follower_controller.GetInputPort("state_estimated"))
-        connect(follower_controller.GetOutputPort("effort"), self.follower.GetInputPort(f"{F}.effort_commanded"))
+        connect(self.teleoperation.GetOutputPort("desired_state"), controller.GetInputPort("desired_state"))
 
         builder.ExportInput(hand.GetInputPort("X_BG_desired"), "X_MG_desired")
         for name in ("engaged", "jaw_angle"):

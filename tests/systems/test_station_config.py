@@ -12,22 +12,25 @@ from repository import ROOT
 from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
+from dvrk_drake.systems.arm_station import arm_plant_config, station_ports
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
-from dvrk_drake.systems.station_config import ArmConfig, StationConfig, load_station_config, make_arm_station
+from dvrk_drake.systems.station import Station
+from dvrk_drake.systems.station_config import ArmConfig, StationArm, StationConfig, load_station_config
 
 pytestmark = pytest.mark.drake_api
 
 FILE = """
-arm: psm
-closure: ball
-gravity: [0, 9.81, 0]
-simulated_effects: [friction]
-seed: 3
+arms:
+  side:
+    arm: psm
+    closure: ball
+    X_PB: {translation: [0, 0, 0.5], rpy: [1.5707963267948966, 0, 0]}
+    simulated_effects: [friction]
+    seed: 3
+    driver: {status_period: 0.002, model: model.yaml}
 plant: {time_step: 0.002, contact_model: point}
 simulator: {target_realtime_rate: 0.0, start_time: 1.0}
-driver: {status_period: 0.002, model: model.yaml}
 """
 
 
@@ -40,26 +43,30 @@ def path(tmp_path):
 
 def test_file_is_loaded_with_defaults(path):
     config = load_station_config(path)
-    assert (config.arm, config.closure, config.seed, config.simulated_effects) == ("psm", "ball", 3, ["friction"])
+    (arm,) = config.arms.values()
+    assert (arm.arm, arm.closure, arm.seed, arm.simulated_effects) == ("psm", "ball", 3, ["friction"])
     assert (config.plant.time_step, config.plant.contact_model) == (0.002, "point")
     assert config.plant.discrete_contact_approximation == "sap" and not config.plant.use_sampled_output_ports
-    assert config.driver.status_period == 0.002
-    assert config.driver.model == str(path.parent / "model.yaml")
+    assert arm.driver.status_period == 0.002
+    assert arm.driver.model == str(path.parent / "model.yaml")
 
 
 def test_configuration_round_trip():
-    config = StationConfig(arm="mtmr", plant=arm_plant_config(2e-3))
+    config = StationConfig(arms={"right": StationArm(arm="mtmr")}, plant=arm_plant_config(2e-3))
     again = yaml_load_typed(schema=StationConfig, data=yaml_dump_typed(config, schema=StationConfig))
     assert repr(again) == repr(config), "Drake's own schemas do not define equality"
 
 
 def test_station_matches_its_file(path):
     config = load_station_config(path)
-    station = make_arm_station(config)
-    assert isinstance(station, ArmStation) and station.plant.time_step() == 0.002
-    np.testing.assert_allclose(station.plant.gravity_field().gravity_vector(), [0.0, 9.81, 0.0], atol=0)
-    assert station.plant.get_contact_model().name == "kPoint"
-    assert station.plant.num_constraints() > 0, "pinned loops"
+    station = Station(config)
+    plant = station.plant
+    assert plant.time_step() == 0.002
+    assert plant.get_contact_model().name == "kPoint"
+    assert plant.num_constraints() > 0, "pinned loops"
+    X_WB = plant.GetFrameByName("base_link").CalcPoseInWorld(plant.CreateDefaultContext())
+    np.testing.assert_allclose(X_WB.GetAsMatrix4()[:3], [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0.5]], atol=1e-12)
+    np.testing.assert_allclose(station.arms["side"].gravity, [0.0, -9.81, 0.0], atol=1e-12)
     simulator = Simulator(station)
     ApplySimulatorConfig(config.simulator, simulator)
     simulator.Initialize()
@@ -68,38 +75,46 @@ def test_station_matches_its_file(path):
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_hardware_and_simulation_have_the_same_ports(name):
-    config = StationConfig(arm=name)
-    hardware, simulation = make_arm_station(config, hardware=True, lcm=DrakeLcm("memq://")), make_arm_station(config)
-    assert isinstance(hardware, HardwareArmStation)
-    for ports in (hardware, simulation):
+    config = StationConfig(arms={name: StationArm(arm=name), "other": StationArm(arm="mtmr")})
+    lcm = DrakeLcm("memq://")
+    for station in (Station(config, hardware=True, lcm=lcm), Station(config), HardwareArmStation(load_arm(name))):
         for port, size in station_ports(load_arm(name)).inputs.items():
-            assert ports.GetInputPort(port).size() == size
+            assert station.GetInputPort(port).size() == size
         for port, size in station_ports(load_arm(name)).outputs.items():
-            assert ports.GetOutputPort(port).size() == size
+            assert station.GetOutputPort(port).size() == size
 
 
 def test_scenario_has_the_same_arm_fields():
-    assert issubclass(Scenario, ArmConfig) and issubclass(StationConfig, ArmConfig)
+    assert issubclass(Scenario, ArmConfig) and issubclass(StationArm, ArmConfig)
     # "closure" has another default in a scenario, but the same meaning.
-    own = [set(schema.__annotations__) & set(ArmConfig.__annotations__) for schema in (Scenario, StationConfig)]
+    own = [set(schema.__annotations__) & set(ArmConfig.__annotations__) for schema in (Scenario, StationArm)]
     assert own == [{"closure"}, set()]
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("arm: psm", "", "arm is missing; give an arm's name"),
+        ("arm: psm", "", r"arms\.side: arm is missing; give an arm's name"),
+        ("arm: psm", "arm: pms", r"station\.yaml: arms\.side: .*pms"),
         ("closure: ball", "closure: weld", 'closure is "weld"; allowed: mimic, ball'),
+        ("[0, 0, 0.5]", "[0, 0.5]", r"arms\.side: X_PB\.translation has 2 numbers; allowed: 3"),
         (
-            "[0, 9.81, 0]",
-            "[0, 981, 0]",
-            r"station\.yaml: gravity \(0, 981, 0\) must be a vector of three numbers with a norm up to 30 m/s",
+            "1.5707963267948966",
+            "90",
+            r"arms\.side: X_PB\.rpy\[0\] is 90; allowed: -6\.3\.\.6\.3 rad; is it in degrees\?",
+        ),
+        (
+            "seed: 3",
+            "gravity: [0, 981, 0]",
+            r"arms\.side: gravity\[1\] is 981; allowed: -30\.\.30 m/s\^2",
         ),
         ("seed: 3", "seed: -1", r"seed is -1; allowed: 0\.\."),
-        ("[friction]", "[fraction]", "simulated arm: .*fraction"),
+        ("[friction]", "[fraction]", r"arms\.side: simulated arm: .*fraction"),
         ("time_step: 0.002,", "time_step: 0.02,", r"plant\.time_step must be above 0 and at most 0\.01 s"),
-        ("status_period: 0.002", "status_period: 0.2", r"status_period is 0\.2; allowed"),
-        ("seed: 3", "sead: 3", r"station\.yaml: .*sead"),
+        ("status_period: 0.002", "status_period: 0.2", r"driver\.status_period is 0\.2; allowed"),
+        ("seed: 3", "sead: 3", r'station\.yaml: arms\.side: key "sead" is unknown; did you mean "seed"\?'),
+        ("  side:", "  left side:", 'the name "left side" is not valid; allowed: letters, digits and _'),
+        ("plant:", "plan:", r"station\.yaml: .*plan"),
         ("point", "[", r"station\.yaml: "),
     ],
 )
@@ -111,31 +126,66 @@ def test_invalid_values_are_reported(path, old, new, message):
     assert "\n" not in str(error.value)
 
 
+def test_gravity_of_another_base_is_refused(path):
+    path.write_text(FILE.replace("seed: 3", "gravity: [0, 9.81, 0]"))
+    with pytest.raises(StationError, match=r"arms\.side: X_PB gives the gravity \[0\.0, -9\.81, 0\.0\] m/s\^2"):
+        Station(load_station_config(path))
+
+
+def test_a_file_without_arms_is_reported(path):
+    path.write_text("plant: {time_step: 0.001}")
+    with pytest.raises(StationError, match=r"station\.yaml: arms is empty; give the arms by name"):
+        load_station_config(path)
+
+
+@pytest.mark.parametrize(
+    ("directives", "parent", "message"),
+    [
+        (None, "", r"cell\.dmd\.yaml: "),
+        ("directives: [{add_arm: {}}]", "", r"cell\.dmd\.yaml: directive 1 is not valid; allowed: add_model, "),
+        ("directives: []", "table::top", r'arms\.side\.X_PB\.parent_frame is "table::top"; not a frame of the'),
+        (
+            "directives: [{add_model: {name: side, file: package://dvrk_drake/sdf/psm.sdf}}]",
+            "",
+            r"arms\.side: the directives have a model of this name",
+        ),
+    ],
+)
+def test_mistakes_in_the_directives_are_reported(path, directives, parent, message):
+    text = FILE.replace("X_PB: {", f'X_PB: {{parent_frame: "{parent}", ')
+    path.write_text(f"{text}directives: cell.dmd.yaml\n")
+    if directives is not None:
+        (path.parent / "cell.dmd.yaml").write_text(directives)
+    with pytest.raises(StationError, match=message) as error:
+        Station(load_station_config(path))
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ({"rate": 5}, r"ros_driver: rate is 5; allowed: 10\.\.1000 Hz"),
-        ({"domain": "x"}, r'ros_driver: domain is "x"; allowed: an integer'),
+        ({"rate": 5}, r"ros_driver\.rate is 5; allowed: 10\.\.1000 Hz"),
+        ({"domain": "x"}, r'ros_driver\.domain is "x"; allowed: an integer'),
         ({"ratte": 500}, r'ros_driver: key "ratte" is unknown; did you mean "rate"\? allowed in ros_driver: domain, '),
-        ({"guard": {"expiry": 9.0}}, r"ros_driver: guard\.expiry is 9; allowed: "),
+        ({"guard": {"expiry": 9.0}}, r"ros_driver\.guard\.expiry is 9; allowed: "),
         ({"control_modes": ["jump"]}, r"control_modes contains an unknown mode: \['jump'\]; allowed: position, "),
         ({"namespace": "MTM L"}, 'namespace is "MTM L"; allowed: '),
-        ([1], r"ros_driver: must have keys and values, not \[1\]; allowed in ros_driver: domain, "),
+        ([1], r"ros_driver is \[1\]; allowed: a mapping with the keys domain, "),
     ],
 )
 def test_mistakes_in_the_driver_over_ros_are_reported(path, section, message):
-    path.write_text(f"{FILE}ros_driver: {section}\n")
-    with pytest.raises(StationError, match=rf"station\.yaml: {message}") as error:
+    path.write_text(FILE.replace("    driver:", f"    ros_driver: {section}\n    driver:"))
+    with pytest.raises(StationError, match=rf"station\.yaml: arms\.side: {message}") as error:
         load_station_config(path)
     assert "\n" not in str(error.value)
 
 
 def test_driver_over_ros_is_chosen_and_has_no_lcm_interface(path):
-    path.write_text(f"{FILE}ros_driver: {{domain: 3, model: ros.yaml}}\n")
+    path.write_text(FILE.replace("    driver:", "    ros_driver: {domain: 3, model: ros.yaml}\n    driver:"))
     config = load_station_config(path)
-    assert config.ros_driver == CrtkDriver(domain=3, model=str(path.parent / "ros.yaml"))
+    assert config.arms["side"].ros_driver == CrtkDriver(domain=3, model=str(path.parent / "ros.yaml"))
     with pytest.raises(StationError, match="lcm cannot be used with a driver over ROS 2"):
-        make_arm_station(config, hardware=True, lcm=DrakeLcm("memq://"))
+        Station(config, hardware=True, lcm=DrakeLcm("memq://"))
 
 
 def test_documentation_example_runs(monkeypatch):

@@ -13,7 +13,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.station_config import load_station_config, make_arm_station
+from dvrk_drake.systems.station import Station
+from dvrk_drake.systems.station_config import load_station_config
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 
@@ -27,7 +28,7 @@ def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
 
     guard = yaml.safe_load(LENIENT_DRIVER)["guard"]
     path = tmp_path / "station.yaml"
-    path.write_text(yaml.safe_dump({"arm": "mtml", "ros_driver": {"guard": guard}}))
+    path.write_text(yaml.safe_dump({"arms": {"mtml": {"arm": "mtml", "ros_driver": {"guard": guard}}}}))
     config = load_station_config(path)
     with start_simulated_arm("mtml", "MTML", 500.0) as arm:
         for word, homed in (("enable", False), ("home", True)):
@@ -36,9 +37,10 @@ def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
         before = np.array(arm.latest().position)
         efforts = arm.domain.subscribe("/MTML/servo_jf", JointState)
         holds = arm.domain.subscribe("/MTML/hold", Empty)
-        station = make_arm_station(config, hardware=True)
+        station = Station(config, hardware=True)
         builder = DiagramBuilder()
-        add_closed_loop(builder, station, GravityPidController(IdentifiedModel.from_arm(station.arm)))
+        model = IdentifiedModel.from_arm(station.arms["mtml"])
+        add_closed_loop(builder, station, GravityPidController(model), name="mtml")
         simulator = Simulator(builder.Build())
         simulator.set_target_realtime_rate(1.0)
         while not (applied := efforts.take()):
@@ -48,7 +50,7 @@ def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
         context = station.GetMyContextFromRoot(simulator.get_context())
         measured = station.GetOutputPort("mtml.position_measured").Eval(context)
         np.testing.assert_allclose(measured, before, rtol=0, atol=0.03)
-        gravity = IdentifiedModel.from_arm(station.arm).holding_torque(before[None])[0]
+        gravity = model.holding_torque(before[None])[0]
         np.testing.assert_allclose(applied[-1][0].effort, gravity, rtol=0, atol=0.05)
         # The Diagram no longer advances, so the deadman process holds the arm.
         assert arm.domain.wait_until(lambda: bool(holds.take()), 20.0)
@@ -58,14 +60,14 @@ def test_later_station_of_a_process_replaces_an_earlier_one(tmp_path, monkeypatc
     """In a notebook, the Diagram of the first station still exists when its cell is executed again."""
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
     path = tmp_path / "station.yaml"
-    path.write_text(yaml.safe_dump({"arm": "mtml", "ros_driver": {}}))
+    path.write_text(yaml.safe_dump({"arms": {"mtml": {"arm": "mtml", "ros_driver": {}}}}))
     config, simulators = load_station_config(path), []
     with start_simulated_arm("mtml", "MTML", 500.0) as arm:
         for word, homed in (("enable", False), ("home", True)):
             arm.state_command(word)
             assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)
         for _ in range(3):
-            station = make_arm_station(config, hardware=True)
+            station = Station(config, hardware=True)
             simulators.append(Simulator(station))
             measured = station.GetOutputPort("mtml.position_measured")
             while not np.all(np.isfinite(measured.Eval(simulators[-1].get_context()))):
