@@ -146,7 +146,8 @@ def _fault(content: Any, packages: PackageMap) -> str:
         if scheme not in ("package", "file") or (scheme == "file" and not rest.startswith("/")):
             return f'directive {number}: file is "{url}"; allowed: package://dvrk_drake/... or file:///...'
         if scheme == "package" and not packages.Contains(package := rest.partition("/")[0]):
-            return f'directive {number}: unknown package "{package}"; allowed: dvrk_drake, or an absolute file:/// URL'
+            known = ", ".join(sorted(packages.GetPackageNames()))[:200]  # ROS may have hundreds of packages
+            return f'directive {number}: unknown package "{package}"; allowed: {known}, or an absolute file:/// URL'
         if fault := number_fault(values):
             return f"directive {number}: {fault.removeprefix('.')}"
     return ""

@@ -114,8 +114,9 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
     """Returns a message on the first part of `content` that does not match the schema, or "" if all parts match.
 
     Args:
-        schema: Dataclass whose fields are dataclasses, lists, mappings with text keys, bool, int, float, str, or
-            optional values of these types. Numbers must be finite and within the range of their field, see `within`.
+        schema: Dataclass whose fields are dataclasses, configurations of Drake such as `MultibodyPlantConfig`, lists,
+            mappings with text keys, bool, int, float, str, or optional values of these types. Numbers must be finite
+            and within the range of their field, see `within`.
         content: Parsed content of the file.
         what: Kind of file that is expected, e.g. "a gains file".
     """
@@ -132,12 +133,12 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
         if value is not None:
             (inner,) = (argument for argument in arguments if argument is not types.NoneType)
             yield from _faults(inner, value, key, what, allowed)
-    elif dataclasses.is_dataclass(schema):
+    elif hints := _hints(schema):
         if not isinstance(value, dict):
             yield _wrong(schema, value, key)
             return
-        hints = get_type_hints(schema)
-        ranges = {entry.name: entry.metadata.get(RANGE) for entry in dataclasses.fields(schema)}
+        fields = getattr(schema, "__dataclass_fields__", {})
+        ranges = {name: entry.metadata.get(RANGE) for name, entry in fields.items()}
         for name, entry in value.items():
             if name not in hints:
                 yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {suggest_name(name, hints)}" + (
@@ -145,7 +146,7 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
                 )
             else:
                 inside = f"{key}.{name}" if key else name
-                yield from _faults(hints[name], entry, inside, inside, ranges[name])
+                yield from _faults(hints[name], entry, inside, inside, ranges.get(name))
     elif origin is list:
         if not isinstance(value, list):
             yield _wrong(schema, value, key)
@@ -227,13 +228,20 @@ def _described(schema: Any, number: dict[type, str]) -> str:
         return f"{'a list' if one else 'lists'} of {_described(arguments[0], _MANY)}"
     if get_origin(schema) is dict:
         return f"{'a mapping' if one else 'mappings'} from names to {_described(arguments[1], _MANY)}"
-    if dataclasses.is_dataclass(schema):
+    if _hints(schema):
         return f"{'a mapping' if one else 'mappings'} with the keys {_keys(schema)}"
     return number[schema]
 
 
 def _keys(schema: Any) -> str:
-    return ", ".join(get_type_hints(schema))
+    return ", ".join(_hints(schema))
+
+
+def _hints(schema: Any) -> dict[str, Any]:
+    """Returns the types of the fields of a dataclass or of a configuration of Drake, or {} for other types."""
+    if dataclasses.is_dataclass(schema):
+        return get_type_hints(schema)
+    return {field.name: field.type for field in getattr(schema, "__fields__", ())}
 
 
 def suggest_name(name: object, known: Iterable[str]) -> str:

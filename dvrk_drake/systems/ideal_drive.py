@@ -24,6 +24,9 @@ def plant_config_fault(config: MultibodyPlantConfig) -> str:
         )
     if config.discrete_contact_approximation == "tamsi":
         return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
+    # Drake ends the process for some of these values.
+    if min(config.penetration_allowance, config.stiction_tolerance) <= 0 or config.sap_near_rigid_threshold < 0:
+        return "penetration_allowance and stiction_tolerance must be above 0, sap_near_rigid_threshold at least 0"
     if config.use_sampled_output_ports:
         # With sampled output ports, Drake steps the plant before all discrete updates. The discrete updates would then
         # use measurements from after the step.

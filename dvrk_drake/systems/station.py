@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.parsing import GetScopedFrameByName
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
@@ -50,6 +50,10 @@ class Station(Diagram):
     `left` stands for the name of each arm in the file. The ports are those of `ArmStation`, or of `HardwareArmStation`
     with `hardware`. All simulated arms and the objects of the directives are in one plant, with contact.
 
+    Attributes:
+        arms: Arms by name, with their gravity vectors as mounted. Controllers of this station use these arms.
+        plant: The plant of arms and objects. With `hardware`, it is a model that is not in the Diagram.
+
     Example:
         >>> import dvrk_drake as dvrk
         >>> from pathlib import Path
@@ -84,44 +88,37 @@ class Station(Diagram):
         super().__init__()
         config.check()
         builder = DiagramBuilder()
-        self._plant, scene_graph = AddMultibodyPlant(config.plant, DiagramBuilder() if hardware else builder)
+        try:
+            self.plant, scene_graph = AddMultibodyPlant(config.plant, DiagramBuilder() if hardware else builder)
+        except RuntimeError as error:  # a word that Drake does not know
+            raise StationError(f"plant: {error}") from error
         if config.directives:
             packages = package_map()
             add_packages(packages, Path(config.directives).absolute().parent)
             text = read_text_input(config.directives, StationError)
-            add_directives(self._plant, text, packages, config.directives, StationError)
+            add_directives(self.plant, text, packages, config.directives, StationError)
         in_plant = {name: self._add_arm(name, entry) for name, entry in config.arms.items()}
-        self._plant.Finalize()
-        self._arms: dict[str, Arm] = {}
+        self.plant.Finalize()
+        self.arms: dict[str, Arm] = {}
         self._drives: dict[str, ArmDrive] = {}
         for name, (instance, effects) in in_plant.items():
-            entry, gravity = config.arms[name], gravity_at_base(self._plant, instance)
+            entry, gravity = config.arms[name], gravity_at_base(self.plant, instance)
             # A file without gravity is that of an upright arm.
-            stated, upright = entry.mounted_arm.gravity, self._plant.gravity_field().gravity_vector()
+            stated, upright = entry.mounted_arm.gravity, self.plant.gravity_field().gravity_vector()
             if min(np.linalg.norm(stated - g) for g in (gravity, upright)) > GRAVITY_TOLERANCE:
                 raise StationError(
                     f"arms.{name}: X_PB gives the gravity {(gravity.round(3) + 0.0).tolist()} m/s^2, but "
                     f"the file states {stated.round(3).tolist()}; correct X_PB.rpy or the gravity"
                 )
-            arm = self._arms[name] = entry.mounted_arm.with_gravity(gravity.tolist())
+            arm = self.arms[name] = entry.mounted_arm.with_gravity(gravity.tolist())
             if hardware:
                 _add_real_arm(builder, name, HardwareArmStation(arm, driver=entry.ros_driver or entry.driver, lcm=lcm))
             else:
-                self._drives[name] = add_arm_drive(builder, self._plant, arm, instance, effects, seed=entry.seed)
+                self._drives[name] = add_arm_drive(builder, self.plant, arm, instance, effects, seed=entry.seed)
                 export_arm(builder, name, self._drives[name])
         if not hardware:
-            export_scene(builder, self._plant, scene_graph, meshcat, "station")
+            export_scene(builder, self.plant, scene_graph, meshcat, "station")
         builder.BuildInto(self)
-
-    @property
-    def arms(self) -> dict[str, Arm]:
-        """Arms by name, with their gravity vectors as mounted. Controllers of this station use these arms."""
-        return dict(self._arms)
-
-    @property
-    def plant(self) -> MultibodyPlant:
-        """The plant of arms and objects. With `hardware`, it is a model that is not in the Diagram."""
-        return self._plant
 
     def SetPositions(self, context: Context, name: str, q: ArrayLike) -> None:
         """Sets the pose of a simulated arm to q (n,) [rad, m], as `ArmStation.SetPositions` does.
@@ -135,24 +132,23 @@ class Station(Diagram):
         """Adds an arm with its effects to the plant, as a model instance with this name."""
         arm, parent, closure = entry.mounted_arm, entry.X_PB.parent_frame, cast(Closure, entry.closure)
         try:
-            frame = GetScopedFrameByName(self._plant, parent) if parent else self._plant.world_frame()
+            frame = GetScopedFrameByName(self.plant, parent) if parent else self.plant.world_frame()
         except RuntimeError as error:
             raise StationError(f'arms.{name}.X_PB.parent_frame is "{parent}"; not a frame of the directives') from error
-        instance = add_arm(self._plant, arm, frame, entry.X_PB.transform(), closure=closure)
-        if self._plant.GetModelInstanceName(instance) != name:
-            if self._plant.HasModelInstanceNamed(name):
-                raise StationError(f"arms.{name}: the directives have a model of this name")
-            self._plant.RenameModelInstance(instance, name)
+        instance = add_arm(self.plant, arm, frame, entry.X_PB.transform(), closure=closure)
+        if self.plant.GetModelInstanceName(instance) != name:
+            if self.plant.HasModelInstanceNamed(name):
+                raise StationError(f"arms.{name}: there is another model of this name in the directives")
+            self.plant.RenameModelInstance(instance, name)
         effects = entry.all_effects
-        return instance, None if effects is None else PlantEffects(self._plant, arm, instance, effects)
+        return instance, None if effects is None else PlantEffects(self.plant, arm, instance, effects)
 
 
 def _add_real_arm(builder: DiagramBuilder, name: str, station: HardwareArmStation) -> None:
     """Adds the station of a real arm and exports its ports with the prefix `name`."""
     station.set_name(name)
     builder.AddSystem(station)
-    ports, own_name = station_ports(station.arm), station.arm.name.lower()
-    for port in ports.inputs:
-        builder.ExportInput(station.GetInputPort(port), f"{name}{port.removeprefix(own_name)}")
-    for port in ports.outputs:
-        builder.ExportOutput(station.GetOutputPort(port), f"{name}{port.removeprefix(own_name)}")
+    for port in station_ports(station.arm).inputs:
+        builder.ExportInput(station.GetInputPort(port), f"{name}{port[len(station.arm.name) :]}")
+    for port in station_ports(station.arm).outputs:
+        builder.ExportOutput(station.GetOutputPort(port), f"{name}{port[len(station.arm.name) :]}")

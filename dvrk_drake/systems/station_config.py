@@ -117,9 +117,8 @@ class BasePose:
         Raises:
             StationError: A field does not have three numbers.
         """
-        for name, values in (("translation", self.translation), ("rpy", self.rpy)):
-            if len(values) != 3:
-                raise StationError(f"X_PB.{name} has {len(values)} numbers; allowed: 3")
+        if (lengths := (len(self.translation), len(self.rpy))) != (3, 3):
+            raise StationError(f"X_PB: translation and rpy must have 3 numbers; got {lengths[0]} and {lengths[1]}")
         return RigidTransform(RollPitchYaw(self.rpy), self.translation)
 
 
@@ -201,11 +200,9 @@ def load_station_config(path: str | Path) -> StationConfig:
         ['left', 'right']
     """
     content = load_yaml(path, StationError)
-    arms = content.get("arms") if isinstance(content, dict) else None
-    for name, section in arms.items() if isinstance(arms, dict) else ():
-        # Drake's messages name neither the section nor the accepted values.
-        if fault := schema_fault(StationArm, section, f"arms.{name}"):
-            raise StationError(f"{path}: arms.{name}: {fault}")
+    # Drake's messages name neither the section nor the accepted values.
+    if fault := schema_fault(StationConfig, content, "a station file"):
+        raise StationError(f"{path}: {fault}")
     try:
         config: StationConfig = yaml_load_typed(schema=StationConfig, data=yaml.safe_dump(content, sort_keys=False))
         config.check()

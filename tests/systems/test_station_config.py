@@ -7,12 +7,16 @@ import pytest
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import DiagramBuilder
 from repository import ROOT
 
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.arm_station import arm_plant_config, station_ports
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
+from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.station import Station
@@ -73,6 +77,34 @@ def test_station_matches_its_file(path):
     simulator.AdvanceTo(1.004)
 
 
+def test_arm_at_a_frame_of_the_directives_moves_as_alone(path):
+    """The frame is rotated against the pose of the base, so that gravity is that of an upright arm."""
+    turned = "{name: stand, X_PF: {base_frame: world, translation: [1, 0, 0], rotation: !Rpy {deg: [-90, 0, 0]}}}"
+    (path.parent / "cell.dmd.yaml").write_text(f"directives: [{{add_frame: {turned}}}]")
+    path.write_text(FILE.replace("X_PB: {", "X_PB: {parent_frame: stand, ") + "directives: cell.dmd.yaml\n")
+    config = load_station_config(path)
+    arm = load_arm("psm")
+    alone = ArmStation(arm, plant_config=config.plant, closure="ball", effects=arm.effects.only(["friction"]), seed=3)
+    station, states = Station(config), []
+    np.testing.assert_allclose(station.arms["side"].gravity, [0.0, 0.0, -9.81], atol=1e-12)
+    X_WB = station.plant.GetFrameByName("base_link").CalcPoseInWorld(station.plant.CreateDefaultContext())
+    np.testing.assert_allclose(X_WB.translation(), [1.0, 0.5, 0.0], atol=1e-12)
+    for system, name in ((station, ["side"]), (alone, [])):
+        simulator = Simulator(system)
+        system.SetPositions(simulator.get_mutable_context(), *name, [0.2, 0.1, 0.1, 0, 0, 0, 0.5])
+        simulator.AdvanceTo(0.05)
+        port = system.GetOutputPort(f"{(name or ['psm'])[0]}.state_true")
+        states.append(port.Eval(simulator.get_context()))
+    assert np.abs(states[0][7:]).max() > 0.01
+    np.testing.assert_allclose(states[0], states[1], atol=1e-9)
+
+
+def test_arm_of_a_closed_loop_is_named(path):
+    station, builder = Station(load_station_config(path)), DiagramBuilder()
+    with pytest.raises(StationError, match='the station has no arm ""; allowed: side'):
+        add_closed_loop(builder, station, GravityPidController(IdentifiedModel.from_arm(load_arm("psm"))))
+
+
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_hardware_and_simulation_have_the_same_ports(name):
     config = StationConfig(arms={name: StationArm(arm=name), "other": StationArm(arm="mtmr")})
@@ -97,24 +129,39 @@ def test_scenario_has_the_same_arm_fields():
         ("arm: psm", "", r"arms\.side: arm is missing; give an arm's name"),
         ("arm: psm", "arm: pms", r"station\.yaml: arms\.side: .*pms"),
         ("closure: ball", "closure: weld", 'closure is "weld"; allowed: mimic, ball'),
-        ("[0, 0, 0.5]", "[0, 0.5]", r"arms\.side: X_PB\.translation has 2 numbers; allowed: 3"),
+        ("[0, 0, 0.5]", "[0, 0.5]", r"arms\.side: X_PB: translation and rpy must have 3 numbers; got 2 and 3"),
         (
             "1.5707963267948966",
             "90",
-            r"arms\.side: X_PB\.rpy\[0\] is 90; allowed: -6\.3\.\.6\.3 rad; is it in degrees\?",
+            r"arms\.side\.X_PB\.rpy\[0\] is 90; allowed: -6\.3\.\.6\.3 rad; is it in degrees\?",
         ),
         (
             "seed: 3",
             "gravity: [0, 981, 0]",
-            r"arms\.side: gravity\[1\] is 981; allowed: -30\.\.30 m/s\^2",
+            r"arms\.side\.gravity\[1\] is 981; allowed: -30\.\.30 m/s\^2",
+        ),
+        (
+            "contact_model: point",
+            "stiction_tolerance: 0",
+            r"plant\.penetration_allowance and stiction_tolerance",
         ),
         ("seed: 3", "seed: -1", r"seed is -1; allowed: 0\.\."),
         ("[friction]", "[fraction]", r"arms\.side: simulated arm: .*fraction"),
+        ("time_step: 0.002,", "time_step: x,", r'station\.yaml: plant\.time_step is "x"; allowed: a number'),
+        (
+            "{target_realtime_rate: 0.0, start_time: 1.0}",
+            "3",
+            r"simulator is 3; allowed: a mapping with the keys integ",
+        ),
         ("time_step: 0.002,", "time_step: 0.02,", r"plant\.time_step must be above 0 and at most 0\.01 s"),
         ("status_period: 0.002", "status_period: 0.2", r"driver\.status_period is 0\.2; allowed"),
         ("seed: 3", "sead: 3", r'station\.yaml: arms\.side: key "sead" is unknown; did you mean "seed"\?'),
         ("  side:", "  left side:", 'the name "left side" is not valid; allowed: letters, digits and _'),
-        ("plant:", "plan:", r"station\.yaml: .*plan"),
+        (
+            "plant:",
+            "plan:",
+            r'station\.yaml: key "plan" is unknown; did you mean "plant"\? allowed in a station file: arms',
+        ),
         ("point", "[", r"station\.yaml: "),
     ],
 )
@@ -126,15 +173,29 @@ def test_invalid_values_are_reported(path, old, new, message):
     assert "\n" not in str(error.value)
 
 
+def test_unknown_word_of_drake_is_reported(path):
+    path.write_text(FILE.replace("point", "glue"))
+    with pytest.raises(StationError, match="plant: Unknown contact_model: 'glue'"):
+        Station(load_station_config(path))
+
+
 def test_gravity_of_another_base_is_refused(path):
     path.write_text(FILE.replace("seed: 3", "gravity: [0, 9.81, 0]"))
     with pytest.raises(StationError, match=r"arms\.side: X_PB gives the gravity \[0\.0, -9\.81, 0\.0\] m/s\^2"):
         Station(load_station_config(path))
 
 
-def test_a_file_without_arms_is_reported(path):
-    path.write_text("plant: {time_step: 0.001}")
-    with pytest.raises(StationError, match=r"station\.yaml: arms is empty; give the arms by name"):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty; allowed in a station file: arms, "),
+        ("plant: {time_step: 0.001}", "arms is empty; give the arms by name"),
+        ("arms: [psm]", "arms is ['psm']; allowed: a mapping from names to mappings with the keys arm, "),
+    ],
+)
+def test_a_file_without_arms_is_reported(path, text, message):
+    path.write_text(text)
+    with pytest.raises(StationError, match=rf"station\.yaml: {re.escape(message)}"):
         load_station_config(path)
 
 
@@ -147,7 +208,7 @@ def test_a_file_without_arms_is_reported(path):
         (
             "directives: [{add_model: {name: side, file: package://dvrk_drake/sdf/psm.sdf}}]",
             "",
-            r"arms\.side: the directives have a model of this name",
+            r"arms\.side: there is another model of this name in the",
         ),
     ],
 )
@@ -164,18 +225,18 @@ def test_mistakes_in_the_directives_are_reported(path, directives, parent, messa
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ({"rate": 5}, r"ros_driver\.rate is 5; allowed: 10\.\.1000 Hz"),
-        ({"domain": "x"}, r'ros_driver\.domain is "x"; allowed: an integer'),
-        ({"ratte": 500}, r'ros_driver: key "ratte" is unknown; did you mean "rate"\? allowed in ros_driver: domain, '),
-        ({"guard": {"expiry": 9.0}}, r"ros_driver\.guard\.expiry is 9; allowed: "),
-        ({"control_modes": ["jump"]}, r"control_modes contains an unknown mode: \['jump'\]; allowed: position, "),
-        ({"namespace": "MTM L"}, 'namespace is "MTM L"; allowed: '),
-        ([1], r"ros_driver is \[1\]; allowed: a mapping with the keys domain, "),
+        ({"rate": 5}, r"\.ros_driver\.rate is 5; allowed: 10\.\.1000 Hz"),
+        ({"domain": "x"}, r'\.ros_driver\.domain is "x"; allowed: an integer'),
+        ({"ratte": 500}, r'\.ros_driver: key "ratte" is unknown; did you mean "rate"\? allowed in arms\.side\.ros_'),
+        ({"guard": {"expiry": 9.0}}, r"\.ros_driver\.guard\.expiry is 9; allowed: "),
+        ({"control_modes": ["jump"]}, r": control_modes contains an unknown mode: \['jump'\]; allowed: position, "),
+        ({"namespace": "MTM L"}, ': namespace is "MTM L"; allowed: '),
+        ([1], r"\.ros_driver is \[1\]; allowed: a mapping with the keys domain, "),
     ],
 )
 def test_mistakes_in_the_driver_over_ros_are_reported(path, section, message):
     path.write_text(FILE.replace("    driver:", f"    ros_driver: {section}\n    driver:"))
-    with pytest.raises(StationError, match=rf"station\.yaml: arms\.side: {message}") as error:
+    with pytest.raises(StationError, match=rf"station\.yaml: arms\.side{message}") as error:
         load_station_config(path)
     assert "\n" not in str(error.value)
 
