@@ -1,1 +1,1 @@
-"""Simulated effects of an arm, such as friction and cables, for `ArmStation`. See `models.effects_schema`."""
+"""Simulated effects, such as friction and cables, of an arm in a plant. See `models.effects_schema`."""
