@@ -108,7 +108,7 @@ def record(
     from dvrk_drake.processes.recorder import Recorder
     from dvrk_drake.processes.ros_recorder import RosRecorder
     from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.recordings.recording_stream import check_stream_output
+    from dvrk_drake.recordings.writer_stream import check_stream_output
 
     check_ros_options(ros, {"topic": topic, "domain": domain}, {"lcm_url": lcm_url, "key": key})
     recorded, line = load_arm(arm), LiveLine(sys.stderr)

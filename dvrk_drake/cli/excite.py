@@ -81,7 +81,7 @@ def excite(
     """
     import numpy as np
 
-    from dvrk_drake.recordings.writing import write_csv
+    from dvrk_drake.recordings.writer_csv import write_csv
     from dvrk_drake.reports.terminal_tables import make_console, print_answer
 
     of_motion = {

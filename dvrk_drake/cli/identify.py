@@ -266,7 +266,7 @@ def predict(
             of the 95 % prediction interval. The columns lower_other_day1..n and upper_other_day1..n are those on
             another day than that of the model's recording.
     """
-    from dvrk_drake.recordings.writing import write_csv
+    from dvrk_drake.recordings.writer_csv import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(output, recording, model, overwrite=overwrite)

@@ -155,7 +155,7 @@ def convert(
         output: File to write: .csv, or .mcap for ROS 2 tools, Foxglove and Rerun.
         arm: Convert to joint coordinates of this arm. Required for bags and for files of the cisst collector.
     """
-    from dvrk_drake.recordings.conversion import convert as convert_recording
+    from dvrk_drake.recordings.writing import convert as convert_recording
 
     check_output(output, recording, overwrite=overwrite)
     if arm is None and locked is not None:

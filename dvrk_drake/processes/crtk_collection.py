@@ -18,10 +18,9 @@ from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, approaches, estimated_duration
 from dvrk_drake.processes.recorder import MissingMessages
-from dvrk_drake.recordings.arm_bag import joint_state_topics
-from dvrk_drake.recordings.mcap_writer import GrowingMcap, Topic
 from dvrk_drake.recordings.pose_file import CollectionFile
-from dvrk_drake.recordings.ros_bag import JOINT_STATE
+from dvrk_drake.recordings.reader_rosbag import JOINT_STATE
+from dvrk_drake.recordings.writer_mcap import GrowingMcap, Topic, joint_state_topics
 from dvrk_drake.systems.ros.discovery import wait_unless_stopped
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 

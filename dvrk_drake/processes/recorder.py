@@ -14,8 +14,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
 from dvrk_drake.processes.lcm_network import handle_message
-from dvrk_drake.recordings.lcm_log_reader import StatusStream
-from dvrk_drake.recordings.recording_stream import (
+from dvrk_drake.recordings.reader_lcm import StatusStream
+from dvrk_drake.recordings.writer_stream import (
     RecordingFile,
     check_stream_output,
     open_recording_file,
@@ -178,7 +178,7 @@ class Recorder:
                 show(self.describe)
         finally:
             if self._file is not None:
-                self._file.close(lambda share: show(lambda: f"{self._path}: index {share:.0%}"))
+                self._file.close()
 
     def describe(self) -> str:
         """Returns the text of the status line: the number of rows, the rate, lost messages and the state of the arm."""

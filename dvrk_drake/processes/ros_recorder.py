@@ -13,10 +13,9 @@ import numpy as np
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.recorder import FIRST_STATUS, MissingMessages, Rate
-from dvrk_drake.recordings.arm_bag import FrameMessages, joint_state_topics
-from dvrk_drake.recordings.mcap_writer import GrowingMcap, Topic
-from dvrk_drake.recordings.recording_stream import check_stream_output
-from dvrk_drake.recordings.ros_bag import JOINT_STATE
+from dvrk_drake.recordings.reader_rosbag import JOINT_STATE
+from dvrk_drake.recordings.writer_mcap import FrameMessages, GrowingMcap, Topic, joint_state_topics
+from dvrk_drake.recordings.writer_stream import check_stream_output
 from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
@@ -110,7 +109,7 @@ class RosRecorder:
                 show(self.describe)
         finally:
             if self._bag is not None:
-                self._bag.close(lambda share: show(lambda: f"{self._path}: index {share:.0%}"))
+                self._bag.close()
 
     def describe(self) -> str:
         """Returns the text of the status line: the number of messages, the rate, and missing messages."""

@@ -1,20 +1,18 @@
-"""Reads rows of CSV files with line numbers, and appends complete rows to a file."""
+"""Reads the rows of CSV files with their line numbers."""
 
 from __future__ import annotations
 
 import codecs
 import csv
 import gzip
-import hashlib
 import io
+import itertools
 import math
-import os
 import re
 import zlib
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from io import FileIO
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +22,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import open_input, read_input
 
-#: Size of the blocks in which a CSV is read, and maximum number of characters of a line.
+#: Size of the blocks in which a file is read [bytes], and maximum number of characters of a line.
 _BLOCK, _MAX_LINE = 1 << 20, 1 << 20
 #: Beginning of a file that is compressed with gzip.
 GZIP_MAGIC = b"\x1f\x8b"
@@ -32,6 +30,8 @@ GZIP_MAGIC = b"\x1f\x8b"
 _MAX_ROWS = 64_000_000
 #: Maximum number of rows of numbers, i.e. 15 min at 1 kHz. With this number of rows, `check` needs 1.5 GB of memory.
 MAX_COUNT = 900_000
+#: Number of lines between two reports of progress.
+_REPORT = 1000
 
 
 def read_bytes(path: Path) -> bytes:
@@ -43,169 +43,74 @@ def read_bytes(path: Path) -> bytes:
     return read_input(path, RecordingError)
 
 
-class CsvReader:
-    """Reads the rows of a CSV file in blocks, so that a large file needs little memory.
+class CsvFile(NamedTuple):
+    """CSV file: UTF-8 with or without a byte-order mark, or UTF-16 with one; it may be compressed with gzip.
 
-    The file is UTF-8 with or without a byte-order mark, or UTF-16 with one, and may be compressed with gzip. Lines end
-    in LF, CRLF or CR. Iteration yields (line number, unmodified cells) of the rows that are not blank. A new iteration
-    continues after the last row that was read.
+    Lines end in LF, CRLF or CR. Each iteration reads the file from its beginning in blocks, so that a large file needs
+    little memory.
 
     Attributes:
         path: Path of the file.
-        has_underscore: Whether the text read so far contains an underscore. Python accepts underscores in numbers, but
-            `is_number` does not.
+        progress: Callback that receives the completed fraction (0 to 1).
     """
 
-    def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Opens the file at `path`. `progress` is called with the completed fraction (0 to 1).
+    path: Path
+    progress: Callable[[float], object] = lambda share: None
+
+    def rows(self, after: int = 0) -> Iterator[tuple[int, list[str]]]:
+        """Iterates over line number and unmodified cells of the rows that are not blank and end after a line.
 
         Raises:
-            RecordingError: The file cannot be read.
+            RecordingError: The file cannot be read, is not text, or its cells are not separated by commas.
         """
-        self.path = path
-        self._file = _HashedFile(open_input(path, RecordingError), progress)
-        self._blocks, self._block, self._num_fast = self._read_blocks(), io.StringIO(), 0
-        self._reader = csv.reader(self._lines(), strict=True)
-        self._is_first = True
-        self.has_underscore = False
-
-    def __enter__(self) -> CsvReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def __iter__(self) -> Iterator[tuple[int, list[str]]]:
-        """Iterates over rows. Raises RecordingError if the file is not text or cells are not separated by commas."""
-        reader = self._reader
+        reader, is_first = csv.reader(self.lines(), strict=True), after == 0
         try:
             for cells in reader:
-                if not any(cells) or not any(cell.strip() for cell in cells):
+                if reader.line_num <= after or not any(cell.strip() for cell in cells):
                     continue
-                if self._is_first and not is_comment(cells):
-                    self._check_commas(cells)
-                yield self._line, cells
+                if is_first and not is_comment(cells):
+                    self._check_commas(reader.line_num, cells)
+                    is_first = False
+                yield reader.line_num, cells
         except csv.Error as error:
-            raise RecordingError(f"{self.path}, line {self._line}: invalid CSV: {error}") from error
+            raise RecordingError(f"{self.path}, line {reader.line_num}: invalid CSV: {error}") from error
 
-    def next_numbers(self, width: int, columns: Sequence[int]) -> tuple[int, NDArray[np.float64]] | None:
-        """Reads the next rows if their format is simple, which is several times faster than the iteration.
+    def lines(self) -> Iterator[str]:
+        """Iterates over the lines, which end in LF.
 
-        Args:
-            width: Number of cells of each row.
-            columns: Columns to read (k), without repetition.
-
-        Returns:
-            Line number of the first row, and numbers (m, k) of rows without blank lines. None at the end of the file,
-            or if a row has quotes, another number of cells, or a selected cell that is not a finite number. The
-            iteration then yields these rows.
+        Raises:
+            RecordingError: The file cannot be read, is not text, or a line is too long.
         """
-        text = self._block.read() or next(self._blocks, "")
-        rows = text.replace("\r\n", "\n").removesuffix("\n").split("\n")
-        table = None
-        if not (text.isspace() or '"' in text or any(row.count(",") != width - 1 for row in rows)):
-            # A carriage return without a line feed is not a number either.
-            with suppress(ValueError):
-                table = np.loadtxt(rows, delimiter=",", comments=None, usecols=columns, ndmin=2)
-        if table is None or not np.all(np.isfinite(table)):
-            self._block = io.StringIO(text, newline="")
-            return None
-        first = self._line + 1
-        self._num_fast += len(rows)
-        return first, table
+        with open_input(self.path, RecordingError) as file:
+            size = max(1, file.seek(0, io.SEEK_END))
+            file.seek(0)
+            try:
+                is_compressed = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+                file.seek(0)
+                content = io.BufferedReader(gzip.GzipFile(fileobj=file) if is_compressed else file, _BLOCK)
+                encoding = "utf-16" if is_utf16(content.peek(2)) else "utf-8-sig"
+                text = io.TextIOWrapper(content, encoding)
+                for number, line in enumerate(iter(partial(text.readline, _MAX_LINE + 1), "")):
+                    if len(line) > _MAX_LINE:
+                        raise RecordingError(f"{self.path}: invalid CSV: a line has more than {_MAX_LINE} characters")
+                    if number % _REPORT == _REPORT - 1:
+                        self.progress(file.tell() / size)
+                    yield line
+                self.progress(1.0)
+            except UnicodeDecodeError as error:
+                at = content.tell() - len(error.object) + error.start
+                name = encoding.removesuffix("-sig").upper()
+                raise RecordingError(f"{self.path} is not a {name} text file: {error.reason} at byte {at}") from error
+            except (OSError, EOFError, zlib.error) as error:
+                reason = getattr(error, "strerror", None) or f"damaged or incomplete gzip file ({error})"
+                raise RecordingError(f"{self.path} cannot be read: {reason}") from error
 
-    def sha256(self) -> str:
-        """Returns the SHA-256 of the file; valid after all rows have been read."""
-        return self._file.digest.hexdigest()
-
-    @property
-    def _line(self) -> int:
-        """Number of the line that was read last."""
-        return self._reader.line_num + self._num_fast
-
-    def _check_commas(self, cells: list[str]) -> None:
-        self._is_first = False
+    def _check_commas(self, line: int, cells: list[str]) -> None:
         if len(cells) == 1 and re.search(r"[;\s]", cells[0].strip()):
             raise RecordingError(
-                f"{self.path}, line {self._line}: the first row has no comma. Separate cells by commas "
-                "and use a point as the decimal separator."
+                f"{self.path}, line {line}: the first row has no comma. Separate cells by commas and use a point as "
+                "the decimal separator."
             )
-
-    def _lines(self) -> Iterator[str]:
-        while True:
-            while line := self._block.readline():
-                yield line
-            if not (block := next(self._blocks, "")):
-                return
-            self._block = io.StringIO(block, newline="")
-
-    def _read_blocks(self) -> Iterator[str]:
-        """Yields text of complete lines, which is not empty."""
-        decoder, rest, num_read, is_start = None, "", 0, True
-        while True:
-            try:
-                block = self._file.read(_BLOCK if decoder else max(_BLOCK, len(codecs.BOM_UTF16)))
-            except (OSError, EOFError, zlib.error) as error:
-                text = getattr(error, "strerror", None) or f"damaged or incomplete gzip file ({error})"
-                raise RecordingError(f"{self.path} cannot be read: {text}") from error
-            if decoder is None:
-                encoding = "utf-16" if is_utf16(block) else "utf-8"
-                decoder = codecs.getincrementaldecoder(encoding)()
-            undecoded = len(decoder.getstate()[0])
-            try:
-                text = decoder.decode(block, final=not block)
-            except UnicodeDecodeError as error:
-                at = num_read - undecoded + error.start
-                raise RecordingError(
-                    f"{self.path} is not a {encoding.upper()} text file: {error.reason} at byte {at}"
-                ) from error
-            if is_start and text:
-                text, is_start = text.removeprefix("\ufeff"), False
-            text = rest + text
-            num_read += len(block)
-            # Use complete lines only; a CR at the end may be the first half of a CRLF.
-            end = max(text.rfind("\n"), text.rfind("\r", 0, -1)) + 1 if block else len(text)
-            whole, rest = text[:end], text[end:]
-            if len(rest) > _MAX_LINE:
-                raise RecordingError(f"{self.path}: invalid CSV: a line has more than {_MAX_LINE} characters")
-            self.has_underscore = self.has_underscore or "_" in whole
-            if whole:
-                yield whole
-            if not block:
-                return
-
-
-class _HashedFile:
-    """File whose content is decompressed if it is a gzip file. The digest is that of the compressed content."""
-
-    def __init__(self, file: FileIO, progress: Callable[[float], object]) -> None:
-        self.digest = hashlib.sha256()
-        self._file, self._progress = file, progress
-        self._size, self._num_read = max(1, os.fstat(file.fileno()).st_size), 0
-        try:
-            is_compressed = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
-        except OSError:  # `read` reports the same error
-            is_compressed = False
-        file.seek(0)
-        self.read: Callable[[int], bytes] = self._read_raw
-        if is_compressed:
-            self.read = gzip.GzipFile(fileobj=_Source(self._read_raw)).read  # type: ignore[call-overload]
-
-    def _read_raw(self, size: int = -1) -> bytes:
-        block = self._file.read(size)
-        self.digest.update(block)
-        self._num_read += len(block)
-        self._progress(min(1.0, self._num_read / self._size))
-        return block
-
-    def close(self) -> None:
-        self._file.close()
-
-
-class _Source(NamedTuple):
-    """Object with the method of a file that `gzip` needs."""
-
-    read: Callable[[int], bytes]
 
 
 def is_utf16(start: bytes) -> bool:
@@ -218,18 +123,16 @@ def is_comment(cells: Sequence[str]) -> bool:
     return cells[0].lstrip().startswith("#")
 
 
-def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
-    """Returns (line number, stripped cells) of all rows that are not blank, and the SHA-256 of the file.
+def read_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Returns (line number, stripped cells) of all rows that are not blank.
 
-    The required memory is about 15 times the file size. Use `CsvReader` for large files of numbers.
+    The required memory is about 15 times the file size. Use `read_numbers` for large files of numbers.
 
     Raises:
         RecordingError: The file cannot be read, is too large, is not text, or its cells are not separated by commas.
     """
     open_input(path, RecordingError, _MAX_ROWS).close()
-    with CsvReader(path) as reader:
-        rows = [(line, [cell.strip() for cell in cells]) for line, cells in reader]
-        return rows, reader.sha256()
+    return [(line, [cell.strip() for cell in cells]) for line, cells in CsvFile(path).rows()]
 
 
 class NumberRows(NamedTuple):
@@ -249,81 +152,109 @@ class NumberRows(NamedTuple):
 
 
 def read_numbers(
-    reader: CsvReader,
+    file: CsvFile,
     header: Sequence[str],
     blocks: Mapping[str, Sequence[int]],
     *,
+    after: int = 0,
     skip_invalid: bool = False,
-    first: Iterable[tuple[int, list[str]]] = (),
     header_name: str = "the header",
 ) -> NumberRows:
-    """Reads the numbers of selected columns in all remaining rows.
+    """Reads the numbers of selected columns.
 
     Args:
-        reader: Open file, after its header.
+        file: File with the numbers.
         header: Name of each column.
         blocks: Mapping from the name of a block to the indices of its columns.
+        after: Number of the last line of the header.
         skip_invalid: Whether to skip and note rows with an empty cell, a NaN or an infinity.
-        first: Rows (line number, cells) that were already read.
         header_name: Source of `header`, for messages.
 
     Raises:
         RecordingError: A row has another number of cells than the header, a cell is not a finite number, there is no
             row, or there are too many rows.
     """
-    path = reader.path
-    skipped, values, lines = array("q"), {name: array("d") for name in blocks}, array("q")
-    parts = [(values[name], columns) for name, columns in blocks.items()]
-    width, used = len(header), sorted({column for columns in blocks.values() for column in columns})
-
-    def too_long(line: int) -> RecordingError:
-        return RecordingError(f"{path}, line {line}: the file has more than {MAX_COUNT} rows. Split the recording.")
-
-    def append(rows: Iterable[tuple[int, list[str]]]) -> None:
-        for line, cells in rows:
-            if len(cells) != width:
-                raise RecordingError(f"{path}, line {line}: the row has {len(cells)} cells, {header_name} has {width}")
-            if len(lines) == MAX_COUNT:
-                raise too_long(line)
-            if skip_invalid and not all(
-                math.isfinite(parse_or_nan(cells[column].strip(), f"{path}, line {line}: {header[column]}"))
-                for column in used
-            ):
-                skipped.append(line)
-                continue
-            lines.append(line)
-            has_underscore = reader.has_underscore and any("_" in cells[column] for column in used)
-            for part, columns in parts:
-                try:
-                    numbers = [float(cells[column]) for column in columns]
-                    valid = math.isfinite(sum(numbers)) and not has_underscore
-                except ValueError:
-                    valid = False
-                if not valid:
-                    numbers = [
-                        parse_finite(cells[column].strip(), f"{path}, line {line}: {header[column]}")
-                        for column in columns
-                    ]
-                part.extend(numbers)
-
-    append(first)
-    while (found := reader.next_numbers(width, used)) is not None:
-        begin, table = found
-        if len(lines) + len(table) > MAX_COUNT:
-            raise too_long(begin + MAX_COUNT - len(lines))
-        lines.extend(range(begin, begin + len(table)))
-        for part, columns in parts:
-            part.frombytes(table[:, np.searchsorted(used, columns)].tobytes())
-    append(reader)
-    if not lines:
-        raise RecordingError(f"{path} has " + ("no row of finite numbers" if skipped else "a header but no rows"))
-    kept, left_out = np.frombuffer(lines, np.int64), np.frombuffer(skipped, np.int64)
+    columns = sorted({column for block in blocks.values() for column in block})
+    try:
+        lines, table = _load_numbers(file, len(header), columns, after)
+        is_complete = skip_invalid or bool(np.all(np.isfinite(table)))
+    except ValueError:
+        is_complete = False
+    if not is_complete:
+        lines, table = _scan_numbers(file, header, columns, after, skip_invalid, header_name)
+    rows = np.flatnonzero(np.all(np.isfinite(table), axis=1))
+    if not len(rows):
+        raise RecordingError(
+            f"{file.path} has " + ("no row of finite numbers" if len(lines) else "a header but no rows")
+        )
+    skipped, notes = np.delete(lines, rows), tuple[str, ...]()
+    if len(skipped):
+        numbers = f"{len(skipped)} of {len(lines)} rows skipped (empty, NaN or infinite)"
+        notes = (f"{numbers}: lines {listed(skipped)}",)
     return NumberRows(
-        {name: np.frombuffer(part).reshape(len(lines), len(blocks[name])) for name, part in values.items()},
-        kept,
-        np.searchsorted(np.union1d(kept, left_out), kept),
-        (skipped_note(left_out, len(lines) + len(skipped)),) if skipped else (),
+        {name: table[np.ix_(rows, np.searchsorted(columns, block))] for name, block in blocks.items()},
+        lines[rows],
+        rows,
+        notes,
     )
+
+
+def _load_numbers(
+    file: CsvFile, width: int, columns: Sequence[int], after: int
+) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+    """Returns the line numbers (m,) and the numbers (m, k) of a file without quotes, several times as fast as a scan.
+
+    Raises:
+        ValueError: A row has quotes or another number of cells, or a selected cell is not a number.
+    """
+    lines = array("q")
+
+    def plain_rows() -> Iterator[str]:
+        for number, line in enumerate(file.lines(), 1):
+            if number <= after or line.isspace():
+                continue
+            if line.count(",") != width - 1 or '"' in line:
+                raise ValueError
+            _check_count(file.path, lines, number)
+            lines.append(number)
+            yield line
+
+    rows = plain_rows()
+    first = list(itertools.islice(rows, 1))
+    # np.loadtxt warns if there is no row.
+    table = (
+        np.loadtxt(itertools.chain(first, rows), delimiter=",", comments=None, usecols=columns, ndmin=2)
+        if first
+        else np.empty((0, len(columns)))
+    )
+    return np.frombuffer(lines, np.int64), table
+
+
+def _scan_numbers(
+    file: CsvFile, header: Sequence[str], columns: Sequence[int], after: int, skip_invalid: bool, header_name: str
+) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+    """Returns the line numbers and the numbers as `_load_numbers` does, or explains a fault of the file.
+
+    An empty cell is NaN if `skip_invalid` is True.
+
+    Raises:
+        RecordingError: See `read_numbers`.
+    """
+    lines, numbers = array("q"), array("d")
+    parse = parse_or_nan if skip_invalid else parse_finite
+    for line, cells in file.rows(after):
+        where = f"{file.path}, line {line}"
+        if len(cells) != len(header):
+            raise RecordingError(f"{where}: the row has {len(cells)} cells, {header_name} has {len(header)}")
+        _check_count(file.path, lines, line)
+        lines.append(line)
+        numbers.extend(parse(cells[column].strip(), f"{where}: {header[column]}") for column in columns)
+    return np.frombuffer(lines, np.int64), np.frombuffer(numbers).reshape(len(lines), len(columns))
+
+
+def _check_count(path: Path, lines: Sequence[int], line: int) -> None:
+    if len(lines) == MAX_COUNT:
+        raise RecordingError(f"{path}, line {line}: the file has more than {MAX_COUNT} rows. Split the recording.")
 
 
 def listed(numbers: Iterable[int]) -> str:
@@ -332,13 +263,8 @@ def listed(numbers: Iterable[int]) -> str:
     return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "..."])
 
 
-def skipped_note(skipped: NDArray[np.int_], count: int) -> str:
-    """Returns a note on the skipped lines of a file with `count` rows."""
-    return f"{len(skipped)} of {count} rows skipped (empty, NaN or infinite): lines {listed(skipped)}"
-
-
 def is_number(cell: str) -> bool:
-    """Returns whether `parse_number` accepts `cell`."""
+    """Returns whether a cell is a number, which may be NaN or infinite."""
     # Python's float() also accepts 1_000, which no other program writes or reads as a number.
     if "_" in cell:
         return False
@@ -349,8 +275,8 @@ def is_number(cell: str) -> bool:
     return True
 
 
-def parse_number(cell: str, where: str) -> float:
-    """Returns the number in `cell`, which may be NaN or infinite.
+def parse_or_nan(cell: str, where: str) -> float:
+    """Returns the number in a cell, which may be NaN or infinite, or NaN for an empty cell.
 
     Args:
         cell: Text of the cell.
@@ -359,82 +285,14 @@ def parse_number(cell: str, where: str) -> float:
     Raises:
         RecordingError: The cell is not a number.
     """
-    if not is_number(cell):
-        raise RecordingError(f"{where} is empty" if not cell else f"{where} is not a number: {cell[:30]!r}")
-    return float(cell)
-
-
-def parse_or_nan(cell: str, where: str) -> float:
-    """Returns the number in `cell` as `parse_number` does, or NaN for an empty cell."""
-    return parse_number(cell, where) if cell else float("nan")
+    if cell and not is_number(cell):
+        raise RecordingError(f"{where} is not a number: {cell[:30]!r}")
+    return float(cell or "nan")
 
 
 def parse_finite(cell: str, where: str) -> float:
-    """Returns the number in `cell` as `parse_number` does; NaN and infinity are errors."""
-    value = parse_number(cell, where)
-    if not np.isfinite(value):
-        raise RecordingError(f"{where} is {cell}; only finite numbers are allowed")
+    """Returns the number in a cell as `parse_or_nan` does; NaN, infinity and an empty cell are errors."""
+    value = parse_or_nan(cell, where)
+    if not math.isfinite(value):
+        raise RecordingError(f"{where} is {cell}; only finite numbers are allowed" if cell else f"{where} is empty")
     return value
-
-
-class GrowingFile:
-    """File to which rows are appended, each by one unbuffered write.
-
-    Written rows survive the termination of the process. With `sync` they also survive a power failure.
-    """
-
-    def __init__(self, path: str | Path, *, resume: bool = False, sync: bool = False) -> None:
-        """Creates a new file. With `resume`, opens an existing file and removes an incomplete last line.
-
-        Args:
-            path: Path of the file.
-            resume: Whether to continue an existing file.
-            sync: Whether to wait for the disk after each row, which may take many milliseconds.
-
-        Raises:
-            RecordingError: The file cannot be written, or it exists although `resume` is False.
-        """
-        self._path, self._sync = path, sync
-        try:
-            self._file = open(path, "r+b" if resume else "xb", buffering=0)  # noqa: SIM115
-            if resume:
-                self._file.truncate(self._file.read().rfind(b"\n") + 1)
-                self._file.seek(0, os.SEEK_END)
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
-
-    def append(self, row: bytes) -> None:
-        """Writes one row.
-
-        Raises:
-            RecordingError: The row cannot be written; the file ends with the previous row.
-        """
-        end = self._file.tell()
-        try:
-            written = self._file.write(row)
-            if self._sync:
-                os.fsync(self._file.fileno())
-        except OSError as error:
-            raise RecordingError(
-                f"{self._path} cannot be written: {error.strerror}. The file ends with its last complete row."
-            ) from error
-        if written != len(row):
-            self._file.truncate(end)
-            self._file.seek(end)
-            raise RecordingError(
-                f"{self._path} cannot be written: no space left. The file ends with its last complete row."
-            )
-
-    @property
-    def size(self) -> int:
-        """Size of the file [bytes]."""
-        return self._file.tell()
-
-    def truncate(self, size: int) -> None:
-        """Removes all rows after the first `size` bytes."""
-        self._file.truncate(size)
-        self._file.seek(size)
-
-    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Closes the file. `progress` is not called, because the file is already complete."""
-        self._file.close()

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.locked_joints import check_held, lock_hint
-from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.reader_options import FileOptions
 from dvrk_drake.recordings.recording import Recording
 
 #: Longest distance in time between a message of the arm and the messages of its jaw [s].

@@ -18,10 +18,11 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write, open_input
 from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite
-from dvrk_drake.recordings.lcm_log_reader import measurements
+from dvrk_drake.recordings.csv_rows import parse_finite
+from dvrk_drake.recordings.growing_file import GrowingFile, csv_line
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
-from dvrk_drake.recordings.writing import column_names
+from dvrk_drake.recordings.reader_lcm import measurements
+from dvrk_drake.recordings.writer_stream import status_cells, status_columns
 
 #: Shortest part that `identify` can use, with a margin [s].
 MIN_PART = 12.0
@@ -60,10 +61,10 @@ class MotionPartFile:
         Raises:
             RecordingError: The file exists or cannot be written.
         """
-        self._end = f",joint,{arm.name},{motion.digest()}\n"
+        self._end = "joint", arm.name, motion.digest()
         self._first_utime, self._last_utime = 0, 0
         self._file = GrowingFile(path)
-        self._file.append((",".join(_header(arm)) + "\n").encode())
+        self._file.append(csv_line(_header(arm)))
         self._blocks: list[tuple[int, int]] = []
 
     def append(self, rows: Iterable[tuple[lcmt_dvrk_status, float]]) -> None:
@@ -74,20 +75,18 @@ class MotionPartFile:
         Raises:
             RecordingError: The rows cannot be written; the previous rows are complete.
         """
-        lines: list[str] = []
+        lines: list[bytes] = []
         for status, motion_time in rows:
-            measured = measurements(status)
             is_off = status.guard_state == lcmt_dvrk_status.STATE_OFF
-            if is_off or status.utime <= self._last_utime or not all(map(math.isfinite, measured)):
+            if is_off or status.utime <= self._last_utime or not all(map(math.isfinite, measurements(status))):
                 continue
             if not lines:
                 self._blocks.append((status.utime, self._file.size))
             self._first_utime, self._last_utime = self._first_utime or status.utime, status.utime
-            numbers = (1e-6 * (status.utime - self._first_utime), *measured)
-            origin = status.utime, status.sequence, status.guard_state
-            lines.append(",".join([*map(repr, numbers), *map(str, origin), repr(motion_time)]) + self._end)
+            t = 1e-6 * (status.utime - self._first_utime)
+            lines.append(csv_line([*status_cells(t, status), motion_time, *self._end]))
         if lines:
-            self._file.append("".join(lines).encode())
+            self._file.append(b"".join(lines))
 
     def remove_end(self, seconds: float) -> None:
         """Removes the rows of the last `seconds`, in whole blocks of `append`."""
@@ -178,8 +177,7 @@ def useful(parts: list[MotionPart], duration: float) -> list[MotionPart]:
 
 
 def _header(arm: Arm) -> list[str]:
-    names = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, arm.num_joints, arm)]
-    return [*names, "utime", "sequence", "guard_state", "motion_time", "coordinates", "arm", "motion"]
+    return [*status_columns(arm), "motion_time", "coordinates", "arm", "motion"]
 
 
 @dataclass

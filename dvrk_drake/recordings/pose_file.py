@@ -16,9 +16,10 @@ from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite, read_bytes, read_rows
+from dvrk_drake.recordings.csv_rows import parse_finite, read_bytes, read_rows
+from dvrk_drake.recordings.growing_file import GrowingFile, csv_line
 from dvrk_drake.recordings.recording import SAME_POSE, Recording
-from dvrk_drake.recordings.writing import column_names
+from dvrk_drake.recordings.writer_csv import column_names
 
 #: Tolerance of the limits [rad, m], because the positions in a file may be rounded.
 _ROUNDING = 1e-9
@@ -208,12 +209,10 @@ class CollectionFile:
         if self._file is None:
             self._file = GrowingFile(self._path, resume=self._exists, sync=True)
             if not self._has_header:
-                self._file.append((",".join(self._header) + "\n").encode())
-        numbers = [*map(repr, [*q.tolist(), *tau.tolist(), *pose.tolist()])]
-        cells = [*numbers, "joint", self._arm.name, str(time.time_ns() // 1000)]
-        if friction is not None:
-            cells += map(repr, friction.tolist())
-        self._file.append((",".join(cells) + "\n").encode())
+                self._file.append(csv_line(self._header))
+        end = [] if friction is None else friction.tolist()
+        stated = "joint", self._arm.name, time.time_ns() // 1000
+        self._file.append(csv_line([*q.tolist(), *tau.tolist(), *pose.tolist(), *stated, *end]))
 
     def close(self) -> None:
         """Closes the file."""
@@ -225,7 +224,7 @@ class CollectionFile:
 
     def _read(self) -> list[tuple[int, NDArray[np.float64]]]:
         """Returns (line, requested pose) of each complete row."""
-        rows, _ = read_rows(self._path)
+        rows = read_rows(self._path)
         if not read_bytes(self._path).endswith(b"\n"):
             rows = rows[:-1]  # incomplete after a power failure
         if not rows:

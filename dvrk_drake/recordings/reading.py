@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -15,14 +15,14 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.array_file import is_array_file, read_array_file
-from dvrk_drake.recordings.cisst_collector import is_collector_file, read_collector
-from dvrk_drake.recordings.csv_recording import read_csv
 from dvrk_drake.recordings.csv_rows import GZIP_MAGIC, is_utf16
-from dvrk_drake.recordings.file_options import FileOptions
-from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
+from dvrk_drake.recordings.reader_cisst import is_collector_file, read_collector
+from dvrk_drake.recordings.reader_csv import read_csv
+from dvrk_drake.recordings.reader_lcm import is_lcm_log, read_status_log
+from dvrk_drake.recordings.reader_matlab import is_array_file, read_array_file
+from dvrk_drake.recordings.reader_options import FileOptions
+from dvrk_drake.recordings.reader_rosbag import is_ros_bag, read_ros_bag
 from dvrk_drake.recordings.recording import Coordinates, Recording
-from dvrk_drake.recordings.ros_bag import is_ros_bag, read_ros_bag
 
 #: Number of bytes at the beginning of a text file that must not contain a null byte.
 _HEAD = 4096
@@ -127,19 +127,12 @@ def read_recording(
     file_format = detect_format(path)
     if coordinates not in (None, "joint") and "coordinates" not in file_format.options:
         raise RecordingError(f"{path}: {file_format.name} is in joint coordinates, not in {coordinates} coordinates")
-    for option, value in (("topic", topic), ("joints", joints), ("arrays", arrays), ("rate", rate)):
+    some: dict[str, Any] = {"topic": topic, "joints": joints, "arrays": arrays, "rate": rate}
+    for option, value in some.items():
         if value is not None and option not in file_format.options:
             raise RecordingError(f"{path}: --{option} does not apply to {file_format.name}")
-    options = FileOptions(
-        arm=arm,
-        coordinates=coordinates,
-        topic=topic,
-        joints=joints,
-        arrays=arrays,
-        rate=rate,
-        skip_invalid=skip_invalid,
-        progress=step_progress(progress, "reading"),
-    )
+    report = step_progress(progress, "reading")
+    options = FileOptions(arm=arm, coordinates=coordinates, skip_invalid=skip_invalid, progress=report, **some)
     options.check_joints(path)
     recording = file_format.read(path, options)
     return recording if effort_scale is None else _scaled(recording, arm, effort_scale)

@@ -1,41 +1,21 @@
-"""Writes recordings as CSV files and as MCAP bags."""
+"""Writes recordings as CSV files and as MCAP bags, and converts recordings of all formats."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
+import dataclasses
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.files import atomic_write
-from dvrk_drake.recordings.arm_bag import write_mcap
+from dvrk_drake.progress import Progress
+from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording, Setpoints
-
-#: Units of the quantities in a CSV, for a revolute and for a prismatic joint.
-UNITS = {
-    "t": ("s", "s"),
-    **dict.fromkeys(("q", "pose"), ("rad", "m")),
-    "qd": ("rad/s", "m/s"),
-    **dict.fromkeys(("tau", "lower", "upper", "lower_other_day", "upper_other_day", "friction"), ("N m", "N")),
-}
-
-
-def column_names(prefix: str, num_joints: int, arm: Arm | None = None) -> list[str]:
-    """Returns the column names of a quantity in a CSV, e.g. "q1". With `arm`, they contain the units, e.g. "q1 [rad]".
-
-    Args:
-        prefix: Name of the quantity, a key of `UNITS` if `arm` is given.
-        num_joints: Number of columns, except for the time t.
-        arm: Arm that defines which joints are prismatic.
-    """
-    names = ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
-    if arm is None:
-        return names
-    return [f"{name} [{UNITS[prefix][bool(arm.prismatic[i])]}]" for i, name in enumerate(names)]
+from dvrk_drake.recordings.writer_csv import write_csv
+from dvrk_drake.recordings.writer_mcap import write_mcap
 
 
 def write_recording(
@@ -79,24 +59,60 @@ def write_recording(
     )
 
 
-def write_csv(
-    path: str | Path, blocks: Mapping[str, NDArray[np.float64]], arm: Arm | None, stated: Mapping[str, str]
-) -> None:
-    """Writes a table of numbers atomically and with full precision.
+def convert(
+    path: str | Path, output: str | Path, *, arm: Arm | None = None, progress: Progress | None = None, **options: Any
+) -> Recording:
+    """Reads a recording and writes it as a CSV or an MCAP bag for `read_recording`, atomically and with full precision.
 
     Args:
-        path: Path of the file. An existing file is replaced.
-        blocks: Mapping from the prefix of the columns (key of `UNITS`) to their numbers (m, n), or (m,) for the time t.
-        arm: Arm that defines the units of the columns. None: the names of the columns have no units.
-        stated: Mapping from the names of further columns to the text in each of their rows. Empty texts are omitted.
+        path: Path of the recording.
+        output: Path of the file to write: .csv, or .mcap for a bag. An existing file is replaced.
+        arm: The data are written in the joint coordinates of this arm. If None, they are written in the coordinates of
+            the recording. Required to write a bag, and to read a bag or a file of the cisst collector.
+        progress, options: See `read_recording`.
+
+    Returns:
+        Written recording. Its `source`, `lines` and `notes` refer to the original file.
 
     Raises:
-        DvrkDrakeError: The folder does not exist or cannot be written.
+        RecordingError: See `read_recording` and `write_recording`; additionally if `output` is the input recording
+            or has another suffix, or the arm cannot reach the poses.
+        DvrkDrakeError: The output cannot be written.
     """
-    tables = {prefix: block if block.ndim == 2 else block[:, None] for prefix, block in blocks.items()}
-    stated = {name: text for name, text in stated.items() if text}
-    header = [name for prefix, table in tables.items() for name in column_names(prefix, table.shape[1], arm)]
-    with atomic_write(path) as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*header, *stated])
-        writer.writerows([*map(repr, row), *stated.values()] for row in np.hstack(list(tables.values())).tolist())
+    if Path(output).suffix.lower() not in (".csv", ".mcap"):
+        raise RecordingError(f"{output}: the name of the output must end in .csv or .mcap (MCAP bag)")
+    if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
+        raise RecordingError(f"{output} is the input recording. Choose another output file.")
+    recording = read_recording(path, arm, progress=progress, **options)
+    if arm is not None:
+        recording = recording.in_joint_coordinates(arm)
+        recording.check_fits(arm)
+    write_recording(recording, output, arm)
+    assumed: tuple[str, ...] = ()
+    if not recording.file_coordinates:
+        assumed = ("coordinates were not stated, read as joint coordinates (default)",)
+    return dataclasses.replace(recording, notes=(*recording.notes, *assumed, *_properties(recording)))
+
+
+def _properties(recording: Recording) -> list[str]:
+    """Returns notes on times and repeated rows, which affect the next command."""
+    notes = []
+    if recording.t is None:
+        notes.append("without times, read as static poses; for a motion, give its sampling rate with --rate HZ")
+        return notes
+    steps = np.diff(recording.t)
+    interval = f", median interval {1e3 * np.median(steps):.4g} ms" if len(steps) else ""
+    notes.append(f"t from {recording.t[0]:g} to {recording.t[-1]:g} s{interval}")
+    if np.any(steps <= 0):
+        first = recording.where(1 + int(np.argmax(steps <= 0)))
+        notes.append(
+            f"t does not increase in all rows ({np.sum(steps == 0)} equal, {np.sum(steps < 0)} smaller than the "
+            f"previous t; first: {first}). The rows are kept, but identify refuses a motion with such times."
+        )
+    table = np.hstack([block for block in (recording.q, recording.qd, recording.tau) if block is not None])
+    if repeats := int(np.sum(np.all(np.diff(table, axis=0) == 0, axis=1))):
+        notes.append(
+            f"{repeats} of {len(recording)} rows repeat the previous row (sampled faster than the arm measures); these "
+            "rows are kept"
+        )
+    return notes

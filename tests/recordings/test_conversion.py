@@ -8,10 +8,9 @@ from public_files import NUMBERS, assert_refused, team_array, wpi_rows, write_ma
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.conversion import convert
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
+from dvrk_drake.recordings.writing import convert, write_recording
 
 
 def assert_equal(first: Recording, second: Recording) -> None:

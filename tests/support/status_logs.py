@@ -4,7 +4,7 @@ import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes
+from dvrk_drake.recordings.reader_lcm import LcmEvent, event_bytes
 
 ARM = load_arm("mtml")
 N = ARM.num_joints

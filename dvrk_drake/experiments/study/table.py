@@ -18,8 +18,9 @@ from dvrk_drake.errors import StudyError
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Case, Study
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.recordings.csv_rows import GrowingFile, read_bytes
-from dvrk_drake.recordings.writing import column_names
+from dvrk_drake.recordings.csv_rows import read_bytes
+from dvrk_drake.recordings.growing_file import GrowingFile
+from dvrk_drake.recordings.writer_csv import column_names
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes
+from dvrk_drake.recordings.reader_lcm import LcmEvent, event_bytes
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import MIN_ROWS, Recording
 from dvrk_drake.recordings.writing import write_recording

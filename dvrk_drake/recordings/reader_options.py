@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import open_input
 from dvrk_drake.recordings.recording import Coordinates, Recording
 
 #: Number of joints of a file that is read without an arm.
@@ -91,20 +93,49 @@ class FileOptions:
             )
         return self.arm
 
-    def with_coordinates(self, recording: Recording, layout: Coordinates | Literal[""] = "") -> Recording:
-        """Returns a recording with the coordinates of these options.
+    def recording(
+        self,
+        path: Path,
+        blocks: Mapping[str, NDArray[np.float64]],
+        rows: NDArray[np.int_],
+        *,
+        notes: Iterable[str] = (),
+        default_rate: float | None = None,
+        default_coordinates: Coordinates | Literal[""] = "",
+        **facts: Any,
+    ) -> Recording:
+        """Returns the recording of a table, with the times and the coordinates of these options.
 
         Data in "wpi" coordinates are converted to joint coordinates of the arm, if it is given.
 
         Args:
-            recording: Data of the file. Its attribute `coordinates` is not used. Its attribute `file_coordinates`
-                contains the coordinates that the file states, or "".
-            layout: Coordinates of other files with the same layout, or "". They are used if neither the file nor these
-                options state coordinates.
+            path: Path of the file.
+            blocks: Mapping from q, and optionally qd, tau and t, to their numbers (m, n), or (m,) for t.
+            rows: Index (m,) of each row among all rows of the file.
+            notes: Notes on the rows.
+            default_rate: Sampling rate [Hz] of a file without times if these options have no rate. None: the rows are
+                static poses, without times.
+            default_coordinates: Coordinates if neither the file nor these options state them, or "".
+            facts: Other attributes of the recording. `times_from` is the source of t in the file, and
+                `file_coordinates` are the coordinates that the file states, or "".
 
         Raises:
-            RecordingError: The file states other coordinates than these options.
+            RecordingError: The rate is not a positive number or is given for a file with times, or the file states
+                unknown coordinates or other coordinates than these options.
         """
+        t, notes = blocks.get("t"), list(notes)
+        if self.rate is not None:
+            if not (np.isfinite(self.rate) and self.rate > 0):
+                raise RecordingError(f"rate is {self.rate:g} Hz; allowed: a positive number")
+            if t is not None:
+                raise RecordingError(f"{path}: --rate does not apply, because the file has times")
+            facts["times_from"] = "rate"
+        if t is None and (rate := self.rate or default_rate):
+            t = rows / rate
+            notes.append(f"{len(rows)} samples; the file has no times, so t = row / {rate:g} Hz")
+        recording = Recording(
+            blocks["q"], blocks.get("tau"), blocks.get("qd"), t, source=str(path), notes=tuple(notes), **facts
+        )
         stated = recording.file_coordinates
         if stated and stated not in get_args(Coordinates):
             allowed = ", ".join(get_args(Coordinates))
@@ -114,33 +145,20 @@ class FileOptions:
                 f"{recording.where(0)}: the file states {stated} coordinates, not {self.coordinates}. Omit "
                 "--coordinates (coordinates= in Python)."
             )
-        coordinates = self.coordinates or stated or layout
-        recording = dataclasses.replace(recording, file_coordinates=coordinates)
-        recording = dataclasses.replace(recording, coordinates=coordinates or "joint")
+        coordinates = self.coordinates or stated or default_coordinates
+        recording = dataclasses.replace(recording, coordinates=coordinates or "joint", file_coordinates=coordinates)
         return recording.in_joint_coordinates(self.arm) if self.arm and coordinates == "wpi" else recording
 
-    def sampled_times(
-        self, path: Path, t: NDArray[np.float64] | None, rows: NDArray[np.int_], default_rate: float | None = None
-    ) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-        """Returns the times [s] of the rows of a file, and notes on them.
 
-        Args:
-            path: Path of the file, for messages.
-            t: Times (m,) in the file, or None.
-            rows: Index (m,) of each row among all rows of the file.
-            default_rate: Sampling rate [Hz] of a file without times if these options have no rate. None: the rows are
-                static poses, without times.
+def sha256_of(*paths: Path) -> str:
+    """Returns the SHA-256 of the contents of files, in this order.
 
-        Raises:
-            RecordingError: The rate is not a positive number, or a rate is given for a file with times.
-        """
-        if self.rate is not None and not (np.isfinite(self.rate) and self.rate > 0):
-            raise RecordingError(f"rate is {self.rate:g} Hz; allowed: a positive number")
-        if t is not None:
-            if self.rate is not None:
-                raise RecordingError(f"{path}: --rate does not apply, because the file has times")
-            return t, ()
-        rate = default_rate if self.rate is None else self.rate
-        if rate is None:
-            return None, ()
-        return rows / rate, (f"{len(rows)} samples; the file has no times, so t = row / {rate:g} Hz",)
+    Raises:
+        RecordingError: A file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for path in paths:
+        with open_input(path, RecordingError) as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

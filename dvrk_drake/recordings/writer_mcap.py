@@ -1,4 +1,7 @@
-"""Writes the messages of an arm to an MCAP bag for ROS 2 tools, Foxglove and Rerun.
+"""Writes the messages of an arm to MCAP bags for ROS 2 tools, Foxglove and Rerun, completely or while they arrive.
+
+The format is described at https://mcap.dev/spec and https://mcap.dev/spec/registry (profile ros2). The schema of each
+topic is the definition of its message, so that a reader needs no ROS installation.
 
 | topic | message | content |
 |---|---|---|
@@ -13,9 +16,11 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Sequence
+from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +28,10 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.recordings.growing_file import GrowingFile
 from dvrk_drake.recordings.link_frames import FrameTransform, LinkFrames, drawable_urdf
-from dvrk_drake.recordings.mcap_writer import McapWriter, Topic
+from dvrk_drake.recordings.reader_rosbag import JOINT_STATE
 from dvrk_drake.recordings.recording import Recording, Setpoints
-from dvrk_drake.recordings.ros_bag import JOINT_STATE
 
 #: Largest rate of the messages on /tf [Hz].
 TRANSFORM_RATE = 50
@@ -38,6 +43,127 @@ _FIRST_STAMP = 1_000_000_000
 _POSE_INTERVAL = 1.0
 #: Largest header stamp [ns]: the seconds are a signed 32-bit integer.
 _LAST_STAMP = (2**31 - 1) * 1_000_000_000
+#: Time after which the messages of a running recording are written to the file [ns]. It limits the loss if the process
+#: is terminated. Shorter chunks are compressed less, and need a larger index.
+CHUNK_TIME = 100_000_000
+
+
+class Topic(NamedTuple):
+    """Topic with messages of one type, e.g. "sensor_msgs/msg/JointState"."""
+
+    name: str
+    message_type: str
+
+
+class McapWriter:
+    """Writes ROS 2 messages to an MCAP stream, encoded as CDR (Common Data Representation)."""
+
+    def __init__(self, stream: Any, topics: Iterable[Topic]) -> None:
+        """Begins a bag with these topics. `stream` is a binary stream that is open for writing."""
+        # These imports take 0.2 s, and most commands write no bag.
+        from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+        from mcap.writer import IndexType, Writer
+        from rosbags.typesys import Stores, get_typestore
+
+        store = get_typestore(Stores.ROS2_JAZZY)
+        self._serialize, self._message_types = store.serialize_cdr, store.types
+        # By default, the library writes pointers to indexes of attachments and metadata, although the bag has neither.
+        self._writer = Writer(stream, index_types=IndexType.CHUNK | IndexType.MESSAGE)
+        self._writer.start(Profile.ROS2, f"dvrk-drake {version('dvrk-drake')}")
+        self._types = {topic.name: topic.message_type for topic in topics}
+        schemas = {}
+        for message_type in dict.fromkeys(self._types.values()):
+            definition, _ = store.generate_msgdef(message_type, ros_version=2)
+            schemas[message_type] = self._writer.register_schema(message_type, SchemaEncoding.ROS2, definition.encode())
+        self._channels = {
+            name: self._writer.register_channel(name, MessageEncoding.CDR, schemas[message_type])
+            for name, message_type in self._types.items()
+        }
+        self._counts = dict.fromkeys(self._channels, 0)
+
+    def make(self, message_type: str, **fields: Any) -> Any:
+        """Returns a message with all its fields."""
+        return self._message_types[message_type](**fields)
+
+    def write(self, topic: str, message: Any, publish_time: int, log_time: int | None = None) -> None:
+        """Writes a message.
+
+        Args:
+            topic: Name of the topic.
+            message: Message, see `make`.
+            publish_time: Time of publication [ns].
+            log_time: Time of arrival [ns]. Default: `publish_time`.
+        """
+        data = bytes(self._serialize(message, self._types[topic]))
+        self.write_encoded(topic, data, publish_time, publish_time if log_time is None else log_time)
+
+    def write_encoded(self, topic: str, data: bytes, publish_time: int, log_time: int) -> None:
+        """Writes a message that is already encoded (CDR), with its times of publication and arrival [ns]."""
+        sequence = self._counts[topic]
+        self._counts[topic] += 1
+        self._writer.add_message(self._channels[topic], log_time, data, publish_time, sequence)
+
+    def finish(self) -> None:
+        """Writes the index and the end of the bag. The stream remains open."""
+        self._writer.finish()
+
+
+class GrowingMcap(McapWriter):
+    """Bag of a running recording. The messages are written to the file in chunks of `CHUNK_TIME`.
+
+    If the process is terminated, the last chunk and the end of the bag are missing. `mcap recover` then restores all
+    complete chunks.
+    """
+
+    def __init__(self, path: str | Path, topics: Iterable[Topic]) -> None:
+        """Creates the file.
+
+        Raises:
+            RecordingError: The file exists or cannot be written.
+        """
+        self._file, self._flushed = GrowingFile(path), 0
+        self._chunks = _Chunks(self._file)
+        super().__init__(self._chunks, topics)
+
+    def write_encoded(self, topic: str, data: bytes, publish_time: int, log_time: int) -> None:
+        """Writes a message as `McapWriter` does.
+
+        Raises:
+            RecordingError: The messages cannot be written; the file ends with its last complete chunk.
+        """
+        super().write_encoded(topic, data, publish_time, log_time)
+        if abs(log_time - self._flushed) >= CHUNK_TIME:
+            self._flushed = log_time
+            self._writer.flush()
+
+    def close(self) -> None:
+        """Writes the last chunk, the index and the end of the bag.
+
+        Raises:
+            RecordingError: They cannot be written; the file ends with its last complete chunk.
+        """
+        try:
+            self.finish()
+            self._chunks.flush()
+        finally:
+            self._file.close()
+
+
+class _Chunks(io.BytesIO):
+    """Stream for a `Writer`, which cannot continue after an error of `write`. `flush` writes all collected chunks."""
+
+    def __init__(self, file: GrowingFile) -> None:
+        super().__init__()
+        self._file, self._size = file, 0
+
+    def flush(self) -> None:
+        self._file.append(self.getvalue())
+        self._size += len(self.getvalue())
+        self.seek(0)
+        self.truncate()
+
+    def tell(self) -> int:
+        return self._size + super().tell()
 
 
 class JointStateTopic(NamedTuple):

@@ -8,7 +8,6 @@ writes the last events only when the log is closed.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import mmap
 import struct
@@ -25,8 +24,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
 from dvrk_drake.models.lcm_messages import MESSAGE_VERSION, STATUS_PREFIX, decode, status_channel
-from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.joint_states import MAX_LATE
+from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 
 _MAGIC = bytes.fromhex("EDA1DA01")
@@ -76,11 +75,6 @@ class LcmLogReader:
                     position = end
                 else:
                     position = self._skip(content, position)
-
-    def sha256(self) -> str:
-        """Returns the SHA-256 of the file."""
-        with open_input(self.path, RecordingError) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
 
     def _skip(self, content: mmap.mmap, damaged: int) -> int:
         """Returns the position of the next complete event after a damaged one, or the end of the file."""
@@ -280,7 +274,7 @@ def read_status_log(path: Path, options: FileOptions) -> Recording:
         raise RecordingError(f"{path}: {_no_usable_status(channel, arm, channels, notes)}")
     order = np.argsort(times, kind="stable")
     q, qd, tau = np.array(rows).reshape(len(events), 3, -1).transpose(1, 0, 2)[:, order]
-    t, numbers, sha256 = np.array(times)[order], np.array(events)[order], log.sha256()
+    t, numbers, sha256 = np.array(times)[order], np.array(events)[order], sha256_of(path)
     return Recording(
         *(q, tau, qd, t - t[0], "joint", str(path), numbers, sha256, tuple(notes), "event"),
         times_from="messages",

@@ -9,7 +9,6 @@ data, and the names, positions, velocities and efforts of its joints (rad, m, N 
 from __future__ import annotations
 
 import csv
-import dataclasses
 import re
 from pathlib import Path
 
@@ -19,9 +18,9 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input, read_input
 from dvrk_drake.models.locked_joints import check_held
-from dvrk_drake.recordings.csv_rows import CsvReader, read_numbers
-from dvrk_drake.recordings.file_options import FileOptions
+from dvrk_drake.recordings.csv_rows import CsvFile, read_numbers
 from dvrk_drake.recordings.joint_states import arm_joint_names, order_in_time
+from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Coordinates, Recording
 
 #: Lines of a description before the names of the columns.
@@ -87,9 +86,8 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
         blocks[block] = [names.index(member)]
     held = {label: column for label, column in zip(known, joints, strict=False) if label in arm.locked_joints}
     blocks["held"] = list(held.values())
-    with CsvReader(data, options.progress) as reader:
-        found = read_numbers(reader, names, blocks, skip_invalid=options.skip_invalid, header_name=description.name)
-        sha256 = reader.sha256()
+    file = CsvFile(data, options.progress)
+    found = read_numbers(file, names, blocks, skip_invalid=options.skip_invalid, header_name=description.name)
     t = found.blocks["t"][:, 0]
     valid = found.blocks["valid"][:, 0] != 0
     notes, usable = [*found.notes, *name_notes], np.flatnonzero(valid)
@@ -103,18 +101,18 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
     )
     new, notes = usable[in_time], [*notes, *time_notes]
     check_held(f"{data}: {signal}", list(held), found.blocks["held"][new], arm)
-    recording = Recording(
-        found.blocks["q"][new],
-        found.blocks["tau"][new] if "tau" in blocks else None,
-        found.blocks["qd"][new] if "qd" in blocks else None,
-        t[new] - t[new][0],
-        source=str(path),
+    quantities = {block: found.blocks[block][new] for block in _MEMBERS if block in blocks}
+    notes.append(f"signal {signal} of {origin}, in {options.coordinates or stated} coordinates")
+    return options.recording(
+        path,
+        quantities | {"t": t[new] - t[new][0]},
+        new,
+        notes=notes,
+        default_coordinates=stated,
         lines=found.lines[new],
-        sha256=sha256,
+        sha256=sha256_of(data),
         times_from="messages",
     )
-    notes.append(f"signal {signal} of {origin}, in {options.coordinates or stated} coordinates")
-    return dataclasses.replace(options.with_coordinates(recording, stated), notes=tuple(notes))
 
 
 def _read_description(path: Path) -> tuple[str, list[str]]:

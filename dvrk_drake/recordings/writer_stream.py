@@ -1,7 +1,7 @@
 """Writes the statuses of an arm to a CSV, an MCAP bag or an LCM log while they are received.
 
-If the process is terminated, the file ends with the last complete row. The last rows before a power failure may be
-lost.
+If the process is terminated, the file ends with the last complete row, and a bag with its last complete chunk. The last
+rows before a power failure may be lost.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import heapq
 import os
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -20,16 +19,15 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.lcm_messages import status_channel
-from dvrk_drake.recordings.arm_bag import ArmMessages
-from dvrk_drake.recordings.csv_rows import GrowingFile
+from dvrk_drake.recordings.growing_file import GrowingFile, csv_line
 from dvrk_drake.recordings.joint_states import MAX_LATE
-from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
-from dvrk_drake.recordings.mcap_writer import GrowingMcap
-from dvrk_drake.recordings.writing import column_names
+from dvrk_drake.recordings.reader_lcm import LcmEvent, StatusStream, event_bytes, measurements
+from dvrk_drake.recordings.writer_csv import column_names
+from dvrk_drake.recordings.writer_mcap import ArmMessages, GrowingMcap
 
 #: Ending of the file name of an LCM log.
 LCM_LOG = ".log"
-#: Additional columns of a CSV, after the columns of a Recording. They identify the status of each row.
+#: Columns of a CSV after the columns of a Recording. They identify the status of each row.
 _ORIGIN = ("utime", "sequence", "guard_state")
 
 
@@ -48,8 +46,8 @@ class RecordingFile(Protocol):
             RecordingError: The file can no longer be written; it ends with its last complete row.
         """
 
-    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Completes and closes the file. `progress` receives the completed fraction (0 to 1)."""
+    def close(self) -> None:
+        """Completes and closes the file."""
 
 
 def check_stream_output(path: str | Path, accepted: tuple[str, ...] = (".csv", ".mcap", LCM_LOG)) -> None:
@@ -92,21 +90,33 @@ def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> Rec
     return _CsvFile(path, stream, arm) if suffix == ".csv" else _McapFile(path, arm)
 
 
+def status_columns(arm: Arm) -> list[str]:
+    """Returns the names of the columns of `status_cells`."""
+    return [
+        *(name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, arm.num_joints, arm)),
+        *_ORIGIN,
+    ]
+
+
+def status_cells(t: float, status: lcmt_dvrk_status) -> list[float]:
+    """Returns the numbers of a status in a CSV. `t` is its time in the recording [s]."""
+    return [t, *measurements(status), *(getattr(status, name) for name in _ORIGIN)]
+
+
 class _CsvFile(GrowingFile):
     """CSV with rows in the order of arrival. At the end, the rows are sorted by their times if a status was late."""
 
     def __init__(self, path: str | Path, stream: StatusStream, arm: Arm) -> None:
         super().__init__(path)
-        self._stream, self._end = stream, f",joint,{arm.name}\n"
-        header = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, stream.num_joints, arm)]
-        self.append((",".join((*header, *_ORIGIN, "coordinates", "arm")) + "\n").encode())
+        self._stream, self._arm = stream, arm
+        self.append(csv_line([*status_columns(arm), "coordinates", "arm"]))
 
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         if status is not None:
-            self.append(self._row(status))
+            self.append(csv_line([*status_cells(self._stream.time(status), status), "joint", self._arm.name]))
 
-    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
-        super().close(progress)
+    def close(self) -> None:
+        super().close()
         if self._stream.num_late:
             with open(self._path, "rb") as rows, atomic_write(self._path, "wb") as ordered:
                 ordered.write(next(rows))
@@ -118,11 +128,6 @@ class _CsvFile(GrowingFile):
                     while waiting[0][0] < t - MAX_LATE:
                         ordered.write(heapq.heappop(waiting)[1])
                 ordered.writelines(row for _, row in sorted(waiting))
-
-    def _row(self, status: lcmt_dvrk_status) -> bytes:
-        numbers = (self._stream.time(status), *measurements(status))
-        origin = (getattr(status, name) for name in _ORIGIN)
-        return (",".join([*map(repr, numbers), *map(str, origin)]) + self._end).encode()
 
 
 class _LogFile(GrowingFile):
@@ -148,5 +153,5 @@ class _McapFile:
             commanded = np.array(status.position_commanded), None, np.array(status.effort_commanded)
             self._messages.write(self._bag, 1000 * status.utime, list(measured), commanded, 1000 * utime)
 
-    def close(self, progress: Callable[[float], object] = lambda share: None) -> None:
-        self._bag.close(progress)
+    def close(self) -> None:
+        self._bag.close()

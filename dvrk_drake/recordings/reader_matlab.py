@@ -10,7 +10,6 @@ The arrays q, qd, tau and t are named by the user or recognised by their names. 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -19,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.recordings.array_content import ArrayContent, is_matlab, read_content
 from dvrk_drake.recordings.csv_rows import listed, read_bytes
-from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.joint_states import JointState, collect_joint_states, joint_recording
+from dvrk_drake.recordings.matlab_content import ArrayContent, is_matlab, read_content
+from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 
 _SUFFIXES = (".mat", ".npz")
@@ -79,14 +78,12 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     names = dict(options.arrays or {})
     if unknown := set(names) - {*QUANTITIES, "poses"}:
         raise RecordingError(f"unknown quantity {', '.join(sorted(unknown))}; allowed: {', '.join(QUANTITIES)}, poses")
-    digest, parts = hashlib.sha256(), []
+    parts = []
     for number, file in enumerate(files):
         options.progress(number / len(files))
-        content = read_bytes(file)
-        digest.update(content)
-        contents = read_content(file, content)
+        contents = read_content(file, read_bytes(file))
         if contents.messages and not names and not _has_positions(contents) and len(files) == 1:
-            return _message_recording(path, contents.messages, options, digest.hexdigest())
+            return _message_recording(path, contents.messages, options)
         parts.append(_rows(file, contents, options.num_joints, names))
     for file, part in zip(files, parts, strict=True):
         if (part.blocks.keys(), part.label) != (parts[0].blocks.keys(), parts[0].label):
@@ -108,20 +105,16 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     rows = np.flatnonzero(valid)
     if options.rate is not None and len(files) > 1:
         raise RecordingError(f"{path}: --rate does not apply to a folder; read the motion of one file")
-    t, time_notes = options.sampled_times(path, blocks["t"][rows] if "t" in blocks else None, rows)
-    recording = Recording(
-        blocks["q"][rows],
-        blocks["tau"][rows] if "tau" in blocks else None,
-        blocks["qd"][rows] if "qd" in blocks else None,
-        t,
-        source=str(path),
+    return options.recording(
+        path,
+        {quantity: block[rows] for quantity, block in blocks.items()},
+        rows,
+        notes=notes,
         lines=rows + 1,
-        sha256=digest.hexdigest(),
-        notes=(*notes, *time_notes),
+        sha256=sha256_of(*files),
         line_label=label,
-        times_from="array" if options.rate is None else "rate",
+        times_from="array",
     )
-    return options.with_coordinates(recording)
 
 
 class _Rows(NamedTuple):
@@ -154,9 +147,7 @@ def _has_positions(content: ArrayContent) -> bool:
     return any(name.rpartition(".")[2].lower() in _NAMES["q"] for name in content.arrays)
 
 
-def _message_recording(
-    path: Path, variables: Mapping[str, list[JointState]], options: FileOptions, sha256: str
-) -> Recording:
+def _message_recording(path: Path, variables: Mapping[str, list[JointState]], options: FileOptions) -> Recording:
     """Returns the recording of the only variable with messages."""
     if len(variables) > 1:
         raise RecordingError(
@@ -166,7 +157,7 @@ def _message_recording(
     states = collect_joint_states(
         path, name, messages, skip_invalid=options.skip_invalid, item=lambda number: f"message {number} of {name}"
     )
-    return joint_recording(path, states, None, options, sha256, "message")
+    return joint_recording(path, states, None, options, sha256_of(path), "message")
 
 
 def _rows(path: Path, content: ArrayContent, n: int, names: Mapping[str, str]) -> _Rows:

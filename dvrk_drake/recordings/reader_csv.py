@@ -13,7 +13,6 @@ Layouts without a header, for an arm with n joints:
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -24,18 +23,18 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import is_package_arm
 from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.recordings.csv_rows import (
-    CsvReader,
+    CsvFile,
     is_comment,
     is_number,
     parse_finite,
     parse_or_nan,
     read_numbers,
 )
-from dvrk_drake.recordings.file_options import FileOptions
 from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
+from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.topic_choice import check_namespace
-from dvrk_drake.recordings.writing import UNITS
+from dvrk_drake.recordings.writer_csv import UNITS
 
 #: Nominal sampling rate of the motions of WPI [Hz].
 WPI_RATE = 200.0
@@ -76,69 +75,79 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
             times.
     """
     arm, n = options.arm, options.num_joints
-    with CsvReader(path, options.progress) as reader:
-        rows, comments = iter(reader), list[list[str]]()
-        line, cells = next(rows, (0, []))
-        while cells and is_comment(cells):
-            comments.append([cell.strip(" #") for cell in cells])
-            line, cells = next(rows, (0, []))
-        if not cells:
-            raise RecordingError(f"{path} is empty; needs a header with {_expected_columns(n)}")
-        cells, where = [cell.strip() for cell in cells], f"{path}, line {line}"
-        is_headerless, first = 2 * sum(map(is_number, cells)) >= len(cells), []
-        last = comments[-1] if comments else []
-        if is_headerless and len(last) == len(cells) and not any(map(is_number, last)):
-            # np.savetxt writes the header as a comment.
-            is_headerless, first, cells = False, [(line, cells)], last
-        if fields := _message_fields(where, cells):
-            topic = next((comment[0][7:] for comment in comments if comment[0].startswith("Topic: ")), "")
-            return _read_messages(reader, cells, fields, topic, options)
-        if is_headerless:
-            blocks = _layout(path, where, len(cells), arm, n)
-            order = options.joint_order(path)
-            blocks = {prefix: [columns[i] for i in order] for prefix, columns in blocks.items()}
-            header = [f"{prefix}{i + 1} (column {n * k + i + 1})" for k, prefix in enumerate(blocks) for i in range(n)]
-            first = [(line, cells)]
-        else:
-            header, units = _split_units(cells)
-            blocks = _columns_of_blocks(where, _with_numbers(where, header, options), options)
-            first = first or list(itertools.islice(reader, 1))
-            _check_arm(path, header, first, arm)
-            _check_units(where, header, units, blocks, arm)
-        found = read_numbers(
-            reader,
-            header,
-            blocks,
-            skip_invalid=options.skip_invalid,
-            first=first,
-            header_name="the first row" if is_headerless else "the header",
-        )
-        sha256 = reader.sha256()
-    is_wpi = is_headerless and len(header) == 3 * _WPI_JOINTS and (arm is None or is_package_arm(arm))
-    recorded = found.blocks["t"][:, 0] if "t" in blocks else None
-    t, time_notes = options.sampled_times(path, recorded, found.rows, WPI_RATE if is_wpi else None)
+    file, comments = CsvFile(path, options.progress), list[tuple[int, list[str]]]()
+    for line, row in file.rows():
+        cells = [cell.strip() for cell in row]
+        if not is_comment(cells):
+            break
+        comments.append((line, [cell.strip(" #") for cell in cells]))
+    else:
+        raise RecordingError(f"{path} is empty; needs a header with {_expected_columns(n)}")
+    is_headerless = 2 * sum(map(is_number, cells)) >= len(cells)
+    if is_headerless and comments and len(comments[-1][1]) == len(cells) and not any(map(is_number, comments[-1][1])):
+        # np.savetxt writes the header as a comment.
+        is_headerless, (line, cells) = False, comments[-1]
+    where = f"{path}, line {line}"
+    if fields := _message_fields(where, cells):
+        topic = next((comment[0][7:] for _, comment in comments if comment[0].startswith("Topic: ")), "")
+        return _read_messages(file, line, cells, fields, topic, options)
     if is_headerless:
-        time_notes = (f"no header: columns read as {', '.join(f'{name}1..{name}{n}' for name in blocks)}", *time_notes)
-    used = {header[column] for columns in blocks.values() for column in columns} | {*_STATEMENTS}
-    # `collect` writes files without a column t.
-    is_pose_file = {"pose1", "utime"} <= set(header)
-    ignored = [name for name in header if name and name not in used]
-    if t is None and ignored and not is_pose_file:
-        time_notes = (f"no column t, read as static poses; ignored columns: {', '.join(ignored)}",)
-    recording = Recording(
-        found.blocks["q"],
-        found.blocks.get("tau"),
-        found.blocks.get("qd"),
-        t,
-        source=str(path),
-        lines=found.lines,
-        sha256=sha256,
-        notes=(*time_notes, *found.notes),
-        times_from="column" if options.rate is None else "rate",
-        file_coordinates=_statement(header, first, "coordinates"),  # type: ignore[arg-type]
-        arm_name=_statement(header, first, "arm"),
+        blocks = _layout(path, where, len(cells), arm, n)
+        order, line = options.joint_order(path), line - 1
+        blocks = {prefix: [columns[i] for i in order] for prefix, columns in blocks.items()}
+        header = [f"{prefix}{i + 1} (column {n * k + i + 1})" for k, prefix in enumerate(blocks) for i in range(n)]
+        stated = {}
+    else:
+        header, units = _split_units(cells)
+        blocks = _columns_of_blocks(where, _with_numbers(where, header, options), options)
+        stated = _stated(file, line, header, arm)
+        _check_units(where, header, units, blocks, arm)
+    found = read_numbers(
+        file,
+        header,
+        blocks,
+        after=line,
+        skip_invalid=options.skip_invalid,
+        header_name="the first row" if is_headerless else "the header",
     )
-    return options.with_coordinates(recording, "wpi" if is_wpi else "")
+    is_wpi = is_headerless and len(header) == 3 * _WPI_JOINTS and (arm is None or is_package_arm(arm))
+    used = {header[column] for columns in blocks.values() for column in columns} | {*_STATEMENTS}
+    ignored = [name for name in header if name and name not in used]
+    notes: tuple[str, ...] = ()
+    if is_headerless:
+        notes = (f"no header: columns read as {', '.join(f'{name}1..{name}{n}' for name in blocks)}",)
+    # `collect` writes files without a column t.
+    elif "t" not in blocks and options.rate is None and ignored and not {"pose1", "utime"} <= set(header):
+        notes = (f"no column t, read as static poses; ignored columns: {', '.join(ignored)}",)
+    return options.recording(
+        path,
+        {name: block[:, 0] if name == "t" else block for name, block in found.blocks.items()},
+        found.rows,
+        notes=(*notes, *found.notes),
+        default_rate=WPI_RATE if is_wpi else None,
+        default_coordinates="wpi" if is_wpi else "",
+        lines=found.lines,
+        sha256=sha256_of(path),
+        times_from="column",
+        file_coordinates=stated.get("coordinates", ""),
+        arm_name=stated.get("arm", ""),
+    )
+
+
+def _stated(file: CsvFile, after: int, header: list[str], arm: Arm | None) -> dict[str, str]:
+    """Returns the cells of the first row after a line by the names of their columns.
+
+    Raises:
+        RecordingError: The column `arm` names another arm.
+    """
+    line, cells = next(file.rows(after), (0, []))
+    if len(cells) != len(header):
+        return {}
+    stated = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
+    name = stated.get("arm", "")
+    if name and arm is not None and name.lower() != arm.name.lower():
+        raise RecordingError(f"{file.path}, line {line}: the row is of {name[:30]}, but the selected arm is {arm.name}")
+    return stated
 
 
 def _message_fields(where: str, header: list[str]) -> dict[str, list[int]]:
@@ -161,10 +170,10 @@ def _message_fields(where: str, header: list[str]) -> dict[str, list[int]]:
 
 
 def _read_messages(
-    reader: CsvReader, header: list[str], fields: dict[str, list[int]], topic: str, options: FileOptions
+    file: CsvFile, after: int, header: list[str], fields: dict[str, list[int]], topic: str, options: FileOptions
 ) -> Recording:
-    """Reads messages, one per row. `topic` is the topic in the file, or ""."""
-    path = reader.path
+    """Reads messages, one per row, after the last line of the header. `topic` is the topic in the file, or ""."""
+    path = file.path
     arm = options.required_arm(path)
     if topic:
         check_namespace(path, arm, topic, advice="")
@@ -178,7 +187,7 @@ def _read_messages(
         ]
 
     def messages() -> Iterator[JointState]:
-        for line, cells in reader:
+        for line, cells in file.rows(after):
             if len(cells) != len(header):
                 raise RecordingError(
                     f"{path}, line {line}: the row has {len(cells)} cells, the header has {len(header)}"
@@ -197,29 +206,13 @@ def _read_messages(
     states = collect_joint_states(
         path, topic, messages(), skip_invalid=options.skip_invalid, item=lambda line: f"line {line}"
     )
-    return joint_recording(path, states, None, options, reader.sha256(), "line")
+    return joint_recording(path, states, None, options, sha256_of(path), "line")
 
 
 def _elements(cell: str) -> list[str]:
     """Returns the elements of a list such as "['yaw', 'pitch']" or "array('d', [1, 2])", or of a single value."""
     text = cell.rpartition("[")[2].partition("]")[0]
     return [element for part in text.split(",") if (element := part.strip(" '\"()"))]
-
-
-def _check_arm(path: Path, header: list[str], first: list[tuple[int, list[str]]], arm: Arm | None) -> None:
-    """Raises RecordingError if the column `arm` of the first row names another arm."""
-    name = _statement(header, first, "arm")
-    if name and arm is not None and name.lower() != arm.name.lower():
-        raise RecordingError(
-            f"{path}, line {first[0][0]}: the row is of {name[:30]}, but the selected arm is {arm.name}"
-        )
-
-
-def _statement(header: list[str], first: list[tuple[int, list[str]]], column: str) -> str:
-    """Returns the text in a column of the first row, or "" without such a column."""
-    if not first or column not in header or len(first[0][1]) != len(header):
-        return ""
-    return first[0][1][header.index(column)].strip()
 
 
 def _split_units(cells: list[str]) -> tuple[list[str], list[str]]:
