@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.files import open_input, read_input
+from dvrk_drake.models.files import open_input
 
 #: Size of the blocks in which a file is read [bytes], and maximum number of characters of a line.
 _BLOCK, _MAX_LINE = 1 << 20, 1 << 20
@@ -32,15 +32,6 @@ _MAX_ROWS = 64_000_000
 MAX_COUNT = 900_000
 #: Number of lines between two reports of progress.
 _REPORT = 1000
-
-
-def read_bytes(path: Path) -> bytes:
-    """Returns the content of a file.
-
-    Raises:
-        RecordingError: The file does not exist, cannot be read, or is too large.
-    """
-    return read_input(path, RecordingError)
 
 
 class CsvFile(NamedTuple):

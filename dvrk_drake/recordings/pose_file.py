@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.files import atomic_write, read_input
 from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.recordings.csv_rows import parse_finite, read_bytes, read_rows
+from dvrk_drake.recordings.csv_rows import parse_finite, read_rows
 from dvrk_drake.recordings.growing_file import GrowingFile, csv_line
 from dvrk_drake.recordings.recording import SAME_POSE, Recording
 from dvrk_drake.recordings.writer_csv import column_names
@@ -225,7 +225,7 @@ class CollectionFile:
     def _read(self) -> list[tuple[int, NDArray[np.float64]]]:
         """Returns (line, requested pose) of each complete row."""
         rows = read_rows(self._path)
-        if not read_bytes(self._path).endswith(b"\n"):
+        if not read_input(self._path, RecordingError).endswith(b"\n"):
             rows = rows[:-1]  # incomplete after a power failure
         if not rows:
             return []

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.recordings.csv_rows import listed, read_bytes
+from dvrk_drake.models.files import read_input
+from dvrk_drake.recordings.csv_rows import listed
 from dvrk_drake.recordings.joint_states import JointState, collect_joint_states, joint_recording
-from dvrk_drake.recordings.matlab_content import ArrayContent, is_matlab, read_content
+from dvrk_drake.recordings.reader_matlab_content import ArrayContent, is_matlab, read_content
 from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 
@@ -81,7 +82,7 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     parts = []
     for number, file in enumerate(files):
         options.progress(number / len(files))
-        contents = read_content(file, read_bytes(file))
+        contents = read_content(file, read_input(file, RecordingError))
         if contents.messages and not names and not _has_positions(contents) and len(files) == 1:
             return _message_recording(path, contents.messages, options)
         parts.append(_rows(file, contents, options.num_joints, names))
@@ -93,14 +94,14 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     order = options.joint_order(path)
     blocks = {quantity: np.concatenate([part.blocks[quantity] for part in parts]) for quantity in parts[0].blocks}
     blocks = {quantity: block if quantity == "t" else block[:, order] for quantity, block in blocks.items()}
-    label, preallocated = parts[0].label, parts[0].preallocated
+    label = parts[0].label
     notes = [parts[0].note if len(files) == 1 else f"{len(files)} files; {parts[0].note} of each file"]
     if "t" in blocks and len(files) > 1:
         del blocks["t"]
         notes.append("times are not used, because each file has its own times")
-    valid = _valid_rows(path, blocks, label, preallocated, options.skip_invalid)
+    valid = _valid_rows(path, blocks, label, options.skip_invalid)
     if not np.all(valid):
-        omitted, reason = np.flatnonzero(~valid) + 1, "NaN or infinite" + preallocated * ", or all zeros"
+        omitted, reason = np.flatnonzero(~valid) + 1, "NaN or infinite" + (label == "pose") * ", or all zeros"
         notes.append(f"{len(omitted)} of {len(valid)} {label}s skipped ({reason}): {listed(omitted)}")
     rows = np.flatnonzero(valid)
     if options.rate is not None and len(files) > 1:
@@ -123,14 +124,12 @@ class _Rows(NamedTuple):
     Attributes:
         blocks: Mapping from a quantity to its rows.
         note: Names of the arrays of the blocks.
-        label: Name of a row, for messages.
-        preallocated: True if a row that contains only zeros is not a measurement.
+        label: Name of a row, for messages: "row", or "pose" of an array of 8 x 2 x N.
     """
 
     blocks: dict[str, NDArray[np.float64]]
     note: str
     label: str = "row"
-    preallocated: bool = False
 
 
 def _collection(folder: Path) -> list[Path]:
@@ -261,18 +260,19 @@ def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
         raise RecordingError(f"{path}: array {name} has no poses")
     joints = np.asarray(array, float).reshape(_POSE_ROWS, 2, -1)[:_POSE_JOINTS]
     blocks = {"q": joints[:, 0].T.copy(), "tau": joints[:, 1].T.copy()}
-    return _Rows(blocks, f"static poses from array {name}; its eighth row (gripper) is ignored", "pose", True)
+    return _Rows(blocks, f"static poses from array {name}; its eighth row (gripper) is ignored", "pose")
 
 
-def _valid_rows(
-    path: Path, blocks: Mapping[str, NDArray], label: str, preallocated: bool, skip_invalid: bool
-) -> NDArray[np.bool_]:
-    """Returns a mask (m,) of the rows that contain only finite numbers and, if preallocated, not only zeros."""
+def _valid_rows(path: Path, blocks: Mapping[str, NDArray], label: str, skip_invalid: bool) -> NDArray[np.bool_]:
+    """Returns a mask (m,) of the rows that contain only finite numbers.
+
+    Poses of only zeros are not valid either, because arrays of 8 x 2 x N are allocated before the measurement.
+    """
     if len(blocks["q"]) == 0:
         raise RecordingError(f"{path}: the arrays have no rows")
     table = np.column_stack([block.reshape(len(blocks["q"]), -1) for block in blocks.values()])
     finite = np.all(np.isfinite(table), axis=1)
-    valid = finite & np.any(table, axis=1) if preallocated else finite
+    valid = finite & np.any(table, axis=1) if label == "pose" else finite
     if not np.any(valid):
         raise RecordingError(f"{path} has {len(valid)} {label}s, but none is valid")
     if np.all(valid) or skip_invalid:

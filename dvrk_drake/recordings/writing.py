@@ -68,7 +68,7 @@ def convert(
         path: Path of the recording.
         output: Path of the file to write: .csv, or .mcap for a bag. An existing file is replaced.
         arm: The data are written in the joint coordinates of this arm. If None, they are written in the coordinates of
-            the recording. Required to write a bag, and to read a bag or a file of the cisst collector.
+            the recording. Required to write a bag. To read a recording, see `read_recording`.
         progress, options: See `read_recording`.
 
     Returns:

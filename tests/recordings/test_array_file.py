@@ -13,7 +13,7 @@ from array_files import KINDS, with_objects, write_arrays
 from public_files import assert_refused, team_array, write_mat
 
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings import matlab_content
+from dvrk_drake.recordings import reader_matlab_content
 from dvrk_drake.recordings.reading import read_recording
 
 
@@ -324,5 +324,5 @@ def test_a_file_that_crashes_the_reader_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "v6.mat"
     scipy.io.savemat(path, {"q": np.zeros((3, 7)), "tau": np.ones((3, 7))})
     np.testing.assert_array_equal(read_recording(path).tau, np.ones((3, 7)))
-    monkeypatch.setattr(matlab_content, "_LOADER", "import os; os.abort()")
+    monkeypatch.setattr(reader_matlab_content, "_LOADER", "import os; os.abort()")
     assert_refused(r"the file is damaged, or not a MATLAB file .*\(the reader crashed\)", read_recording, path)

@@ -14,11 +14,10 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.errors import StudyError
+from dvrk_drake.errors import RecordingError, StudyError
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Case, Study
-from dvrk_drake.models.files import atomic_write
-from dvrk_drake.recordings.csv_rows import read_bytes
+from dvrk_drake.models.files import atomic_write, read_input
 from dvrk_drake.recordings.growing_file import GrowingFile
 from dvrk_drake.recordings.writer_csv import column_names
 
@@ -97,7 +96,7 @@ class StudyTable:
 
     def _read(self) -> dict[int, Row]:
         """Reads the complete rows of the file, by the number of the case."""
-        content, begin = read_bytes(self._path), _line(self._header)
+        content, begin = read_input(self._path, RecordingError), _line(self._header)
         whole, tail = content[: content.rfind(b"\n") + 1], content[content.rfind(b"\n") + 1 :]
         if not whole and begin.startswith(tail):
             return {}  # new file, or interrupted while writing the header
