@@ -153,7 +153,8 @@ def convert(
 
     Args:
         output: File to write: .csv, or .mcap for ROS 2 tools, Foxglove and Rerun.
-        arm: Convert to joint coordinates of this arm. Required for bags and for files of the cisst collector.
+        arm: Convert to joint coordinates of this arm. Required for bags, LeRobot data sets and files of the cisst
+            collector.
     """
     from dvrk_drake.recordings.writing import convert as convert_recording
 

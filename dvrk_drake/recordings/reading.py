@@ -19,6 +19,7 @@ from dvrk_drake.recordings.csv_rows import GZIP_MAGIC, is_utf16
 from dvrk_drake.recordings.reader_cisst import is_collector_file, read_collector
 from dvrk_drake.recordings.reader_csv import read_csv
 from dvrk_drake.recordings.reader_lcm import is_lcm_log, read_status_log
+from dvrk_drake.recordings.reader_lerobot import is_lerobot, read_lerobot
 from dvrk_drake.recordings.reader_matlab import is_array_file, read_array_file
 from dvrk_drake.recordings.reader_options import FileOptions
 from dvrk_drake.recordings.reader_rosbag import is_ros_bag, read_ros_bag
@@ -48,6 +49,7 @@ class Format:
 #: Formats in the order in which they are tried. A file of no other format is a CSV.
 FORMATS = (
     Format("an LCM log", is_lcm_log, read_status_log, frozenset()),
+    Format("a LeRobot data set", is_lerobot, read_lerobot, frozenset({"joints"})),
     Format("a ROS bag", is_ros_bag, read_ros_bag, frozenset({"topic", "joints"})),
     Format(
         "a file of the cisst collector",
@@ -78,7 +80,7 @@ def read_recording(
     skip_invalid: bool = False,
     progress: Progress | None = None,
 ) -> Recording:
-    """Reads a recording: CSV, ROS bag, MATLAB file, NumPy archive, cisst collector or LCM log.
+    """Reads a recording: CSV, ROS bag, MATLAB file, NumPy archive, LeRobot data set, cisst collector or LCM log.
 
     The content of the file selects the format. docs/recordings.md describes the formats with their units, coordinates
     and times.
@@ -86,8 +88,8 @@ def read_recording(
     Args:
         path: Path of the file. A ROS 2 bag and a collection of MATLAB files may also be folders.
         arm: Arm that defines the number and the names of the joints. From a bag or a log, only the measurements of this
-            arm are read. Required for a bag and for the cisst collector. If None, other files must have 7 joints, and a
-            log must have statuses of only one arm.
+            arm are read. Required for a bag, for a LeRobot data set and for the cisst collector. If None, other files
+            must have 7 joints, and a log must have statuses of only one arm.
         coordinates: Coordinates of q, qd and tau in a file that does not state them: "joint", "actuator", or "wpi" for
             the motions of WPI, which are in actuator coordinates except for the roll of a PSM. Default: the coordinates
             that the file states, "wpi" for a CSV of an arm of this package with 21 columns and no header, or else
@@ -179,7 +181,7 @@ def detect_format(path: Path) -> Format:
     if found is None:
         raise RecordingError(
             f"{path} is a folder without a recording; allowed: ROS bag (.mcap, .db3, .bag), MATLAB files (.mat), NumPy "
-            "archives (.npz)"
+            "archives (.npz), LeRobot data set"
         )
     if head.startswith(GZIP_MAGIC):
         head = _decompressed(path, head)
