@@ -81,9 +81,9 @@ class McapWriter:
         }
         self._counts = dict.fromkeys(self._channels, 0)
 
-    def make(self, message_type: str, **fields: Any) -> Any:
-        """Returns a message with all its fields."""
-        return self._message_types[message_type](**fields)
+    def make(self, message_type: str, *fields: Any) -> Any:
+        """Returns a message with all its fields, in the order of its definition."""
+        return self._message_types[message_type](*fields)
 
     def write(self, topic: str, message: Any, publish_time: int, log_time: int | None = None) -> None:
         """Writes a message.
@@ -235,7 +235,7 @@ class FrameMessages:
             return
         if self._slot is None:
             if self._urdf:
-                bag.write(self._description, bag.make(_STRING, data=self._urdf), stamp, log_time)
+                bag.write(self._description, bag.make(_STRING, self._urdf), stamp, log_time)
             _write_transforms(bag, _TF_STATIC, stamp, self._frames.static, log_time)
         self._slot = slot
         _write_transforms(bag, _TF, stamp, self._frames.moving(q), log_time)
@@ -285,35 +285,17 @@ class ArmMessages:
         for topics, state in ((self._measured, measured), (self._commanded, commanded)):
             if any(part is not None for part in state):
                 for topic in topics:
-                    _write_joint_state(bag, topic, stamp, state, log_time)
+                    blocks = [np.empty(0) if part is None else part[topic.columns] for part in state]
+                    message = bag.make(JOINT_STATE, _header(bag, stamp), list(topic.joint_names), *blocks)
+                    bag.write(topic.name, message, stamp, log_time)
         q = measured[0]
         assert q is not None
         self._frames.write(bag, stamp, q, log_time)
 
 
 def _header(bag: McapWriter, stamp: int, frame_id: str = "") -> object:
-    sec, nanosec = divmod(stamp, 1_000_000_000)
-    time = bag.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return bag.make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
-
-
-def _write_joint_state(
-    bag: McapWriter,
-    topic: JointStateTopic,
-    stamp: int,
-    state: Sequence[NDArray[np.float64] | None],
-    log_time: int | None,
-) -> None:
-    position, velocity, effort = (np.empty(0) if part is None else part[topic.columns] for part in state)
-    message = bag.make(
-        JOINT_STATE,
-        header=_header(bag, stamp),
-        name=list(topic.joint_names),
-        position=position,
-        velocity=velocity,
-        effort=effort,
-    )
-    bag.write(topic.name, message, stamp, log_time)
+    time = bag.make("builtin_interfaces/msg/Time", *divmod(stamp, 1_000_000_000))
+    return bag.make("std_msgs/msg/Header", time, frame_id)
 
 
 def _write_transforms(
@@ -321,23 +303,14 @@ def _write_transforms(
 ) -> None:
     messages = []
     for parent, child, X_PC in transforms:
-        (x, y, z), rotation = X_PC.translation(), X_PC.rotation().ToQuaternion()
+        w, x, y, z = X_PC.rotation().ToQuaternion().wxyz()
+        translation = bag.make("geometry_msgs/msg/Vector3", *X_PC.translation())
         transform = bag.make(
-            "geometry_msgs/msg/Transform",
-            translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=bag.make(
-                "geometry_msgs/msg/Quaternion", x=rotation.x(), y=rotation.y(), z=rotation.z(), w=rotation.w()
-            ),
+            "geometry_msgs/msg/Transform", translation, bag.make("geometry_msgs/msg/Quaternion", x, y, z, w)
         )
-        messages.append(
-            bag.make(
-                "geometry_msgs/msg/TransformStamped",
-                header=_header(bag, stamp, parent),
-                child_frame_id=child,
-                transform=transform,
-            )
-        )
-    bag.write(topic, bag.make(_TRANSFORMS, transforms=messages), stamp, log_time)
+        header = _header(bag, stamp, parent)
+        messages.append(bag.make("geometry_msgs/msg/TransformStamped", header, child, transform))
+    bag.write(topic, bag.make(_TRANSFORMS, messages), stamp, log_time)
 
 
 def write_mcap(recording: Recording, path: str | Path, arm: Arm, setpoints: Setpoints | None = None) -> None:
