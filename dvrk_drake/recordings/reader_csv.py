@@ -92,19 +92,14 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         topic = next((comment[0][7:] for _, comment in comments if comment[0].startswith("Topic: ")), "")
         return _read_messages(file, line, cells, fields, topic, options)
     if is_headerless:
-        blocks = _layout(path, where, len(cells), arm, n)
-        order, line = options.joint_order(path), line - 1
-        blocks = {prefix: [columns[i] for i in order] for prefix, columns in blocks.items()}
-        header = [f"{prefix}{i + 1} (column {n * k + i + 1})" for k, prefix in enumerate(blocks) for i in range(n)]
-        stated = {}
-    else:
-        header, units = _split_units(cells)
-        blocks = _columns_of_blocks(where, _with_numbers(where, header, options), options)
-        stated = _stated(file, line, header, arm)
-        _check_units(where, header, units, blocks, arm)
+        line, cells = line - 1, _assumed_header(path, where, len(cells), arm, n)
+    header, units = _split_units(cells)
+    blocks = _columns_of_blocks(where, _with_numbers(where, header, options), options)
+    stated = _stated(file, line, header, arm)
+    _check_units(where, header, units, blocks, arm)
     found = read_numbers(
         file,
-        header,
+        [f"{name} (column {i})" for i, name in enumerate(header, 1)] if is_headerless else header,
         blocks,
         after=line,
         skip_invalid=options.skip_invalid,
@@ -238,11 +233,11 @@ def _check_units(
                 )
 
 
-def _layout(path: Path, where: str, width: int, arm: Arm | None, n: int) -> dict[str, list[int]]:
-    """Returns a mapping from a prefix (q, qd, tau) to its columns in a file without a header."""
+def _assumed_header(path: Path, where: str, width: int, arm: Arm | None, n: int) -> list[str]:
+    """Returns the names of the columns of a file without a header."""
     for prefixes in (("q", "qd", "tau"), ("q", "tau")):
         if width == n * len(prefixes):
-            return {prefix: list(range(k * n, (k + 1) * n)) for k, prefix in enumerate(prefixes)}
+            return [f"{prefix}{i}" for prefix in prefixes for i in range(1, n + 1)]
     message = (
         f"{where}: the first row has {width} cell{'s' * (width != 1)} and no header. Allowed without a header for {n} "
         f"joints: {3 * n} columns (q, qd, tau) or {2 * n} (q, tau)"
