@@ -1,4 +1,8 @@
-"""Weighted least squares over poses, with Gaussian priors, robust weights and closed-form leave-one-out residuals."""
+"""Weighted least squares over poses, with Gaussian priors, robust weights and closed-form leave-one-out residuals.
+
+Poses are not fitted with `Estimator`, which is for motions. A pose can be an outlier, so that each of its efforts has a
+weight of its own, and each pose is predicted from all others, for which `Estimator` would need one fit per pose.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Fits a point mass on a link to the difference of the efforts of two recordings."""
+"""Fits a point mass on a link to the difference of the efforts of two recordings.
+
+The efforts are not linear in the mass and its position, so that this fit shares only the normal equations with
+`Estimator`. A linear fit of the ten inertial parameters would not determine the mass on a link that rotates about a
+fixed point.
+"""
 
 from __future__ import annotations
 
