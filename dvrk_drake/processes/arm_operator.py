@@ -1,4 +1,4 @@
-"""What an operator of an arm does over LCM: look at its state, stop it, and reset a fault."""
+"""Shows an operator the state of an arm over LCM, stops the arm, and resets a fault."""
 
 from __future__ import annotations
 
