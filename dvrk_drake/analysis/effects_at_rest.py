@@ -11,15 +11,15 @@ from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
 from dvrk_drake.analysis.estimation.robust_fit import blocks
 from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
+from dvrk_drake.analysis.verdict import NEGLIGIBLE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
+from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 
-#: Smallest coefficient of a correction in standard errors, and its smallest RMS effort as a share of the dry friction.
-#: If a pose is approached from both sides by a short distance, about 12 % of the dry friction remains in the
-#: measurement.
-MIN_RATIO, MIN_FRICTION_SHARE = 3.0, 0.15
+#: Smallest coefficient of a correction in standard errors. XXX
+MIN_RATIO = 3.0
 #: Smallest number of poses for corrections. The errors of a gravity model depend on the posture, so fewer poses can
 #: increase the errors at other poses.
 MIN_NUM_POSES = 20
@@ -106,7 +106,7 @@ class _Candidate:
         effect: Effect.
         efforts: Efforts (m, n) of the actuators for a coefficient of 1.
         deviation: Prior standard deviation of the coefficient.
-        least: Smallest absolute coefficient of a correction.
+        least: Smallest absolute coefficient of a correction, whose RMS effort is then `NEGLIGIBLE`.
     """
 
     effect: ActuatorEffect
@@ -120,18 +120,18 @@ def _candidates(model: IdentifiedModel, q: NDArray[np.float64], residual: NDArra
     rows = arm.effect_coordinates
     of_motion = [e for e in model.dynamic_model.section.effects if EFFECT_KINDS[e.kind].symmetric]
     dry = np.sum([np.abs(rows[e.coordinate] * e.coefficient) for e in of_motion], axis=0) * np.ones(arm.num_joints)
-    largest = np.sqrt(np.mean(residual**2, axis=0)) + 1e-9
+    largest = np.maximum(np.sqrt(np.mean(residual**2, axis=0)), ROUNDING_EFFORT)
     workspace = arm.sample_poses(200, np.random.default_rng(0))
 
     def candidate(effect: ActuatorEffect, shape: NDArray[np.float64]) -> _Candidate:
         row = rows[effect.coordinate]
         size = np.sqrt(np.mean(shape**2)) * np.abs(row)
         acts = size > 0
-        friction = float(np.min(np.maximum(dry, 1e-9)[acts] / size[acts], initial=np.inf))
+        friction = float(np.min(np.maximum(dry, ROUNDING_EFFORT)[acts] / size[acts], initial=np.inf))
         if effect.kind == "presliding":
             return _Candidate(effect, np.outer(shape, row), friction / len(TRAVELS), 0.0)
         deviation = float(np.min(largest[acts] / size[acts]))
-        return _Candidate(effect, np.outer(shape, row), deviation, MIN_FRICTION_SHARE * friction)
+        return _Candidate(effect, np.outer(shape, row), deviation, NEGLIGIBLE * friction)
 
     candidates = []
     for name in distinct_coordinates(arm):

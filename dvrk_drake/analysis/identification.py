@@ -13,7 +13,7 @@ from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT, MAX_HALF_WIDTH, GravityDirection
+from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT, GravityDirection
 from dvrk_drake.analysis.static.gravity_direction import estimate_gravity as gravity_direction
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
@@ -122,7 +122,7 @@ def _with_estimated_gravity(arm: Arm, direction: GravityDirection, source: str) 
     if not direction.is_determined:
         raise IdentificationError(
             f"{source}: the poses do not determine the direction of gravity: {direction} from the arm file; at most +- "
-            f"{np.rad2deg(MAX_HALF_WIDTH):g} deg is allowed. Measure the tilt of the base and give the gravity vector, "
+            f"{np.rad2deg(LARGE_TILT):g} deg is allowed. Measure the tilt of the base and give the gravity vector, "
             "or record more poses over larger ranges."
         )
     return arm.with_gravity(direction.gravity.tolist())

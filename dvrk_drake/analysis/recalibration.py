@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
+from dvrk_drake.analysis.dynamic.estimates import MAX_CORRELATION_TIME
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
+from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION
 from dvrk_drake.analysis.observations.drive_efforts import (
     FrictionPart,
     drive_efforts,
@@ -17,7 +19,7 @@ from dvrk_drake.analysis.observations.drive_efforts import (
 )
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.repetition import correlation_of, phase_folds
+from dvrk_drake.analysis.observations.repetition import CORRELATION_TIME, correlation_of, phase_folds
 from dvrk_drake.analysis.results import ModelResult
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
@@ -30,14 +32,6 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Number of folds for cross-validation. The folds of a periodic motion are intervals of its phase.
 FOLDS = 4
-#: Prior standard deviations. The first is that of a friction factor, with prior mean 1. The second is that of the
-#: change of an offset, as a share of the RMS effort, with prior mean 0.
-SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
-#: Assumed correlation time of the residuals [s]. Residuals are correlated because they are mainly model errors.
-_CORRELATION_TIME = 0.1
-#: Duration of a block whose residuals are assumed to be independent of those of other blocks [s], see
-#: `estimates.CORRELATION_TIME`.
-_BLOCK = 1.0
 #: Smallest share of the time during which an actuator must move in each direction. Otherwise, its friction is not
 #: fitted.
 MIN_SHARE = 0.1
@@ -243,13 +237,13 @@ class _Fit:
         self.unchanged = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
         k, n = len(self.keys), len(self.names)
         size = np.where(self.measured, np.sqrt(np.mean(self.tau**2, axis=0)), 1.0)
-        self._deviation = np.concatenate([np.full(k, SCALE_DEVIATION), OFFSET_DEVIATION * size])
+        self._deviation = np.concatenate([np.full(k, EFFECT_DEVIATION), EFFECT_KINDS["offset"].prior_share * size])
         columns = []
         for i in range(n):
             own = np.flatnonzero(self._loads[:, i])
             columns.append((np.append(own, k + i), np.column_stack([self.friction[:, i, own], np.ones(len(self.tau))])))
         # Rows within the correlation time are not independent.
-        independent = np.full(self.tau.shape, 1 / (self.rate * _CORRELATION_TIME))
+        independent = np.full(self.tau.shape, 1 / (self.rate * CORRELATION_TIME))
         self._estimator = Estimator(
             NormalEquations.of(columns, k + n, self.tau - self.other, self._fold, self._edge),
             Prior(self.unchanged, self._deviation**-2.0, np.arange(k + n) < k),
@@ -294,8 +288,8 @@ class _Fit:
     def standard_errors(self, free: NDArray[np.bool_], held_out: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the standard errors (k + n,) of x, 0 for the values that are not fitted.
 
-        They are those of a jackknife over blocks of `_BLOCK` seconds (cluster-robust covariance), because the residuals
-        are correlated.
+        They are those of a jackknife over blocks of `MAX_CORRELATION_TIME` (cluster-robust covariance), because the
+        residuals are correlated.
 
         Args:
             free: See `solve`.
@@ -313,7 +307,7 @@ class _Fit:
         return errors
 
     def _blocks(self) -> NDArray[np.int_]:
-        return np.arange(len(self.tau)) // max(int(_BLOCK * self.rate), 1)
+        return np.arange(len(self.tau)) // max(int(MAX_CORRELATION_TIME * self.rate), 1)
 
     @property
     def degrees_of_freedom(self) -> float:

@@ -88,9 +88,9 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: Gravity effort above which an actuator is considered loaded by gravity [N m, N]. Smaller efforts are rounding errors.
-MIN_WEIGHT = 1e-9
-#: Number of random poses at which the gravity efforts are compared with `MIN_WEIGHT`.
+#: Largest effort that is a rounding error, e.g. of efforts that cancel [N m, N]. XXX
+ROUNDING_EFFORT = 1e-9
+#: Number of random poses at which the gravity efforts are compared with `ROUNDING_EFFORT`. XXX
 WEIGHING_POSES = 20
 
 
@@ -141,7 +141,7 @@ class DynamicModel:
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
         poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))
         weight = np.abs(nominal_weight(DynamicRegressor(arm), poses)).max(axis=0)
-        excluded = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > MIN_WEIGHT}
+        excluded = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > ROUNDING_EFFORT}
         excluded -= {e.coordinate for e in self.effects if e.kind == "cable cosine"}
         return tuple(
             i

@@ -7,11 +7,12 @@ from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect
 from dvrk_drake.models.schema_fault import within
 
-#: Allowed range of estimates. It is wide because parameters that a recording does not identify can have any value.
+#: Allowed ranges of estimates, standard errors and efforts. They detect wrong units and misplaced decimal points (see
+#: docs/number_ranges.md), and are wide because parameters that a recording does not identify can have any value.
 ESTIMATES = within(-1e5, 1e5, "kg, kg m or kg m^2")
 STANDARD_ERRORS = within(0.0, 1e9)
 RMS_EFFORTS = within(0.0, 1e6, "N m or N")
-#: Range from 0 to 1 with a tolerance for rounding.
+#: Ranges from 0 to 1 and from -1 to 1, with a tolerance for rounding.
 SHARES = within(-1e-6, 1.0 + 1e-6)
 _CORRELATIONS = within(-1.0 - 1e-6, 1.0 + 1e-6)
 _CUT_OFFS = within(0.01, 1e5, "Hz")

@@ -120,7 +120,8 @@ def _box_from_corners(link: str, corners: BoxCorners) -> BoundingBox:
 #: Lower bound on the eigenvalues of a pseudo-inertia [kg, kg m, kg m^2]. The bound is lower for a link whose smallest
 #: eigenvalue in the SDF is less than four times this value (see `least_eigenvalue_bound`).
 MIN_EIGENVALUE = 1e-9
-#: Lower and upper bounds of the mass of a link, as multiples of its mass in the SDF.
+#: Lower and upper bounds of the mass of a link, as multiples of its mass in the SDF. The lower bound is also that of a
+#: rotor inertia. XXX
 MASS_RANGE = 0.1, 5.0
 #: Largest change of the total mass of all links, as a share of the total mass in the SDF.
 TOTAL_MASS_TOLERANCE = 0.2

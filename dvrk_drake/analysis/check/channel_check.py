@@ -12,7 +12,7 @@ from itertools import chain, combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.channel_fit import ChannelFit
+from dvrk_drake.analysis.check.channel_fit import OFFSET_DEVIATION, ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.excluded_measurements import find_excluded
@@ -35,16 +35,15 @@ MIN_MIRROR_GAIN = 100.0
 MIN_GAIN_AT_REST, MIN_EFFORT_GAIN_AT_REST = 30.0, 40.0
 #: Hypotheses with a gain within this distance of the largest gain are reported as alternatives.
 SIMILAR_GAIN = 10.0
-#: Factors by which the recorded effort is multiplied for a test of the scale. They are not tested for a converted model
-#: file, whose masses may be wrong by a factor of 2 and which states no friction; see `find_mounting`.
+#: Factors by which the recorded effort is multiplied for a test of the scale. Smaller errors may be changes of friction
+#: (`FRICTION_FACTOR`). The factors are not tested for a converted model file, whose masses may be wrong by a factor of
+#: 2 and which states no friction; see `find_mounting`.
 SCALES = (0.5, 2.0)
 #: Largest accepted ratio of the dissipated friction power to the friction power expected from the arm file. The public
 #: recordings of one PSM on two days have ratios between 0.96 and 1.54.
 FRICTION_FACTOR = 1.7
 #: Smallest reported position offset [rad], [m], and smallest ratio of a reported offset to its standard error.
 MIN_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
-#: The offset of a joint is checked only if an offset of this size [rad], [m] would be significant.
-MAX_UNDETECTED_OFFSET = 0.1, 0.01
 #: Largest duration of a segment [s]. A longer motion is divided into equal segments, because the memory of a fit is
 #: proportional to the duration. Of more than `MAX_SEGMENTS` segments, evenly distributed ones are checked.
 MAX_SEGMENT_DURATION, MAX_SEGMENTS = 120.0, 4
@@ -278,7 +277,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
             advice = f"Check that tau{i + 1} and the positions were recorded in the same motion."
         elif ratio > 0:
             if 1 / allowed[i] < ratio < allowed[i]:
-                if not 0.5 * allowed[i] < ratio < 2.0 / allowed[i]:
+                if not SCALES[0] * allowed[i] < ratio < SCALES[1] / allowed[i]:
                     uncertain.append(i)
                 continue
             what = f"the actuator friction dissipates {ratio:.2g} times the power expected from the arm file"
@@ -344,7 +343,7 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
     Offsets of joints with parallel axes have similar effects, so the warning also lists the other possible joints.
     """
     arm, undetectable, found = fit.arm, [], {}
-    min_offset, max_undetected = arm.per_joint(*MIN_OFFSET), arm.per_joint(*MAX_UNDETECTED_OFFSET)
+    min_offset, max_undetected = arm.per_joint(*MIN_OFFSET), arm.per_joint(*OFFSET_DEVIATION)
     for i in range(arm.num_joints):
         offset, error = fit.position_offset(i)
         if OFFSET_ERRORS * error > max_undetected[i]:
@@ -367,7 +366,7 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
 
 def _undetectable(arm: Arm, joints: list[int]) -> Iterator[Finding]:
     if joints:
-        angle, length = MAX_UNDETECTED_OFFSET
+        angle, length = OFFSET_DEVIATION
         what = f"position offsets of {angle} rad ({length} m) cannot be detected in this recording"
         advice = (
             "Such offsets have the same effect as different centres of mass of the links. Check the encoder offsets."

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
 from dvrk_drake.analysis.estimation.estimator import MIN_ERROR, Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
-from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
+from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION, KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
+from dvrk_drake.analysis.observations.effort_lag import NUM_INDEPENDENT
 from dvrk_drake.analysis.observations.low_pass import low_pass, resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid, ends_of
 from dvrk_drake.analysis.observations.observations import Observations
@@ -23,16 +24,14 @@ from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED
 
-#: Prior standard deviation of the effects in the arm file, as a share of each coefficient.
-EFFECT_DEVIATION = 0.5
-#: Prior standard deviation of a position offset [rad], [m].
+#: Prior standard deviation of a position offset [rad], [m]. An offset of a joint is reported only if one of this size
+#: would be significant. XXX
 OFFSET_DEVIATION = 0.1, 0.01
 #: Number of samples of the fit per period of the effort's cut-off frequency.
 OVERSAMPLING = 2.5
-#: Largest assumed numbers of independent measurements of an effort in a motion and in poses. More measurements do not
-#: average out model errors. The number of poses is that of the largest public recording of poses (`mtm_2015_good72`),
-#: for which the limits of the gain at rest are set.
-MAX_INDEPENDENT, MAX_INDEPENDENT_POSES = 220.0, 72.0
+#: Largest assumed number of independent measurements of an effort in poses, see `NUM_INDEPENDENT`. It is that of the
+#: largest public recording of poses (`mtm_2015_good72`), for which the limits of the gain at rest are set.
+MAX_INDEPENDENT_POSES = 72.0
 #: In poses at rest, an actuator counts as moving if the range of its positions exceeds this value [rad], [m].
 MIN_RANGE = 0.1, 0.01
 #: Smallest information about a direction in the space of rigid-body parameters. The information is the squared relative
@@ -75,7 +74,7 @@ class ChannelFit:
         self.moves = bool(recording.motion(arm))
         if self.moves:
             grid = observations.grid
-            self._cut_off = min(arm.identification.effort_cut_off, 0.4 * grid.rate)
+            self._cut_off = min(arm.identification.effort_cut_off, grid.rate / OVERSAMPLING)
             self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
             self._q, self._v, self._vd = grid.q, grid.v, grid.vd
             self._tau = self._sampled_efforts(grid)
@@ -91,7 +90,7 @@ class ChannelFit:
             self._tau = observations.tau
             independent = min(len(recording), MAX_INDEPENDENT_POSES)
             moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*MIN_RANGE)
-        self.num_independent = min(independent, MAX_INDEPENDENT)
+        self.num_independent = min(independent, NUM_INDEPENDENT)
         measured = np.any(recording.measured_actuators(arm).measured_effort() != 0, axis=0)
         self.used, self.resting = np.flatnonzero(moves & measured), np.flatnonzero(~moves & measured)
         self.log_likelihood = 0.0

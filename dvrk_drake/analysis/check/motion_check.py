@@ -8,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
-from dvrk_drake.analysis.observations.effort_lag import LAG_STEP, MAX_LAG, EffortLag, effort_lag
+from dvrk_drake.analysis.dynamic.estimates import STRONG_CORRELATION
+from dvrk_drake.analysis.observations.effort_lag import CUT_OFF, LAG_STEP, MAX_LAG, MIN_ERRORS, EffortLag, effort_lag
 from dvrk_drake.analysis.observations.low_pass import resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionSignals, motion_signals
 from dvrk_drake.analysis.observations.noise import cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import find_period, repeatability_floor
 from dvrk_drake.analysis.observations.true_time import (
+    GAIN_TOLERANCE,
     TrueTime,
     VelocityAgreement,
     distinct_rows,
@@ -32,13 +34,10 @@ MIN_REPEATED = 0.005
 MIN_EXTRA = 0.05
 #: Smallest reported jitter as a share of the mean interval.
 MIN_JITTER = 0.05
-#: An effort has the wrong sign in two cases: its Coulomb friction is more than the first number of standard errors
-#: below 0, or it is more than the second number of standard errors below 0 and the relative work of the motor is below
-#: minus the third number. Within two standard errors of 0, the sign of the friction is uncertain.
-MIN_SIGN_ERRORS, MIN_SIGN_ERRORS_WITH_WORK, MIN_NEGATIVE_WORK = 5.0, 2.0, 0.05
-#: The parameters of two joints are hardly identifiable separately if the correlation of the joint velocities exceeds
-#: this value.
-MIN_CORRELATION = 0.95
+#: An effort has the wrong sign in two cases: its Coulomb friction is more than `MIN_ERRORS` standard errors below 0, or
+#: it is more than the first number of standard errors below 0 and the relative work of the motor is below minus the
+#: second number. Within two standard errors of 0, the sign of the friction is uncertain. XXX
+MIN_SIGN_ERRORS_WITH_WORK, MIN_NEGATIVE_WORK = 2.0, 0.05
 #: Smallest duration of a motion for the estimation of lags, signs and noise [s].
 MIN_DURATION = 10.0
 
@@ -70,7 +69,7 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
         )
         advice = f"Record at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
-    signals = motion_signals(actuators, clock, 20.0, rate=min(rate, GRID_RATE))
+    signals = motion_signals(actuators, clock, CUT_OFF, rate=min(rate, GRID_RATE))
     moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
     agreement = _agreement(actuators, clock, signals)
     lags = effort_lag(signals, moving)
@@ -183,7 +182,7 @@ def _velocities(agreement: VelocityAgreement | None, names: tuple[str, ...]) -> 
         mismatch = f"mismatch {100 * agreement.mismatch[j]:.0f} %"
         what = f"qd{j + 1} is {gain:.3g} times dq/dt and {1e3 * lag:.1f} ms late ({mismatch})"
         advice = "Velocities are computed from q instead."
-        if abs(gain * np.pi / 180 - 1) < 0.1:
+        if abs(gain * np.pi / 180 - 1) < GAIN_TOLERANCE:
             advice += f" The unit of qd{j + 1} may be deg/s; use rad/s."
         elif gain < 0:
             advice += f" The sign of qd{j + 1} is wrong."
@@ -212,7 +211,7 @@ def _correlated_joints(signals: MotionSignals, moving: NDArray[np.bool_], names:
         return []
     correlation = np.abs(np.corrcoef(signals.v[:, index].T))
     findings = []
-    for a, b in np.argwhere(np.triu(correlation, 1) > MIN_CORRELATION):
+    for a, b in np.argwhere(np.triu(correlation, 1) > STRONG_CORRELATION):
         i, j = int(index[a]), int(index[b])
         what = f"these joints move together (correlation of their velocities {correlation[a, b]:.3f})"
         advice = "Their inertia and friction are not identifiable separately. Move the joints independently."
@@ -232,7 +231,7 @@ def _wrong_signs(work: NDArray[np.float64], lags: EffortLag, arm: Arm) -> list[F
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = lags.coulomb / lags.coulomb_error
     # Negative work alone is not sufficient, because gravity and inertia may transfer power from other joints.
-    wrong = (errors < -MIN_SIGN_ERRORS) | ((work < -MIN_NEGATIVE_WORK) & (errors < -MIN_SIGN_ERRORS_WITH_WORK))
+    wrong = (errors < -MIN_ERRORS) | ((work < -MIN_NEGATIVE_WORK) & (errors < -MIN_SIGN_ERRORS_WITH_WORK))
     findings = []
     for j in np.flatnonzero(wrong):
         friction, unit = float(lags.coulomb[j]), "N" if arm.prismatic[j] else "N m"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from dvrk_drake.analysis.check.channel_check import segments_of
+from dvrk_drake.analysis.check.channel_check import MIN_GAIN, segments_of
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.observations.observations import Observations
@@ -24,11 +24,11 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import has_converted_model, is_from_model_file
 from dvrk_drake.models.arm_schema import ANGLES, ArmDescription, Gains
 
-#: Smallest gain in log-likelihood of another direction of gravity or another joint zero, in the search and in the
-#: `ChannelFit` that confirms the result and whose priors contain more of a wrong mounting. In this fit, the gain of the
-#: true hypotheses is 260 to 1960 on recordings of two robots and 14 on a simulated one with three joints. That of all
-#: other hypotheses is at most 6 on recordings of five robots.
-MIN_GAIN, MIN_CONFIRMED_GAIN = 20.0, 10.0
+#: Smallest gain in log-likelihood of another direction of gravity or another joint zero in the `ChannelFit` that
+#: confirms the result. Its priors contain more of a wrong mounting than the search, whose smallest gain is `MIN_GAIN`.
+#: The gain of the true hypotheses is 260 to 1960 on recordings of two robots and 14 on a simulated one with three
+#: joints. That of all other hypotheses is at most 6 on recordings of five robots.
+MIN_CONFIRMED_GAIN = 10.0
 #: Smallest angle of a reported direction from the stated one [rad]. Smaller angles are tilts of the base, which the
 #: identification estimates (`base_may_tilt`).
 MIN_ANGLE = np.deg2rad(30.0)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.observations.effort_lag import MIN_ERRORS
 from dvrk_drake.analysis.static.excluded_measurements import find_excluded, usable_measurements
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
@@ -17,9 +18,9 @@ MAX_COMPARED = 500
 #: Smallest RMS gravity effort of the SDF model [N m], [N], and its smallest share of the measured RMS effort, for a
 #: check of the sign. The torque of a cable can exceed a smaller gravity effort.
 MIN_GRAVITY, GRAVITY_SHARE = (0.1, 1.0), 0.5
-#: An effort has the wrong sign if its regression coefficient on gravity is more than the first number of standard
-#: errors below 0, and if the correlation of effort and gravity is below minus the second number.
-MIN_SIGN_ERRORS, MIN_OPPOSITE_CORRELATION = 5.0, 0.7
+#: An effort has the wrong sign if its regression coefficient on gravity is more than `MIN_ERRORS` standard errors below
+#: 0, and if the correlation of effort and gravity is below minus this number. XXX
+MIN_OPPOSITE_CORRELATION = 0.7
 
 
 def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
@@ -83,5 +84,5 @@ def _significant_correlation(gravity: NDArray[np.float64], tau: NDArray[np.float
     slope = float(gravity @ tau) / sizes[0] ** 2
     error = float(np.linalg.norm(tau - slope * gravity)) / sizes[0] / np.sqrt(len(tau) - 1)
     covariance = float((gravity - np.mean(gravity)) @ (tau - np.mean(tau)))
-    significant = abs(slope) > MIN_SIGN_ERRORS * error and slope * covariance > 0
+    significant = abs(slope) > MIN_ERRORS * error and slope * covariance > 0
     return float(gravity @ tau) / (sizes[0] * sizes[1]) if significant else 0.0

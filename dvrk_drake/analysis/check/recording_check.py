@@ -14,16 +14,17 @@ from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_fi
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.dynamic.validation import find_other_robot, validate_motion
+from dvrk_drake.analysis.observations.motion_faults import TIME_UNITS
 from dvrk_drake.analysis.observations.motion_grid import MIN_SEGMENT
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.true_time import MIN_ROWS, distinct_rows, repeated_rows, time_factor
+from dvrk_drake.analysis.observations.true_time import SAME_VALUE, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, usable_poses
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import COORDINATES_HELP, MIN_RANGE, REST_SPEED, Recording
+from dvrk_drake.recordings.recording import COORDINATES_HELP, MIN_RANGE, MIN_ROWS, REST_SPEED, Recording
 
 #: Smallest share of the range between its limits that a joint must cover for accurate estimates of its parameters.
 MIN_COVERAGE = 0.1
@@ -215,7 +216,7 @@ def _off_rows(actuators: Recording, tau: NDArray[np.float64], joint: int, arm: A
 
 def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
     """Returns the share of rows that are in runs of at least `FLAT_ROWS` rows at the extreme value."""
-    at = np.abs(values - extreme) <= 1e-6 * max(abs(extreme), float(np.ptp(values)))
+    at = np.abs(values - extreme) <= SAME_VALUE * max(abs(extreme), float(np.ptp(values)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
     lengths = np.diff(edges.reshape(-1, 2), axis=1).ravel()
     return float(np.sum(lengths[lengths >= FLAT_ROWS]) / len(values))
@@ -246,8 +247,7 @@ def _time(observations: Observations, kind: str) -> list[Finding]:
         factor = time_factor(times, recording.q[rows], recording.qd[rows])
     if factor is None or abs(factor - 1) < TIME_TOLERANCE:
         return [Finding("refusal", *fault)] if (fault := observations.fault) else []
-    units = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
-    unit = next((name for size, name in units.items() if abs(factor / size - 1) < 0.1), "")
+    unit = next((name for name, size in TIME_UNITS.items() if abs(factor * size - 1) < TIME_TOLERANCE), "")
     cause = f"t may be in {unit}" if unit else "usual causes: a wrong rate, or qd in another unit"
     what = f"times increase {factor:.4g} times as fast as q and qd imply ({cause})"
     advice = "Use t in s, q in rad (m) and qd in rad/s (m/s)."

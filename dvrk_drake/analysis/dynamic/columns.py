@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     spring_over,
 )
 from dvrk_drake.dynamics.base_parameters import independent_columns
-from dvrk_drake.dynamics.dynamic_model import effect_shapes, is_loaded
+from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT, effect_shapes, is_loaded
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
@@ -27,9 +27,8 @@ from dvrk_drake.models.arm import Arm
 #: Widths of the smoothed sign function of Coulomb friction, divided by the standard deviation of the coordinate's
 #: velocity [1].
 COULOMB_WIDTHS = (0.03, 0.1, 0.4)
-#: Width of the smoothed sign function of asymmetric, Stribeck and load-dependent friction, divided by the same standard
-#: deviation [1].
-DIRECTION_WIDTH = 0.1
+#: Width of the smoothed sign function of all other friction, divided by the same standard deviation [1].
+DIRECTION_WIDTH = COULOMB_WIDTHS[1]
 #: Name of an effect in an arm file -> number of periods of its sine and cosine per revolution.
 CABLES = {"cable 1": 1.0, "cable 2": 2.0}
 ASYMMETRIC = "asymmetric friction"
@@ -41,10 +40,6 @@ NAMED_FRICTION = {
     "position^2 friction": "position^2 coulomb",
 }
 NAMED_EFFECTS = ("spring", *CABLES, *NAMED_FRICTION)
-
-
-#: Largest effort of an effect with a coefficient of 1 that is a rounding error, e.g. of efforts that cancel.
-MIN_SHAPE = 1e-9
 #: Kinds of the effects that differ between recordings.
 RECORDING_KINDS = ("offset", "viscous", "coulomb")
 
@@ -129,7 +124,7 @@ class DynamicColumns:
         Friction of a drive whose effort was not measured, or that did not move, does not act on the measured efforts.
         """
         size = [np.max(np.abs(shape), axis=0, initial=0.0) for shape in self.shapes]
-        return np.asarray(np.max(np.array(size).T * np.abs(self.rows), axis=1) > MIN_SHAPE)
+        return np.asarray(np.max(np.array(size).T * np.abs(self.rows), axis=1) > ROUNDING_EFFORT)
 
     def with_effects(self, kept: NDArray[np.bool_]) -> DynamicColumns:
         """Returns the columns of the effects in the mask `kept` (e,)."""

@@ -50,8 +50,6 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 #: Smallest absolute coefficient of an effect that the model contains, in units of the prior standard deviation of this
 #: coefficient.
 MIN_EFFECT = 1e-4
-#: Smallest number of folds of one motion.
-MIN_FOLDS = 3
 #: Largest number of rows in a fit. A motion with more rows is thinned out after low-pass filtering.
 MAX_ROWS = 40_000
 
@@ -224,7 +222,7 @@ def motion_problem(
         acting = whole.acting
         num_mandatory = int(np.sum(acting[:num_mandatory]))
         whole = whole.with_effects(acting)
-    num_folds = max(FOLDS // len(grids), MIN_FOLDS)
+    num_folds = -(-FOLDS // len(grids))
     folds, edges = zip(
         *(phase_folds(grid, own.period, num_folds) for grid, own in zip(grids, observations, strict=True)), strict=True
     )

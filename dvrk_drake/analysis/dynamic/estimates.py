@@ -75,16 +75,13 @@ class ParameterUncertainty:
 
 #: Largest time lag at which effort errors are assumed to be correlated [s]. If the motion repeats, errors at lags near
 #: whole periods are also correlated.
-CORRELATION_TIME = 1.0
+MAX_CORRELATION_TIME = 1.0
 #: Degrees of freedom of a variance that is estimated with a Parzen window, times the largest lag of the window, divided
 #: by the duration (Priestley, "Spectral Analysis and Time Series", 1981, table 6.2).
 PARZEN_FREEDOM = 3.71
 #: Ratio of two rates: the rate of the rows from which the covariance is computed, and twice the cut-off frequency of
 #: the low-pass filter.
 _OVERSAMPLING = 2.0
-#: Smallest overlap of a motion with the same motion shifted by one period, as a share of the duration of the motion.
-#: With a smaller overlap, the errors that repeat are not estimated.
-_MIN_OVERLAP = 0.2
 #: Smallest number of directions from which the size of the deviations from the SDF is estimated, and largest variance
 #: of the noise in such a direction, as a share of the prior variance.
 _MIN_DIRECTIONS, _MAX_NOISE = 5, 0.1
@@ -172,7 +169,7 @@ def parameter_covariance(
     scaled = fit.prior_precision * np.outer(factor, factor)
     prior = _inverse(fit.prior_precision) * np.outer(factor, factor)
     seconds = sum(min(_duration(motion), motion.period or np.inf) for motion in series)
-    return ParameterCovariance(A @ (noise + scaled) @ A, prior, PARZEN_FREEDOM * seconds / CORRELATION_TIME)
+    return ParameterCovariance(A @ (noise + scaled) @ A, prior, PARZEN_FREEDOM * seconds / MAX_CORRELATION_TIME)
 
 
 def _duration(motion: ResidualSeries) -> float:
@@ -236,7 +233,7 @@ def error_covariance(
 ) -> NDArray[np.float64]:
     """Returns the autocovariance (r,) of an actuator's error, for lags of 0 to r - 1 rows.
 
-    Up to a lag of `CORRELATION_TIME`, the result is the sample autocovariance of the error, multiplied by a Parzen
+    Up to a lag of `MAX_CORRELATION_TIME`, the result is the sample autocovariance of the error, multiplied by a Parzen
     window. For lags near a multiple of the period, the values for lags near one period are used again. This part is
     due to errors that repeat in every period.
 
@@ -249,13 +246,13 @@ def error_covariance(
     count = len(fitted)
     products = correlation(fitted, held_out)
     lags = (products + products[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
-    width = min(round(CORRELATION_TIME * rate), count - 1)
+    width = min(round(MAX_CORRELATION_TIME * rate), count - 1)
     window = _parzen(np.arange(-width, width + 1) / width)
     near_zero = np.concatenate([lags[width:0:-1], lags[: width + 1]]) * window
     covariance = np.zeros(count + width)
     covariance[: width + 1] = near_zero[width:]
     shift = 0 if period is None else round(period * rate)
-    if width < shift and (count - shift - width) > _MIN_OVERLAP * count:
+    if width < min(shift, count - shift):
         near_period = lags[shift - width : shift + width + 1] * window
         for start in range(shift, count + width, shift):
             end = min(start + width + 1, len(covariance))

@@ -18,6 +18,7 @@ from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import (
+    MASS_RANGE,
     BoundingBox,
     bounding_boxes,
     consistent_parameters,
@@ -25,8 +26,6 @@ from dvrk_drake.dynamics.physical_consistency import (
 )
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
-#: Lower bound of a rotor inertia, as a share of its value in the SDF.
-MIN_ROTOR_SHARE = 0.1
 #: Prior standard deviation of the torque of the second harmonic of a known cable with a first harmonic, as a share of
 #: the RMS effort. It is a correction; a wide prior would let it diverge outside the range of the motion.
 HARMONIC_SHARE = 0.1
@@ -337,7 +336,7 @@ class ConsistentProgram:
     def __init__(self, problem: DynamicProblem, effects: NDArray[np.int_]) -> None:
         self._problem = problem
         links = problem.regressor.links
-        rotors = MIN_ROTOR_SHARE * problem.prior[10 * len(links) :]
+        rotors = MASS_RANGE[0] * problem.prior[10 * len(links) :]
         coefficients = [0.0 if problem.columns.effects[k].dissipative else -np.inf for k in effects]
         self.lower = np.concatenate([np.full(10 * len(links), -np.inf), rotors, coefficients])
         self.precision = np.concatenate([problem.deviation**-2, problem.effect_precision[effects]])

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import motion_floor
 from dvrk_drake.analysis.results import Validation
@@ -17,12 +19,8 @@ from dvrk_drake.analysis.verdict import Tolerance, coverage, judge, rule_text, t
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.recordings.recording import GAP, MIN_GAP
 
-#: Width of the smoothed sign function of the friction-like error, as a share of the RMS velocity.
-_FRICTION_WIDTH = 0.1
 #: Number of frequencies of the sine and cosine functions in the position-dependent error.
 _HARMONICS = 2
-#: Smallest frequency of the fast share of an error [Hz]. Arms are moved with lower frequencies.
-FAST = 2.0
 #: Smallest ratio of an error to the one expected on another day that is reported. Between recordings of two PSMs, it is
 #: exceeded in 10 of 12 pairs. Between recordings of one arm, the largest ratio is 1.1, but 3.2 for the insertion of one
 #: recording of a PSM (docs/benchmarks.md, three joints).
@@ -45,8 +43,8 @@ class ErrorShares(NamedTuple):
         not_repeating: Share of the rest that differs between periods of the motion: half the mean square of its
             difference between periods. No function of position, velocity and acceleration explains it. None if the
             motion does not repeat.
-        fast: Share of the rest above `FAST` Hz, without the part that does not repeat: transients at reversals of the
-            velocity, vibration, errors of the delay.
+        fast: Share of the rest above `MOTION_FREQUENCY`, without the part that does not repeat: transients at reversals
+            of the velocity, vibration, errors of the delay.
         other: Remaining share: slow and, in a periodic motion, the same in each period.
     """
 
@@ -281,7 +279,7 @@ def error_shares(
         period: Period of the motion [s], or None if the motion does not repeat.
     """
     own, others = q[:, actuator], np.delete(q, actuator, axis=1)
-    width = _FRICTION_WIDTH * float(np.sqrt(np.mean(v**2))) or 1.0
+    width = DIRECTION_WIDTH * float(np.sqrt(np.mean(v**2))) or 1.0
     travel = (own - own.min()) / (float(np.ptp(own)) or 1.0)
     kinds = [
         [np.ones_like(own)],
@@ -315,9 +313,9 @@ def error_shares(
 
 
 def _slow_part(x: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the part of a signal (r,) below `FAST` Hz. It is orthogonal to the rest of the signal."""
+    """Returns the part of a signal (r,) below `MOTION_FREQUENCY`. It is orthogonal to the rest of the signal."""
     frequency = np.fft.rfftfreq(len(x), float(t[-1] - t[0]) / (len(t) - 1))
-    return np.fft.irfft(np.where(frequency < FAST, np.fft.rfft(x), 0.0), len(x))
+    return np.fft.irfft(np.where(frequency < MOTION_FREQUENCY, np.fft.rfft(x), 0.0), len(x))
 
 
 def _mean_square_between_periods(x: NDArray[np.float64], t: NDArray[np.float64], period: float | None) -> float:

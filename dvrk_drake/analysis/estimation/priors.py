@@ -11,7 +11,7 @@ from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
 
 #: Prior standard deviation of an inertial parameter about its value in the SDF, as a share of the scale of the
-#: parameter (`LinkScale`). The share was selected by cross-validation.
+#: parameter (`LinkScale`). The share was selected by cross-validation. XXX
 LINK_DEVIATION = 0.3
 #: Smallest prior standard deviation of a rotor inertia [kg m^2; kg].
 MIN_ROTOR_DEVIATION = 3e-6
@@ -23,6 +23,9 @@ ROTOR_ACCELERATION = 100.0, 30.0
 _BALANCE = 1e-6
 #: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
 TILT_DEVIATION = 0.05
+#: Prior standard deviation of a known coefficient of an effect, as a share of the coefficient. The friction power of
+#: one PSM on two days is 0.96 to 1.54 times that of its arm file (`FRICTION_FACTOR`).
+EFFECT_DEVIATION = 0.5
 #: Prior standard deviation of the torque of a spring or cable that the arm file lists, as a share of the RMS effort,
 #: because it may balance gravity. For other effects, see `EffectKind.prior_share`.
 KNOWN_SHARE = 1.0

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
-from dvrk_drake.analysis.excitation.information import MotionInformation
-from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, first_collision, motion_violations
+from dvrk_drake.analysis.excitation.information import STEP, MotionInformation
+from dvrk_drake.analysis.excitation.motion_limits import ROUNDING, MotionLimits, first_collision, motion_violations
 from dvrk_drake.analysis.excitation.random_motion import (
     USED,
     effort_without_friction,
@@ -27,12 +27,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
-#: Number of times per harmonic at which the information is computed.
+#: Number of times per harmonic at which the information is computed and the efforts are limited. XXX
 INFORMATION_TIMES = 8
-#: Numbers of times per harmonic at which the optimisation limits positions, velocities, accelerations and jerks, and
-#: efforts. High harmonics are a larger part of high derivatives, which therefore need more times. The contraction
-#: corrects the small excess between the times.
-_DERIVATIVE_TIMES, _EFFORT_TIMES = (6, 6, 8, 12), 8
+#: Numbers of times per harmonic at which the optimisation limits positions, velocities, accelerations and jerks. High
+#: harmonics are a larger part of high derivatives, which therefore need more times. The contraction corrects the small
+#: excess between the times.
+_DERIVATIVE_TIMES = (6, 6, 8, 12)
 #: Share of the effort limits that the optimisation uses, see `USED`.
 _USED_EFFORT = 0.95
 #: Longest default period [s].
@@ -44,8 +44,6 @@ MAX_ITERATIONS, MAX_MINOR_ITERATIONS = 100, 150
 #: Factor by which a motion is contracted towards its centre until it has no collision and meets all limits, and largest
 #: number of contractions.
 _CONTRACTION, _MAX_CONTRACTIONS = 0.99, 150
-#: Step of the forward differences of the efforts, relative to the limits of positions, velocities and accelerations.
-_STEP = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +156,7 @@ def design_excitation(
         share(0.9 * len(results) / starts)
     best = min(results, key=lambda result: result[1])
     motion = contracted(best[0], arm, limits, model)
-    motion = replace(motion, repetitions=int(np.ceil(duration / period - 1e-9)), environment=limits.environment)
+    motion = replace(motion, repetitions=int(np.ceil(duration / period - ROUNDING)), environment=limits.environment)
     share(1.0)
     information = MotionInformation(arm, limits, model)
     state = state_of(motion, INFORMATION_TIMES * harmonics)
@@ -296,7 +294,7 @@ def _add_effort_limits(
     """Adds the constraints on the predicted efforts, relative to their limits."""
     predicted, scales = information.predicted, information.scales
     allowed, unit = _USED_EFFORT * effort_without_friction(predicted, information.limits), scales[0]
-    values, n = basis.values(sample_times(basis, _EFFORT_TIMES))[:3], len(allowed)
+    values, n = basis.values(sample_times(basis, INFORMATION_TIMES))[:3], len(allowed)
 
     def effort(state: NDArray[np.float64]) -> NDArray[np.float64]:
         return predicted.without_dry_friction(*state) / allowed
@@ -312,7 +310,7 @@ def _add_effort_limits(
         gradient = np.zeros((*tau.shape, n, values.shape[2]))
         for k in range(3):
             for j in range(n):
-                step = _STEP * scales[k, j]
+                step = STEP * scales[k, j]
                 ahead = state.copy()
                 ahead[k, :, j] += step
                 slope = (effort(ahead) - tau) / step

@@ -10,26 +10,24 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import COULOMB_WIDTHS, BaseColumns, base_columns
+from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR
 from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, rigid_deviations
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
+from dvrk_drake.analysis.observations.repetition import CORRELATION_TIME
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
-#: RMS error of a measured effort relative to the RMS effort of the motion, and time over which errors are correlated
-#: [s]. The errors are those of the model, not of the sensor. The values are those of the public motions of a real MTM
-#: and PSM.
-EFFORT_ERROR, CORRELATION_TIME = 0.1, 0.1
 #: Number, period [s] and number of harmonics of the random motions for which the expected error is computed, and number
 #: of states per motion.
 NUM_MOTIONS, MOTION_PERIOD, MOTION_HARMONICS, STATES_PER_MOTION = 20, 10.0, 6, 50
 #: Acceleration below which presliding is smoothed, as a share of the RMS acceleration of the random motions.
 SMOOTHED_ACCELERATION = 0.2
 #: Step of the forward differences with respect to positions, velocities and accelerations, relative to their limits.
-_STEP = 1e-7
+STEP = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +206,11 @@ class MotionInformation:
         return ExpectedError(self._prior, target, values)
 
     def weight(self, period: float, rows: int) -> float:
-        """Returns the number of independent measurements per row, for rows that are evenly spread over a period [s]."""
-        return period / (CORRELATION_TIME * rows * EFFORT_ERROR**2)
+        """Returns the information per row, for rows that are evenly spread over a period [s].
+
+        It is the number of independent measurements, divided by the squared relative error of the model.
+        """
+        return period / (CORRELATION_TIME * rows * ASSUMED_ERROR**2)
 
     def matrix(self, state: NDArray[np.float64], period: float) -> NDArray[np.float64]:
         """Returns the information (k, k) of a motion with states (3, m, n) and a period [s], see `ExpectedError`."""
@@ -243,7 +244,7 @@ class MotionInformation:
         gradient = np.empty_like(state)
         for k in range(3):
             for j in range(state.shape[2]):
-                step = _STEP * self.scales[k, j]
+                step = STEP * self.scales[k, j]
                 ahead = state.copy()
                 ahead[k, :, j] += step
                 change = np.sum(by_effort * (self._efforts(ahead) - tau), axis=1)

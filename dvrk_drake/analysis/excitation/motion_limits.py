@@ -20,8 +20,10 @@ from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
 CHECK_RATE, ROUNDING = 1000.0, 1e-9
-#: Rate at which collisions are checked [Hz].
+#: Rate at which collisions are checked [Hz]. XXX
 COLLISION_RATE = 50.0
+#: Largest distance between two poses at which a straight path is checked, as a share of each position range. XXX
+PATH_STEP = 0.01
 
 
 @dataclass(frozen=True)
@@ -152,8 +154,8 @@ def path_obstacle(
 ) -> str:
     """Returns why an arm cannot move on the straight path in joint space between two poses (n,), or "".
 
-    The joints move by at most 1 % of their ranges between two checked poses. A motor must hold each pose, and overcome
-    its dry friction, with less than the effort of `execution_limits`.
+    The joints move by at most `PATH_STEP` of their ranges between two checked poses. A motor must hold each pose, and
+    overcome its dry friction, with less than the effort of `execution_limits`.
 
     Args:
         arm: Arm to move.
@@ -162,7 +164,7 @@ def path_obstacle(
         model: Model that predicts the efforts, see `PredictedEffort`.
     """
     start, end = np.asarray(q_start, dtype=np.float64), np.asarray(q_end, dtype=np.float64)
-    steps = int(np.ceil(100 * np.max(np.abs(end - start) / (arm.position_upper - arm.position_lower)))) + 1
+    steps = int(np.ceil(np.max(np.abs(end - start) / (arm.position_upper - arm.position_lower)) / PATH_STEP)) + 1
     q = start + np.linspace(0, 1, steps + 1)[:, None] * (end - start)
     if collision := first_collision(arm, q, environment):
         return collision[1]

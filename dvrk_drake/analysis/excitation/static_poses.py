@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.analysis.excitation.information import ExpectedError
-from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+from dvrk_drake.analysis.excitation.motion_limits import PATH_STEP, ROUNDING, MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import middle_pose
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, candidate_effects
@@ -41,8 +41,6 @@ MIN_APPROACH = 0.4
 EFFORT_ERROR = 0.01
 #: Number of random poses for which holding efforts are predicted, and number of random selections for the comparison.
 NUM_TARGETS, NUM_RANDOM = 2000, 20
-#: Largest distance between two poses at which a straight path is checked, as a share of each position range.
-PATH_STEP = 0.01
 #: Smallest relative reduction of the squared expected error by an exchange.
 _MIN_REDUCTION = 1e-6
 #: Travel that replaces the travel of a blocked path, in units of the position ranges.
@@ -375,7 +373,7 @@ class PoseChecker:
 
     def _path(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns poses (m, n) on the straight path between two poses (n,)."""
-        steps = int(np.ceil(np.max(np.abs(end - begin) / self._span) / PATH_STEP - 1e-9))
+        steps = int(np.ceil(np.max(np.abs(end - begin) / self._span) / PATH_STEP - ROUNDING))
         return np.asarray(begin + (np.arange(steps + 1) / max(steps, 1))[:, None] * (end - begin))
 
     def _can_hold(self, q: NDArray[np.float64]) -> bool:
@@ -456,7 +454,7 @@ def short_path(travel: NDArray[np.float64]) -> list[int]:
         change += np.where(first > 0, travel[before, order[last]] - travel[before, order[first]], 0.0)
         change += np.where(last < m - 1, travel[order[first], after] - travel[order[last], after], 0.0)
         best = int(np.argmin(change))
-        if change[best] > -1e-9:
+        if change[best] > -ROUNDING:
             return [int(i) for i in order]
         i, j = first[best], last[best]
         order[i : j + 1] = order[i : j + 1][::-1].copy()

@@ -68,7 +68,8 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
     )
 
 
-#: Largest correlation between measured and predicted efforts that indicates a wrong sign of the effort.
+#: Largest correlation between measured and predicted efforts that indicates a wrong sign of the effort. It is near 0
+#: for unrelated efforts. XXX
 MAX_OPPOSITE_CORRELATION = -0.3
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
 
@@ -16,8 +17,6 @@ CUT_OFF = 20.0
 MAX_LAG, LAG_STEP = 0.04, 0.0025
 #: Largest number of samples in a fit. A longer motion is thinned out after low-pass filtering.
 MAX_ROWS = 50_000
-#: Width of the smoothed sign function for Coulomb friction, as a share of the RMS velocity.
-SMOOTHING = 0.1
 #: Number of segments of the motion from which the standard error of the delay is estimated.
 NUM_SEGMENTS = 5
 #: Assumed number of independent measurements for the standard error of the Coulomb friction, as in `ChannelFit`. The
@@ -69,7 +68,7 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
     result = np.full((tau.shape[1], 5), np.nan)
     for j in np.flatnonzero(moving & np.any(tau != 0, axis=0)):
         v = signals.v[:, j]
-        coulomb = np.tanh(v / (SMOOTHING * np.sqrt(np.mean(v**2))))
+        coulomb = np.tanh(v / (DIRECTION_WIDTH * np.sqrt(np.mean(v**2))))
         columns = low_pass(np.column_stack([coulomb, v, shared]), rate, CUT_OFF)[inner]
         Q, _ = np.linalg.qr(columns / (np.sqrt(np.mean(columns**2, axis=0)) + np.finfo(float).tiny))
         result[j] = *_fit(tau[:, j], Q, inner, rate), *_coulomb(columns, tau[inner, j])

@@ -35,7 +35,7 @@ WRAP_TOLERANCE, WRAP_SPEED, ISOLATED = 0.5, 50.0, 10.0
 #: at most, and public motions of eight arms give up to 3.0.
 JUMP_RATIO, NEARBY = 2 * GAP, 0.25
 #: Units of times in which recorders write, with their size [s].
-_TIME_UNITS = {
+TIME_UNITS = {
     "milliseconds": 1e-3,
     "microseconds": 1e-6,
     "nanoseconds": 1e-9,
@@ -193,14 +193,14 @@ def time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
 
     moves, slow = recording.motion(arm), not np.any(speeds > arm.per_joint(*REST_SPEED))
     if (too_fast and is_motion) or (not is_motion and slow and joints.is_path(arm)):
-        unit = next((name for name, size in _TIME_UNITS.items() if fits(size)), "")
+        unit = next((name for name, size in TIME_UNITS.items() if fits(size)), "")
         if too_fast or unit:
             joint = int(np.argmax(speeds / arm.per_joint(*MAX_SPEED)))
             what = f"t increases by {interval:.3g} per row, but the rows are samples of a motion in small steps"
             if too_fast:
                 unit_of_speed = "m/s" if arm.prismatic[joint] else "rad/s"
                 what = f"t implies an RMS speed of {speeds[joint]:.3g} {unit_of_speed} of joint {joint + 1}"
-            what += f" (t may be in {unit}: {rate / _TIME_UNITS[unit]:.4g} Hz)" if unit else ""
+            what += f" (t may be in {unit}: {rate / TIME_UNITS[unit]:.4g} Hz)" if unit else ""
             advice = f"Use t in s. {recording.rest_advice}"
             return MotionFault("wrong time", "t", what, advice if unit else "Use t in s, and q in rad (m).")
     if not moves or recording.is_motion:

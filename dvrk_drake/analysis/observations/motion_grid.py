@@ -16,8 +16,9 @@ from dvrk_drake.recordings.recording import Recording
 
 #: Rate of the time grid [Hz], high enough to resolve hysteresis when a joint reverses its direction.
 GRID_RATE = 400.0
-#: Duration that is omitted at each end because of filter transients [s], and its largest share of a motion. Motions of
-#: less than 20 s would otherwise lose more than a tenth of their rows.
+#: Duration that is omitted at each end because of filter transients [s], as for the published errors of a real MTM and
+#: PSM (Wang et al., RA-L 2019: 200 rows at 200 Hz), and its largest share of a motion. Motions of less than 20 s would
+#: otherwise lose more than a tenth of their rows.
 ENDS, ENDS_SHARE = 1.0, 0.05
 #: Smallest accepted duration of a segment of a motion between gaps [s].
 MIN_SEGMENT = 3.0

@@ -11,8 +11,8 @@ from scipy.ndimage import median_filter
 #: Duration of the segments for averaged periodograms [s]. The frequency resolution [Hz] is the reciprocal of this
 #: duration.
 SEGMENT_DURATION = 2.56
-#: Smallest cut-off frequency [Hz].
-MIN_CUT_OFF = 2.0
+#: Largest frequency of the motion of an arm [Hz], and smallest cut-off frequency. XXX
+MOTION_FREQUENCY = 2.0
 #: Smallest ratio of the peak noise in a narrow band to the median noise below and above the band.
 PEAK = 4.0
 #: Noise at the edges of a narrow band as a share of the peak noise, and largest width of a narrow band [octaves].
@@ -75,7 +75,7 @@ def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectr
 
 
 def cut_offs(densities: Spectra) -> NDArray[np.float64]:
-    """Returns the lowest frequency (n,) at which the noise exceeds the signal [Hz], at least `MIN_CUT_OFF`.
+    """Returns the lowest frequency (n,) at which the noise exceeds the signal [Hz], at least `MOTION_FREQUENCY`.
 
     Both spectra are smoothed over five frequencies. If the signal exceeds the noise at all frequencies, the result is
     half the sampling rate.
@@ -84,7 +84,7 @@ def cut_offs(densities: Spectra) -> NDArray[np.float64]:
     result = []
     for signal, noise in zip(densities.signal.T, densities.noise.T, strict=True):
         noisy = np.convolve(signal, kernel, "same") < np.convolve(noise, kernel, "same")
-        noisy &= densities.frequency >= MIN_CUT_OFF
+        noisy &= densities.frequency >= MOTION_FREQUENCY
         result.append(densities.frequency[np.argmax(noisy)] if np.any(noisy) else densities.frequency[-1])
     return np.array(result)
 

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.analysis.observations.low_pass import correlation, low_pass, resample
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid, ends_of
+from dvrk_drake.recordings.recording import SAME_POSE
 
 #: Largest difference D(T) of the positions of a motion that repeats after the period T, see `find_period`.
 SAME_MOTION = 0.1
@@ -30,7 +31,7 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
         rate: Sampling rate [Hz].
     """
     deviation = np.std(q, axis=0)
-    moving = deviation > 1e-3
+    moving = deviation > SAME_POSE[1]
     if not np.any(moving):
         return None
     x = (q[:, moving] - np.mean(q[:, moving], axis=0)) / deviation[moving]
@@ -103,9 +104,9 @@ def motion_floor(tau: NDArray[np.float64], grid: MotionGrid, period: float) -> N
 
 #: Number of folds for cross-validation.
 FOLDS = 12
-#: Duration next to a held-out fold that is not used for the fit [s]. Low-pass filtering correlates these rows with the
-#: rows of the held-out fold.
-GAP = 0.1
+#: Time over which the errors of low-pass filtered efforts are correlated [s]. XXX Rows within this time of a held-out
+#: fold are not used for the fit.
+CORRELATION_TIME = 0.1
 
 
 def correlation_of(errors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -135,8 +136,8 @@ def phase_folds(
 
     Returns:
         fold: Index (r,) of the fold of each row, 0 to folds - 1.
-        edge: Mask (r, 2) of the rows within `GAP` seconds of the preceding fold (column 0) and of the following fold
-            (column 1).
+        edge: Mask (r, 2) of the rows within `CORRELATION_TIME` of the preceding fold (column 0) and of the following
+            fold (column 1).
     """
     t = grid.row_times[grid.inner]
     if period is None and grid.segments:
@@ -146,5 +147,5 @@ def phase_folds(
     length = period if period is not None else float(t[-1] - t[0]) * (1 + 1e-9)
     phase = ((t - t[0]) % length) / length * folds
     fold = np.minimum(phase.astype(int), folds - 1)
-    gap = GAP * folds / length
+    gap = CORRELATION_TIME * folds / length
     return fold, np.column_stack([phase - fold < gap, phase - fold > 1 - gap])

@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.observations.true_time import CUT_OFF, ORDER
 from dvrk_drake.analysis.static.static_identification import average_repeated_poses
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import MAX_PERIOD, Recording
+from dvrk_drake.recordings.recording import MAX_PERIOD, SAME_POSE, Recording
 
-#: Cut-off of the zero-phase low-pass filter for velocities [Hz], and its order.
-CUT_OFF, ORDER = 10.0, 4
-#: Limits of a static segment: largest speed of each joint [rad/s], [m/s], smallest duration [s], and largest distance
-#: of each joint from the start of the segment [rad], [m].
-MAX_REST_SPEED, MIN_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
+#: Largest speed of each joint [rad/s], [m/s] and smallest duration [s] of a static segment. XXX
+MAX_REST_SPEED, MIN_REST = (0.02, 0.002), 0.3
 
 
 def static_poses(recording: Recording, arm: Arm) -> Recording | None:
@@ -46,7 +44,7 @@ def static_poses(recording: Recording, arm: Arm) -> Recording | None:
     still = np.all(np.abs(v) < arm.per_joint(*MAX_REST_SPEED), axis=1)
     still &= np.diff(t, append=t[-1]) < MAX_PERIOD
     min_rows = round(MIN_REST / float(np.median(np.diff(t))))
-    runs = list(stationary_runs(still, moving.q, arm.per_joint(*SAME_REST), min_rows))
+    runs = list(stationary_runs(still, moving.q, arm.per_joint(*SAME_POSE), min_rows))
     second_halves = [run[len(run) // 2 :] for run in runs]
     poses = replace(
         moving,

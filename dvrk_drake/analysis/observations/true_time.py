@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.observations.low_pass import central_difference, low_pass, resample
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.recordings.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 
 #: Cut-off frequency of the low-pass filter for the comparison of velocities [Hz]. Motions have lower frequencies, and
 #: most timing jitter has higher frequencies.
-CUT_OFF = 10.0
+CUT_OFF, ORDER = 10.0, 4
 #: Largest deviation of the gain from 1, and largest lag [s], of velocities that agree with dq/dt.
 GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
 #: Smallest RMS speed for a comparison [rad/s, m/s].
@@ -52,7 +52,7 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
         qd: Velocities (m, n) at the same rate.
         rate: Sampling rate [Hz].
     """
-    v, qd = (low_pass(x, rate, min(CUT_OFF, 0.2 * rate), order=4) for x in (central_difference(q, rate), qd))
+    v, qd = (low_pass(x, rate, min(CUT_OFF, 0.2 * rate), ORDER) for x in (central_difference(q, rate), qd))
     ends = min(int(ENDS * rate), len(q) // 10)
     fits = np.array([_fit(v[:, j], qd[:, j], slice(ends, len(q) - ends)) for j in range(q.shape[1])])
     gain, samples, mismatch = fits.T
@@ -83,8 +83,8 @@ def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple
 #: Largest difference between equal values, as a share of the RMS value of the channel. Equal values differ by rounding
 #: errors after a conversion of coordinates.
 SAME_VALUE = 1e-9
-#: Smallest number of rows, and smallest number of joints whose qd agrees with dq/dt, for reconstructing times.
-MIN_ROWS, MIN_JOINTS = 100, 2
+#: Smallest number of joints that determine times. A single joint fits any times, with intervals dq / qd.
+MIN_JOINTS = 2
 #: Smallest ratio of the residual variance with recorded times to the residual variance with reconstructed times. Below
 #: this ratio, the recorded times are kept.
 MIN_VARIANCE_RATIO = 3.0
@@ -235,7 +235,7 @@ def distinct_rows(recording: Recording) -> DistinctRows:
 def time_factor(t: NDArray[np.float64], q: NDArray[np.float64], qd: NDArray[np.float64]) -> float | None:
     """Returns the ratio of recorded to true time from the integral of qd, or None if it is not identifiable.
 
-    At least two joints must move, and the ratios of most of these joints must agree within 10 %.
+    At least `MIN_JOINTS` joints must move, and the ratios of most of these joints must agree within 10 %.
 
     Args:
         t: Recorded times (m,) [s].
@@ -250,7 +250,7 @@ def time_factor(t: NDArray[np.float64], q: NDArray[np.float64], qd: NDArray[np.f
     squares = np.sum(dq**2, axis=0) * np.sum(integrals**2, axis=0)
     correlated = np.sum(dq * integrals, axis=0) > 0.6 * np.sqrt(squares)
     used = moving & correlated & (squares > 0)
-    if np.sum(used) < 2:
+    if np.sum(used) < MIN_JOINTS:
         return None
     factors = np.sqrt(np.sum(integrals[:, used] ** 2, axis=0) / np.sum(dq[:, used] ** 2, axis=0))
     factor = float(np.median(factors))

@@ -14,16 +14,15 @@ from dvrk_drake.analysis.static.excluded_measurements import find_excluded, usab
 from dvrk_drake.analysis.static.static_identification import FOLDS, usable_poses
 from dvrk_drake.dynamics.actuator_effects import effect_column
 from dvrk_drake.dynamics.base_parameters import independent_columns
+from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MIN_RANGE, Recording
 
-#: Angle above which a difference from the assumed direction is reported [rad]. Poses of upright MTMs give up to 4.2
-#: deg (mtm_2015_apr18_all80). At 5 deg, about 0.09 N m of the 1 N m on the shoulder of an MTM act on the outer yaw,
-#: which is its dry friction.
+#: Angle above which a difference from the assumed direction is reported, and largest half width of the 95 % interval of
+#: an estimate that can be used [rad]. Poses of upright MTMs give up to 4.2 deg (mtm_2015_apr18_all80). At 5 deg, about
+#: 0.09 N m of the 1 N m on the shoulder of an MTM act on the outer yaw, which is its dry friction.
 LARGE_TILT = np.deg2rad(5.0)
-#: Largest half width of the 95 % interval of an estimate that can be used [rad].
-MAX_HALF_WIDTH = LARGE_TILT
 #: Prior standard deviation of a change of the direction in one iteration [rad], and number of iterations.
 _STEP, _ITERATIONS = 0.5, 10
 
@@ -53,8 +52,8 @@ class GravityDirection(NamedTuple):
 
     @property
     def is_determined(self) -> bool:
-        """True if the poses determine the direction, see `MAX_HALF_WIDTH`."""
-        return self.half_width <= MAX_HALF_WIDTH
+        """True if the poses determine the direction, see `LARGE_TILT`."""
+        return self.half_width <= LARGE_TILT
 
 
 def estimate_gravity(recording: Recording, arm: Arm) -> GravityDirection:
@@ -88,7 +87,8 @@ def estimate_gravity(recording: Recording, arm: Arm) -> GravityDirection:
     effects = [effect for group in candidate_effects(problem) for effect in group]
     of_effects = np.stack([effect_column(arm, e, q) for e in effects], axis=2) if effects else np.empty((*q.shape, 0))
     largest = np.abs(sampled[..., independent]).max(axis=(0, 1))
-    limits = np.where(largest > 1e-9, arm.effort_limits[:, None] / np.maximum(largest, 1e-9), np.inf).min(axis=0)
+    used = largest > ROUNDING_EFFORT
+    limits = np.where(used, arm.effort_limits[:, None] / np.where(used, largest, 1.0), np.inf).min(axis=0)
     own = problem.prior_precision(effects)[len(problem.base_model.gravity.base.names) :]
     prior = np.concatenate([(BASE_PRIOR * limits) ** -2.0, own, np.full(2, _STEP**-2.0)])
     # The effort of a joint that does not move contains a constant dry friction.

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.dynamic.validation import FAST, SHARE_LABELS, ErrorShares, error_shares
+from dvrk_drake.analysis.dynamic.validation import SHARE_LABELS, ErrorShares, error_shares
+from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY
 
 pytestmark = pytest.mark.numeric
 
@@ -62,8 +63,8 @@ def test_sum_of_shares_is_one_and_no_share_is_negative():
 def test_motion_without_period_has_no_share_that_does_not_repeat():
     found = shares(NOISE, period=None)
     assert found.not_repeating is None
-    # White noise is above `FAST` Hz, except for the share of `FAST` of half the rate.
-    assert found.fast == pytest.approx(1 - FAST / (RATE / 2), abs=0.05)
+    # White noise is above `MOTION_FREQUENCY`, except for the share of it in half the rate.
+    assert found.fast == pytest.approx(1 - MOTION_FREQUENCY / (RATE / 2), abs=0.05)
     assert sum(x for x in found if x is not None) == pytest.approx(1.0, abs=1e-9)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.observations.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
+from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY, cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import find_period, motion_floor, repeatability_floor
 from dvrk_drake.models.arm_files import load_arm
@@ -83,7 +83,7 @@ def test_cut_off_is_where_noise_exceeds_the_signal():
     found = cut_offs(spectra(x, RATE, 5.0))
     # The spectrum is smoothed over five lines of 0.4 Hz, and the window of a periodogram leaks into adjacent lines.
     assert 12.0 <= found[0] < 15.0
-    assert MIN_CUT_OFF <= found[1] < 4.0
+    assert MOTION_FREQUENCY <= found[1] < 4.0
 
 
 def test_narrow_band_of_noise_is_detected():

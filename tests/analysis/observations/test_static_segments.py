@@ -7,11 +7,11 @@ import pytest
 from static_poses import motion_with_pauses
 
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.static_segments import SAME_REST, smooth_velocity, static_poses, stationary_runs
+from dvrk_drake.analysis.observations.static_segments import smooth_velocity, static_poses, stationary_runs
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import SAME_POSE, Recording
 
 pytestmark = pytest.mark.numeric
 
@@ -88,7 +88,7 @@ def test_static_segment_ends_at_a_gap_in_the_times():
     a, b = ARM.sample_poses(2, np.random.default_rng(1), margin=0.1)
     recording = motion_with_pauses(ARM, [a, b], np.random.default_rng(2), rest=2.0)
     late = recording.t >= 5.0  # in the middle of the rest at b
-    sag = 0.9 * ARM.per_joint(*SAME_REST)
+    sag = 0.9 * ARM.per_joint(*SAME_POSE)
     split = replace(recording, t=recording.t + 5.0 * late, q=recording.q + sag * late[:, None])
     rests = static_poses(split, ARM)
     assert len(rests) == 2
