@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
 from dvrk_drake.analysis.estimation.robust_fit import blocks
-from dvrk_drake.analysis.static.static_identification import MIN_MOTION, StaticIdentification
+from dvrk_drake.analysis.static.static_identification import FOLDS, MIN_MOTION, StaticIdentification
 from dvrk_drake.analysis.verdict import NEGLIGIBLE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
 from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT
@@ -25,8 +25,6 @@ MIN_RATIO = 3.0
 MIN_NUM_POSES = 20
 #: Smallest range of a coordinate at the poses for a spring, as a share of its range in the workspace.
 MIN_SPRING_RANGE = 0.3
-#: Number of held-out blocks of successive poses. A correction must reduce the errors in these blocks.
-_BLOCKS = 5
 #: Travels of the hysteresis between poses, as shares of the range of the coordinate in the workspace.
 TRAVELS = (0.03, 0.1, 0.2, 0.4)
 
@@ -165,7 +163,7 @@ def _estimator(candidates: list[_Candidate], residual: NDArray[np.float64], usab
     for i in range(residual.shape[1]):
         own = np.flatnonzero(np.any(efforts[:, :, i], axis=1))
         columns.append((own, efforts[own, :, i].T))
-    tau, fold = residual * usable, blocks(len(residual), _BLOCKS)
+    tau, fold = residual * usable, blocks(len(residual), FOLDS)
     is_friction = np.array([c.effect.kind == "presliding" for c in candidates], dtype=bool)
     precision = np.array([c.deviation for c in candidates]) ** -2.0
     return Estimator(

@@ -64,24 +64,25 @@ class BaseParameters:
     units: tuple[str, ...]
 
 
-def independent_columns(
-    regressor: NDArray[np.float64], tolerance: float = 1e-9
-) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+#: Largest rounding error of a coefficient. A column is dependent if the norm of its component that is orthogonal to the
+#: chosen columns is at most this share of the largest column norm. XXX
+TOLERANCE = 1e-9
+
+
+def independent_columns(regressor: NDArray[np.float64]) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
     """Returns indices of linearly independent columns of a regressor, and the combinations that give all columns.
 
     The indices `columns` (b,) and the matrix B (b, p) satisfy regressor = regressor[:, columns] B.
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.
-        tolerance: Relative tolerance. A column is dependent if the norm of its component that is orthogonal to the
-            chosen columns is at most `tolerance` times the largest column norm.
     """
     R, pivots = scipy.linalg.qr(regressor, mode="r", pivoting=True)
-    rank = int(np.sum(np.abs(np.diag(R)) > tolerance * abs(R[0, 0])))
+    rank = int(np.sum(np.abs(np.diag(R)) > TOLERANCE * abs(R[0, 0])))
     order = np.argsort(pivots[:rank])
     B = np.empty((rank, regressor.shape[1]))
     B[:, pivots] = np.linalg.solve(R[:rank, :rank], R[:rank])[order]
-    return pivots[:rank][order], np.where(np.abs(B) > tolerance, B, 0.0)
+    return pivots[:rank][order], np.where(np.abs(B) > TOLERANCE, B, 0.0)
 
 
 def reduce_to_base(
@@ -89,7 +90,6 @@ def reduce_to_base(
     parameters: Sequence[StandardParameter],
     preference: Sequence[int],
     lengths: Mapping[str, float],
-    tolerance: float = 1e-9,
 ) -> BaseParameters:
     """Computes base parameters whose regressor columns come as early as possible in `preference`.
 
@@ -103,8 +103,6 @@ def reduce_to_base(
         preference: Permutation of the column indices 0 to p - 1, most preferred column first.
         lengths: Name -> coefficient, such as a length [m] or a product of lengths. In the symbolic names of the
             base parameters, each coefficient is written as its key instead of its value.
-        tolerance: Relative tolerance. A column is dependent if the norm of its component that is orthogonal to the
-            chosen columns is at most `tolerance` times the largest column norm.
     """
     scale = np.linalg.norm(regressor, axis=0).max()
     columns: list[int] = []
@@ -114,7 +112,7 @@ def reduce_to_base(
         for _ in range(2):  # Two passes give orthogonality to machine precision (Kahan, Parlett).
             residual = residual - basis @ (basis.T @ residual)
         norm = np.linalg.norm(residual)
-        if norm > tolerance * scale:
+        if norm > TOLERANCE * scale:
             columns.append(column)
             basis = np.column_stack([basis, residual / norm])
     columns.sort()
@@ -129,7 +127,7 @@ def _snap_to_known(combination: NDArray[np.float64], lengths: Mapping[str, float
     """Corrects coefficients that differ from 0, +-1 or a named length only by rounding errors."""
     known = np.array([0.0, 1.0, -1.0, *lengths.values(), *(-v for v in lengths.values())])
     nearest = known[np.argmin(np.abs(combination[..., None] - known), axis=-1)]
-    return np.where(np.abs(combination - nearest) < 1e-9, nearest, combination)
+    return np.where(np.abs(combination - nearest) < TOLERANCE, nearest, combination)
 
 
 def _format_combination(
@@ -154,7 +152,7 @@ def _format_combination(
     text = ""
     for coefficient, term in terms:
         size = next(
-            (name for name, v in lengths.items() if abs(v - abs(coefficient)) < 1e-11), f"{abs(coefficient):.6g}"
+            (name for name, v in lengths.items() if abs(v - abs(coefficient)) < TOLERANCE), f"{abs(coefficient):.6g}"
         )
         factor = "" if size == "1" else f"{size} "
         sign = ("- " if coefficient < 0 else "+ ") if text else ("-" if coefficient < 0 else "")

@@ -90,7 +90,8 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
 
 #: Largest effort that is a rounding error, e.g. of efforts that cancel [N m, N]. XXX
 ROUNDING_EFFORT = 1e-9
-#: Number of random poses at which the gravity efforts are compared with `ROUNDING_EFFORT`. XXX
+#: Number of random poses at which the gravity efforts are compared with `ROUNDING_EFFORT`. One pose would be
+#: sufficient, unless an effort is 0 there by chance.
 WEIGHING_POSES = 20
 
 

@@ -25,7 +25,7 @@ from dvrk_drake.models.plant import shared_plant
 #: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to the pseudo-inertia in the SDF (see
 #: `nearest_links`).
 MIN_EIGENVALUE_RATIO = 0.01
-#: Largest change of an element of Z that is considered a rounding error.
+#: Largest change of an element of Z that is considered a rounding error: ten times the tolerance of Clarabel (1e-8).
 _ROUNDING = 1e-7
 _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
-from dvrk_drake.analysis.estimation.estimator import MIN_ERROR, Estimator, Prior
+from dvrk_drake.analysis.dynamic.problem import MIN_INFORMATION
+from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, MIN_ERROR, Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION, KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
 from dvrk_drake.analysis.observations.effort_lag import NUM_INDEPENDENT
@@ -22,21 +23,17 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.recordings.recording import REST_SPEED
+from dvrk_drake.recordings.recording import MIN_RANGE, REST_SPEED
 
 #: Prior standard deviation of a position offset [rad], [m]. An offset of a joint is reported only if one of this size
 #: would be significant. XXX
 OFFSET_DEVIATION = 0.1, 0.01
-#: Number of samples of the fit per period of the effort's cut-off frequency.
+#: Number of samples of the fit per period of the effort's cut-off frequency. The gain of the low-pass filter is 0.06 at
+#: half the rate of the samples.
 OVERSAMPLING = 2.5
 #: Largest assumed number of independent measurements of an effort in poses, see `NUM_INDEPENDENT`. It is that of the
 #: largest public recording of poses (`mtm_2015_good72`), for which the limits of the gain at rest are set.
 MAX_INDEPENDENT_POSES = 72.0
-#: In poses at rest, an actuator counts as moving if the range of its positions exceeds this value [rad], [m].
-MIN_RANGE = 0.1, 0.01
-#: Smallest information about a direction in the space of rigid-body parameters. The information is the squared relative
-#: change of the efforts for one prior standard deviation. Directions with less information are excluded.
-MIN_INFORMATION = 1e-6
 #: Step of the numerical derivative with respect to a position [rad, m].
 _STEP = 1e-3
 
@@ -182,7 +179,7 @@ class ChannelFit:
             scaled = to_base * deviation
             information += scaled.T @ (filtered.T @ filtered) @ scaled / (len(filtered) * effort[i] ** 2)
         values, vectors = np.linalg.eigh(information)
-        directions = vectors[:, values > MIN_INFORMATION]
+        directions = vectors[:, self.num_independent * values > MIN_INFORMATION * ASSUMED_ERROR**2]
         self._to_parameters = deviation[:, None] * directions
         tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._unit_gravity_efforts(q)
         self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.dynamic.estimates import STRONG_CORRELATION
-from dvrk_drake.analysis.observations.effort_lag import CUT_OFF, LAG_STEP, MAX_LAG, MIN_ERRORS, EffortLag, effort_lag
+from dvrk_drake.analysis.observations.effort_lag import CUT_OFF, MAX_LAG, MIN_ERRORS, EffortLag, effort_lag
 from dvrk_drake.analysis.observations.low_pass import resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionSignals, motion_signals
 from dvrk_drake.analysis.observations.noise import cut_offs, narrow_band, spectra
@@ -195,7 +195,7 @@ def _lags(lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
     for j in np.flatnonzero(lags.determined):
         lag, error = 1e3 * float(lags.lag[j]), 1e3 * float(lags.standard_error[j])
         size = f"{abs(lag):.1f} ms (standard error {error:.1f} ms)"
-        if abs(lags.lag[j]) > MAX_LAG - LAG_STEP:
+        if abs(lags.lag[j]) > MAX_LAG - 1 / GRID_RATE:
             size = f"{1e3 * MAX_LAG:.0f} ms or more"
         what = f"tau{j + 1} {'lags' if lag > 0 else 'leads'} the motion by {size}"
         advice = "Presliding friction causes a similar lag. Fit presliding friction before you correct a delay."

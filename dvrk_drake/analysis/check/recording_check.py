@@ -14,8 +14,8 @@ from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_fi
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.dynamic.validation import find_other_robot, validate_motion
-from dvrk_drake.analysis.observations.motion_faults import TIME_UNITS
-from dvrk_drake.analysis.observations.motion_grid import MIN_SEGMENT
+from dvrk_drake.analysis.observations.motion_faults import MIN_RETURNS, TIME_UNITS
+from dvrk_drake.analysis.observations.motion_grid import MIN_DURATION
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.true_time import SAME_VALUE, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
@@ -24,7 +24,14 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import COORDINATES_HELP, MIN_RANGE, MIN_ROWS, REST_SPEED, Recording
+from dvrk_drake.recordings.recording import (
+    COORDINATES_HELP,
+    LIMIT_TOLERANCE,
+    MIN_RANGE,
+    MIN_ROWS,
+    REST_SPEED,
+    Recording,
+)
 
 #: Smallest share of the range between its limits that a joint must cover for accurate estimates of its parameters.
 MIN_COVERAGE = 0.1
@@ -32,12 +39,8 @@ MIN_COVERAGE = 0.1
 LIMIT_MARGIN = 0.005, 0.0005
 #: Largest possible ratio of an effort to its limit in a motion. A larger ratio is a measurement error.
 IMPOSSIBLE_EFFORT = 5.0
-#: Largest possible excess of a position beyond a coupled limit [rad]. A larger excess is a measurement error.
-IMPOSSIBLE_EXCESS = 0.3
 #: Smallest number of consecutive rows at the extreme effort, and smallest share of all rows, for a saturated effort.
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
-#: Smallest number of runs of rows without power, if they alternate with rows of another source, and share of all rows.
-MIN_OFF_RUNS, MIN_OFF_SHARE = 10, 0.1
 #: Smallest duration for which the effort of a moving joint is exactly 0 if its motor is off [s]. At rest or for
 #: moments, a quantised effort can be 0.
 MIN_OFF_TIME = 1.0
@@ -123,7 +126,7 @@ def _positions(joints: Recording, arm: Arm, joint_signals: tuple[JointSignals, .
         )
         moved = tuple(int(j) for j in np.flatnonzero(A[i]))
         severity: Severity = "warning"
-        if i >= arm.num_joints and excess[row, i] > IMPOSSIBLE_EXCESS:
+        if i >= arm.num_joints and excess[row, i] > LIMIT_TOLERANCE[0]:
             severity = "refusal"
             advice = (
                 "The arm cannot reach this position. Is the choice of coordinates wrong? "
@@ -316,7 +319,7 @@ def with_power(recording: Recording, arm: Arm) -> tuple[Recording, tuple[Finding
     """Returns the part of a recording whose efforts can be used, and findings on all other rows and channels.
 
     The result has no rows without power, in which all efforts are exactly 0, and no segments of a motion that are
-    shorter than `MIN_SEGMENT` between two gaps. Efforts of a moving joint that are constant in all rows were not
+    shorter than `MIN_DURATION` between two gaps. Efforts of a moving joint that are constant in all rows were not
     measured. They are replaced by 0, which marks a channel that was not measured (`Recording.unmeasured`). A recording
     without any efforts is not changed.
     """
@@ -332,7 +335,7 @@ def with_power(recording: Recording, arm: Arm) -> tuple[Recording, tuple[Finding
             f"{recording.where(int(np.argmax(off)))}. These rows are not used"
         )
         advice = "The motors were off, or the efforts were not measured."
-        if runs > MIN_OFF_RUNS and runs > MIN_OFF_SHARE * count:
+        if runs > MIN_RETURNS * count:
             advice = "The rows alternate with rows that have efforts. Usual cause: two publishers on one topic."
         findings.append(Finding("warning", "no power", "efforts", what, advice, size=float(num_off)))
         recording = recording.select(~off)
@@ -343,14 +346,14 @@ def with_power(recording: Recording, arm: Arm) -> tuple[Recording, tuple[Finding
         recording = replace(recording, tau=np.where(constant, 0.0, tau))
     if recording.is_motion and recording.has_increasing_times:
         t, segments = np.asarray(recording.t), recording.segments()
-        short = [rows for rows in segments if t[rows.stop - 1] - t[rows.start] < MIN_SEGMENT]
+        short = [rows for rows in segments if t[rows.stop - 1] - t[rows.start] < MIN_DURATION]
         if 0 < len(short) < len(segments):
             keep = np.ones(len(t), dtype=bool)
             for rows in short:
                 keep[rows] = False
             what = (
                 f"{np.sum(~keep)} of {len(t)} rows are in {len(short)} segment{'s' * (len(short) != 1)} shorter than "
-                f"{MIN_SEGMENT:g} s between gaps of t, first at {recording.where(short[0].start)}. These rows are not "
+                f"{MIN_DURATION:g} s between gaps of t, first at {recording.where(short[0].start)}. These rows are not "
                 "used"
             )
             findings.append(Finding("warning", "short segments", "t", what, "Record without interruptions."))

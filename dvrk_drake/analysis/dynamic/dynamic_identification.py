@@ -25,7 +25,7 @@ from dvrk_drake.analysis.dynamic.estimates import (
     parameter_covariance,
 )
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
-from dvrk_drake.analysis.observations.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.motion_grid import MAX_ROWS, MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import (
     FOLDS,
@@ -50,8 +50,6 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 #: Smallest absolute coefficient of an effect that the model contains, in units of the prior standard deviation of this
 #: coefficient.
 MIN_EFFECT = 1e-4
-#: Largest number of rows in a fit. A motion with more rows is thinned out after low-pass filtering.
-MAX_ROWS = 40_000
 
 
 @dataclass(frozen=True, eq=False)

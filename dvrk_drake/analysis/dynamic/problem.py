@@ -33,7 +33,7 @@ HARMONIC_SHARE = 0.1
 RECORDING_DEVIATION = 0.02
 #: Smallest information about a direction in parameter space, relative to the prior. Along directions with less
 #: information, the estimates are the values of the SDF.
-_MIN_INFORMATION = 1e-2
+MIN_INFORMATION = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +292,7 @@ class DynamicProblem:
         H = sum(weight * self.rigid[:, i].T @ self.rigid[:, i] for i, weight in enumerate(weights))
         scaled = self.columns.base * self.deviation
         values, vectors = np.linalg.eigh(scaled.T @ H @ scaled)
-        return np.asarray(vectors[:, values > _MIN_INFORMATION])
+        return np.asarray(vectors[:, values > MIN_INFORMATION])
 
 
 class ConsistentFit:

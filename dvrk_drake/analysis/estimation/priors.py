@@ -13,7 +13,8 @@ from dvrk_drake.models.arm import Arm
 #: Prior standard deviation of an inertial parameter about its value in the SDF, as a share of the scale of the
 #: parameter (`LinkScale`). The share was selected by cross-validation. XXX
 LINK_DEVIATION = 0.3
-#: Smallest prior standard deviation of a rotor inertia [kg m^2; kg].
+#: Smallest prior standard deviation of a rotor inertia [kg m^2; kg]. It is less than that of the smallest rotor of this
+#: package's arms (4e-6, wrist roll of an MTM), so that it applies only to rotors that a model omits.
 MIN_ROTOR_DEVIATION = 3e-6
 #: Acceleration of a rotor by the effort limit of its joint [rad/s^2, m/s^2] at one prior standard deviation of its
 #: inertia, if the model states no rotors. The drives of published robots (UR, Franka, Staubli) reach 10 to 100 rad/s^2.

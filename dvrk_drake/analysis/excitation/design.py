@@ -27,7 +27,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
-#: Number of times per harmonic at which the information is computed and the efforts are limited. XXX
+#: Number of times per harmonic at which the information is computed and the efforts are limited. The information
+#: contains products of two states, whose frequencies require more than four times.
 INFORMATION_TIMES = 8
 #: Numbers of times per harmonic at which the optimisation limits positions, velocities, accelerations and jerks. High
 #: harmonics are a larger part of high derivatives, which therefore need more times. The contraction corrects the small

@@ -19,8 +19,10 @@ from dvrk_drake.models.soft_walls import SoftWalls
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
+#: Between the times, the highest possible harmonic (20 Hz) grows by at most 0.2 % of its amplitude.
 CHECK_RATE, ROUNDING = 1000.0, 1e-9
-#: Rate at which collisions are checked [Hz]. XXX
+#: Rate at which collisions are checked [Hz]. Between the times, a joint moves by at most 0.06 rad or 4 mm at the
+#: default speed limits.
 COLLISION_RATE = 50.0
 #: Largest distance between two poses at which a straight path is checked, as a share of each position range. XXX
 PATH_STEP = 0.01

@@ -9,18 +9,17 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.observations.low_pass import low_pass
-from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
+from dvrk_drake.analysis.observations.motion_grid import MAX_ROWS, MotionSignals, ends_of
 
 #: Cut-off of the low-pass filter for efforts and regressor columns [Hz].
 CUT_OFF = 20.0
-#: Largest tested delay and step between tested delays [s].
-MAX_LAG, LAG_STEP = 0.04, 0.0025
-#: Largest number of samples in a fit. A longer motion is thinned out after low-pass filtering.
-MAX_ROWS = 50_000
+#: Largest tested delay [s]. XXX
+MAX_LAG = 0.04
 #: Number of segments of the motion from which the standard error of the delay is estimated.
 NUM_SEGMENTS = 5
-#: Assumed number of independent measurements for the standard error of the Coulomb friction, as in `ChannelFit`. The
-#: shortest motion that is checked has more independent values below `CUT_OFF`.
+#: Assumed number of independent measurements of an effort, for the standard error of the Coulomb friction and the
+#: log-likelihood of `ChannelFit`. More measurements do not average out model errors. It is that of one period (6.48 s)
+#: of the public motion `psm_one` below its cut-off frequency (16.96 Hz).
 NUM_INDEPENDENT = 220
 #: A delay is significant if two ratios exceed these numbers: the ratio of the residual variances without and with the
 #: delay, and the ratio of the delay to its standard error.
@@ -93,9 +92,8 @@ def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[fl
 
 def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: float) -> tuple[float, float, float]:
     """Returns the delay [s], its standard error [s] and its gain, for regressors with the orthonormal basis Q."""
-    step = max(round(LAG_STEP * rate), 1)
-    shifts = np.arange(-(inner.start // step), inner.start // step + 1) * step
-    shifts = shifts[np.abs(shifts) <= MAX_LAG * rate]
+    last = int(MAX_LAG * rate)
+    shifts = np.arange(-last, last + 1)
     shifted = np.column_stack([tau[inner.start + s : inner.stop + s : inner.step] for s in shifts])
     squares = (shifted - Q @ (Q.T @ shifted)) ** 2
     totals = np.sum(squares, axis=0)

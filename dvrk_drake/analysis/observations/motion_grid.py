@@ -20,8 +20,12 @@ GRID_RATE = 400.0
 #: PSM (Wang et al., RA-L 2019: 200 rows at 200 Hz), and its largest share of a motion. Motions of less than 20 s would
 #: otherwise lose more than a tenth of their rows.
 ENDS, ENDS_SHARE = 1.0, 0.05
-#: Smallest accepted duration of a segment of a motion between gaps [s].
-MIN_SEGMENT = 3.0
+#: Smallest accepted duration of a motion, and of each of its segments between gaps [s]. At the cut-off frequency of
+#: 10 Hz that is the default for efforts, it has 40 independent values of each effort.
+MIN_DURATION = 2.0
+#: Largest number of rows in a fit. A motion with more rows is thinned out after low-pass filtering. It limits the time
+#: and the memory for a long motion (benchmarks/long_recording.py).
+MAX_ROWS = 40_000
 #: Number of rows in one part of `MotionGrid.parts`.
 PART_ROWS = 10_000
 #: Additional rows at both ends of a part, in periods of the effort filter's cut-off. A filter transient decays by a
@@ -188,7 +192,7 @@ class MotionGrid:
                 yield from own.parts()
             return
         inner, count = self.inner_rows, len(self.row_times)
-        overlap = round(max(ENDS, PART_OVERLAP / self.settings.effort_cut_off) * self.rate)
+        overlap = round(PART_OVERLAP / self.settings.effort_cut_off * self.rate)
         delays = self.settings.effort_delay
         for rows in np.array_split(inner, max(1, round(count / PART_ROWS))):
             start, end = max(rows[0] - overlap, 0), min(rows[-1] + overlap + 1, count)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.observations.low_pass import central_difference, low_pass, resample
 from dvrk_drake.analysis.observations.motion_faults import MotionFault, jump_fault, source_fault, time_fault
-from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MIN_SEGMENT, MotionGrid, even_times
+from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MIN_DURATION, MotionGrid, even_times
 from dvrk_drake.analysis.observations.repetition import find_period
 from dvrk_drake.analysis.observations.static_segments import static_poses
 from dvrk_drake.analysis.observations.true_time import TrueTime, increasing_times, true_time
@@ -21,10 +21,6 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_LOST, MIN_RATE, MIN_ROWS, Recording
-
-#: Smallest accepted duration of a motion [s]. At the cut-off frequency of 10 Hz that is the default for efforts, it has
-#: 40 independent values of each effort.
-MIN_DURATION = 2.0
 
 
 class Observations:
@@ -222,11 +218,11 @@ class Observations:
                 f"{self.source}: the motion lasts {total:.1f} s at {rate:.3g} Hz{gaps}. A dynamic model requires at "
                 f"least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
             )
-        if min(durations) < (MIN_SEGMENT if len(rows) > 1 else 0.0):
+        if min(durations) < MIN_DURATION:
             k = int(np.argmin(durations))
             raise RecordingError(
                 f"{recording.where(rows[k].start)}: only {durations[k]:.3g} s of motion between two gaps of t; "
-                f"required: {MIN_SEGMENT:g} s. Remove these {rows[k].stop - rows[k].start} rows."
+                f"required: {MIN_DURATION:g} s. Remove these {rows[k].stop - rows[k].start} rows."
             )
 
     def _segment_grid(self, actuators: Recording, clock: TrueTime) -> MotionGrid:

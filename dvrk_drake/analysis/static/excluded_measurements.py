@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording
-
-#: Distance from a limit within which a joint may be at its stop [rad], [m].
-STOP_MARGIN = 0.01, 0.002
+from dvrk_drake.recordings.recording import SAME_POSE, Recording
 
 
 @dataclass(frozen=True)
@@ -45,8 +42,9 @@ def find_excluded(recording: Recording, arm: Arm) -> list[ExcludedMeasurement]:
     A, lower, upper = arm.limit_matrix()
     names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
     values = recording.q @ A.T
+    # A pose that is the same as one at the limit may be at the stop.
     # A coupled limit has no margin, because its value is the position at first contact with a soft stop.
-    margin = np.concatenate([arm.per_joint(*STOP_MARGIN), np.zeros(len(arm.coupled_limits))])
+    margin = np.concatenate([arm.per_joint(*SAME_POSE), np.zeros(len(arm.coupled_limits))])
     at_stop = (values < lower + margin) | (values > upper - margin)
     for row, limit in np.argwhere(at_stop):
         joints = tuple(int(j) for j in np.flatnonzero(A[limit]))
