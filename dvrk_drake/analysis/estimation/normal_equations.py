@@ -12,7 +12,8 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-#: Maximum number of iterations in which unknowns change between the positive set and the zero set.
+#: Maximum number of iterations in which unknowns change between the positive set and the zero set. If they are not
+#: sufficient, a slower method is used. Half the number changes no result of the public motions `mtm_one` and `psm_one`.
 MAX_EXCHANGES = 10
 #: Indices (c,) of the nonzero regressor columns of one actuator, and the values (r, c) of these columns.
 OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]

