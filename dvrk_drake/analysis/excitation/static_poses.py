@@ -29,7 +29,8 @@ from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.pose_file import save_poses
 
 #: Number of random poses from which the poses are selected, largest number of random poses that are drawn for this
-#: pool, and largest number of selected poses.
+#: pool, and largest number of selected poses. With half the pool, the expected error for 30 poses of an MTML is 8.2 %
+#: instead of 8.1 %; twice the pool does not reduce it.
 POOL, MAX_DRAWN, MAX_POSES = 1500, 30_000, 300
 #: Number of drawn poses after which the search ends if none of them meets all limits.
 _MAX_FAILED = 4000
@@ -40,8 +41,10 @@ MIN_APPROACH = 0.4
 #: Standard deviation of the error of a measured holding effort, as a share of the effort limit.
 EFFORT_ERROR = 0.01
 #: Number of random poses for which holding efforts are predicted, and number of random selections for the comparison.
+#: Half the first number increases the same expected error from 8.1 to 8.2 %, twice the number does not reduce it.
 NUM_TARGETS, NUM_RANDOM = 2000, 20
-#: Smallest relative reduction of the squared expected error by an exchange.
+#: Smallest relative reduction of the squared expected error by an exchange. Half or twice the value gives the same
+#: expected error for 30 poses of an MTML.
 _MIN_REDUCTION = 1e-6
 #: Travel that replaces the travel of a blocked path, in units of the position ranges.
 _BLOCKED = 1e3

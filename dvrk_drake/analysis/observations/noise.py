@@ -11,7 +11,8 @@ from scipy.ndimage import median_filter
 #: Duration of the segments for averaged periodograms [s]. The frequency resolution [Hz] is the reciprocal of this
 #: duration. Half or twice the value changes only cut-offs and notes on narrow-band noise of the public recordings.
 SEGMENT_DURATION = 2.56
-#: Largest frequency of the motion of an arm [Hz], and smallest cut-off frequency. XXX
+#: Largest frequency of the motion of an arm [Hz], and smallest cut-off frequency. In three public motions (`mtm_one`,
+#: `psm_one`, `psm1_2`), at most 1.3 % of the power of the velocity is above it, except for one of 17 joints.
 MOTION_FREQUENCY = 2.0
 #: Smallest ratio of the peak noise in a narrow band to the median noise below and above the band. Half the value
 #: changes no note on the public recordings, twice the value removes one.

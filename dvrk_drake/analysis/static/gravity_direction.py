@@ -23,7 +23,8 @@ from dvrk_drake.recordings.recording import MIN_RANGE, Recording
 #: an estimate that can be used [rad]. Poses of upright MTMs give up to 4.2 deg (mtm_2015_apr18_all80). At 5 deg, about
 #: 0.09 N m of the 1 N m on the shoulder of an MTM act on the outer yaw, which is its dry friction.
 LARGE_TILT = np.deg2rad(5.0)
-#: Prior standard deviation of a change of the direction in one iteration [rad], and number of iterations.
+#: Prior standard deviation of a change of the direction in one iteration [rad], and number of iterations. Half or twice
+#: the deviation, and twice the number, change no printed tilt of the public poses.
 _STEP, _ITERATIONS = 0.5, 10
 
 

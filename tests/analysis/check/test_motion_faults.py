@@ -283,7 +283,7 @@ def test_drops_short_segments_between_gaps():
     with pytest.raises(RecordingError, match=r"row 901: only 0.99 s of motion between two gaps of t"):
         _ = Observations(cut, ARM).grid
     kept, (finding,) = with_power(cut, ARM)
-    assert len(kept) == 1700 and "100 of 1800 rows are in 1 segment shorter than 3 s" in finding.what
+    assert len(kept) == 1700 and "100 of 1800 rows are in 1 segment shorter than 2 s" in finding.what
     # A twentieth of each segment is left out at both ends.
     assert Observations(kept, ARM).grid.inner_rows.size == 0.9 * 1700
 
