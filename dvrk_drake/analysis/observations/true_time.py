@@ -24,8 +24,8 @@ GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
 MIN_SPEED = 1e-3
 #: Duration that is omitted at each end because of filter transients [s], at most a tenth of the motion.
 ENDS = 0.5
-#: Number of Gauss-Newton iterations. Twice as many change no printed digit on the public recordings.
-_FIT_ITERATIONS = 5
+#: Number of iterations of a fit. Twice as many change the printed lags on the public recordings by at most 0.1 ms.
+_ITERATIONS = 8
 
 
 class VelocityAgreement(NamedTuple):
@@ -71,7 +71,7 @@ def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple
         return 0.0, 0.0, 1.0
     index = np.arange(len(v), dtype=float)
     gain, lag = 1.0, 0.0
-    for _ in range(_FIT_ITERATIONS):
+    for _ in range(_ITERATIONS):
         shifted = np.interp(index - lag, index, v)
         columns = np.column_stack([shifted, -np.gradient(shifted)])
         (gain, slope), *_ = np.linalg.lstsq(columns[inner], qd[inner], rcond=None)
@@ -96,8 +96,6 @@ DRIFT = 0.3
 #: Smallest interval between two distinct rows, as a share of the mean interval. Half or twice the value changes no
 #: finding on the public recordings.
 MIN_INTERVAL = 0.02
-#: Number of iterations. Twice as many change the printed lags on the public recordings by at most 0.1 ms.
-_ITERATIONS = 8
 
 
 #: The arm moves while the speed of at least one joint exceeds MOVING_SHARE of its RMS speed. Without qd, the speed is

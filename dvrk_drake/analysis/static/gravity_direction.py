@@ -88,8 +88,7 @@ def estimate_gravity(recording: Recording, arm: Arm) -> GravityDirection:
     effects = [effect for group in candidate_effects(problem) for effect in group]
     of_effects = np.stack([effect_column(arm, e, q) for e in effects], axis=2) if effects else np.empty((*q.shape, 0))
     largest = np.abs(sampled[..., independent]).max(axis=(0, 1))
-    used = largest > ROUNDING_EFFORT
-    limits = np.where(used, arm.effort_limits[:, None] / np.where(used, largest, 1.0), np.inf).min(axis=0)
+    limits = (arm.effort_limits[:, None] / np.maximum(largest, ROUNDING_EFFORT)).min(axis=0)
     own = problem.prior_precision(effects)[len(problem.base_model.gravity.base.names) :]
     prior = np.concatenate([(BASE_PRIOR * limits) ** -2.0, own, np.full(2, _STEP**-2.0)])
     # The effort of a joint that does not move contains a constant dry friction.
