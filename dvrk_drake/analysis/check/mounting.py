@@ -17,8 +17,6 @@ from scipy.optimize import minimize_scalar
 from dvrk_drake.analysis.check.channel_check import MIN_GAIN, segments_of
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
-from dvrk_drake.analysis.estimation.estimator import MIN_ERROR
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.errors import RecordingError
@@ -31,6 +29,8 @@ from dvrk_drake.models.arm_schema import ANGLES, ArmDescription, Gains
 #: The gain of the true hypotheses is 260 to 1960 on recordings of two robots and 14 on a simulated one with three
 #: joints. That of all other hypotheses is at most 6 on recordings of five robots.
 MIN_CONFIRMED_GAIN = 10.0
+#: Relative error of an effort that is due to the nominal links, and is no evidence for another mounting.
+NOMINAL_ERROR = 0.05
 #: Smallest angle of a reported direction from the stated one [rad]. Smaller angles are tilts of the base, which the
 #: identification estimates (`base_may_tilt`).
 MIN_ANGLE = np.deg2rad(30.0)
@@ -144,7 +144,7 @@ class _Search:
         self._motion = fit.efforts_of_motion()
         scale = np.std(velocities, axis=0) + np.finfo(float).tiny
         self._friction = [
-            np.column_stack([np.ones(len(v)), *((v / s, np.tanh(v / (DIRECTION_WIDTH * s))) if fit.moves else ())])
+            np.column_stack([np.ones(len(v)), v / s, np.tanh(3 * v / s)]) if fit.moves else np.ones((len(v), 1))
             for v, s in zip(velocities.T, scale, strict=True)
         ]
 
@@ -213,9 +213,9 @@ class _Search:
                 own = weights[i] * (own - X @ np.linalg.lstsq(X, own, rcond=None)[0])
                 rows.append(own[:, :3])
                 efforts.append(own[:, 3])
-            g = np.linalg.lstsq(np.concatenate(rows), np.concatenate(efforts), rcond=None)[0]
+            g = np.linalg.lstsq(np.concatenate(rows), np.concatenate(efforts), rcond=1e-6)[0]
             errors = [e - r @ g for r, e in zip(rows, efforts, strict=True)]
-            weights[self._fit.used] /= [np.sqrt(np.mean(e**2)) + np.finfo(float).tiny for e in errors]
+            weights[self._fit.used] /= [np.sqrt(np.mean(e**2)) + 1e-9 for e in errors]
         if not np.any(g):
             return self._arm.gravity
         axis = np.sign(g[np.argmax(np.abs(g))]) * np.eye(3)[np.argmax(np.abs(g))]
@@ -229,11 +229,11 @@ class _Search:
         for i in self._fit.used:
             tau = self._tau[:, i]
             X = np.column_stack([holding[:, i], self._motion[:, i], self._friction[i]])
-            x, *_ = np.linalg.lstsq(X, tau, rcond=None)
+            x, *_ = np.linalg.lstsq(X, tau, rcond=1e-9)
             if x[0] < 0:  # Masses are positive.
                 X = X[:, 1:]
-                x, *_ = np.linalg.lstsq(X, tau, rcond=None)
-            error = max(float(np.mean((tau - X @ x) ** 2)), MIN_ERROR**2 * float(np.mean(tau**2)))
+                x, *_ = np.linalg.lstsq(X, tau, rcond=1e-9)
+            error = max(float(np.mean((tau - X @ x) ** 2)), NOMINAL_ERROR**2 * float(np.mean(tau**2)))
             total -= 0.5 * self._fit.num_independent * np.log(error)
         return total
 
