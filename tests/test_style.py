@@ -36,6 +36,18 @@ def test_files_contain_no_banned_words():
     assert not found, "words that the style guide does not allow"
 
 
+def test_only_models_exports_and_recordings_name_frames():
+    """All other packages work for any arm. Frames with a purpose are data, see `Arm.frames` and `base_body`."""
+    general = [path for path in PYTHON if path.is_relative_to(ROOT / "dvrk_drake")]
+    named = [
+        str(path.relative_to(ROOT))
+        for path in general
+        if path.relative_to(ROOT).parts[1] not in ("models", "export", "recordings")
+        and re.search(r"\b(dh_\d+|base_link)\b", path.read_text())
+    ]
+    assert not named
+
+
 def test_docstrings_start_with_a_verb_or_a_noun():
     found = [
         f"{path.relative_to(ROOT)}: {match.group()}" for path in PYTHON for match in NO_VERB.finditer(path.read_text())

@@ -212,7 +212,7 @@ def transparency(
     file: FileOptions = _FILE,
     speed: Annotated[float | None, Parameter(metavar="S")] = None,
     model: Annotated[list[str] | None, Parameter(metavar="MODEL.yaml")] = None,
-    friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.5,
+    friction_ratio: Annotated[float | None, Parameter(metavar="R", show_default=False)] = None,
     simulated_effects: Annotated[list[str] | None, Parameter(metavar="EFFECT ..", consume_multiple=True)] = None,
     frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
     output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
@@ -227,9 +227,11 @@ def transparency(
         path: Recording of the motion of the operator. Default: a motion through random poses.
         speed: Speed factor of the recorded motion. 2 doubles the speed.
         model: Model for gravity compensation. Repeat the option to compare models. Default: the nominal model.
-        friction_ratio: Share of the friction to compensate, 0 to 0.6.
+        friction_ratio: Share of the friction to compensate, 0 to 0.6. Default: 0.5, or 0 for an arm file without
+            friction.
         simulated_effects: Effects to simulate (docs/simulated_effects.md), e.g. friction cables. Default: all.
-        frame: SDF frame at which the operator holds the arm. Default: dh_7 for an MTM, dh_6 for a PSM.
+        frame: SDF frame at which the operator holds the arm. Default: frames.hand of the arm file, or
+            the last link.
         output: CSV file for the results.
     """
     from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
@@ -246,6 +248,8 @@ def transparency(
         followed = recorded_path(moved_arm, motion, 1.0 if speed is None else speed)
     elif speed is not None:
         raise ScenarioError("--speed requires --path with a recorded motion")
+    if friction_ratio is None:
+        friction_ratio = 0.5 if moved_arm.effects.friction else 0.0
     compensations = _compensations(moved_arm, model or [], friction_ratio)
     if output is not None:
         if not output.lower().endswith(".csv"):

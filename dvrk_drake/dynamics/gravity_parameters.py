@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Joint, ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import Joint, RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
 from dvrk_drake.dynamics.inertial_parameters import link_inertias, moving_bodies, rotor_links
@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.dynamics.regressor_kernel import fill_gravity_regressor
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import shared_plant
+from dvrk_drake.models.plant import arm_frames, base_body, shared_plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +85,13 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
 
     Args:
         arm: Arm whose gravity vector specifies the orientation of the base.
-        frames: Prefix of the SDF frames in which the parameters are expressed: "dh" for the DH frames of the dVRK or,
-            for an MTM, "paper" for the frames of Rutfield et al. (2015). See `link_frames`.
+        frames: Prefix of the SDF frames in which the parameters are expressed: "dh" for the DH frames of the dVRK, or
+            another prefix of the arm's SDF, e.g. "paper" for the frames of Rutfield et al. (2015). See `link_frames`.
         serial: True to omit the links of the linkage (crank, coupler), as in Rutfield et al. (2015).
 
     Raises:
         ArmError: The SDF has no frames with this prefix, gravity is less than 1 m/s^2, or `serial` is True and a joint
-            moves a link without a numbered frame, such as the jaw of a PSM.
+            moves a link without a numbered frame, such as a jaw.
     """
     if (size := float(np.linalg.norm(arm.gravity))) < 1.0:
         raise ArmError(f"{arm.name}: gravity is {size:.3g} m/s^2; it must be 1 m/s^2 or more for a gravity model")
@@ -147,7 +147,7 @@ def _to_standard(arm: Arm, bodies: Sequence[tuple[RigidBody, RigidTransform]]) -
     """
     plant = shared_plant(arm)
     order = [link.link for link in link_inertias(arm)]
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices(arm_instance(plant))]
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(base_body(plant).model_instance())]
     rotors = rotor_links(arm)
     rows = np.zeros((len(bodies), 4, len(order), 10))
     for row, (body, X_BF) in zip(rows, bodies, strict=True):
@@ -184,8 +184,7 @@ def link_frames(arm: Arm, frames: str = "dh") -> dict[str, tuple[RigidBody, Rigi
     """
     plant = shared_plant(arm)
     found = {}
-    for index in plant.GetFrameIndices(arm_instance(plant)):
-        frame = plant.get_frame(index)
+    for frame in arm_frames(plant):
         prefix, _, label = frame.name().partition("_")
         if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
             found[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
@@ -200,11 +199,6 @@ def link_frames(arm: Arm, frames: str = "dh") -> dict[str, tuple[RigidBody, Rigi
         if body.name() not in named:
             bodies[body.name().removesuffix("_link")] = (body, RigidTransform())
     return bodies
-
-
-def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
-    """Returns the model instance of the arm in a plant with one arm."""
-    return plant.GetBodyByName("base_link").model_instance()
 
 
 def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -228,7 +222,7 @@ def named_lengths(
             X = plant.GetFrameByName(f"{frames}_{label}").CalcPose(context, previous)
             name = f"L{label}"
         else:
-            parents = [plant.get_joint(j) for j in plant.GetJointIndices(arm_instance(plant))]
+            parents = [plant.get_joint(j) for j in plant.GetJointIndices(base_body(plant).model_instance())]
             child = next((j for j in parents if j.parent_body() == labels[label][0] and j.num_positions()), None)
             if child is None:
                 continue

@@ -13,7 +13,7 @@ from pydrake.multibody.tree import Joint, RigidBody, SpatialInertia, UnitInertia
 
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import shared_plant
+from dvrk_drake.models.plant import DH_PREFIX, arm_frames, base_body, shared_plant
 
 #: Names of the ten inertial parameters of a link [kg, kg m, kg m^2], in the order of all parameter vectors.
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
@@ -75,9 +75,7 @@ def link_inertias(arm: Arm) -> tuple[LinkInertia, ...]:
 
 def moving_bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
     """Yields the bodies of a finalized plant that are not anchored to the world, in the order of the SDF."""
-    bodies = (
-        plant.get_body(index) for index in plant.GetBodyIndices(plant.GetBodyByName("base_link").model_instance())
-    )
+    bodies = map(plant.get_body, plant.GetBodyIndices(base_body(plant).model_instance()))
     return (body for body in bodies if not plant.IsAnchored(body))
 
 
@@ -144,8 +142,8 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
 
     The diagonal elements of all actuators come first, then the nonzero elements that couple two actuators. Drake adds
     gear^2 * inertia to the diagonal of the mass matrix in joint coordinates. If the transmission couples joints that
-    have rotors, as in the PSM's wrist, D is not diagonal. Real motors do not cause such coupling elements, so
-    identification omits these elements. The value is 0 for a rotor that the SDF models as a link.
+    have rotors, as in the wrist of an instrument, D is not diagonal. Real motors do not cause such coupling elements,
+    so identification omits these elements. The value is 0 for a rotor that the SDF models as a link.
     """
     D_tree = np.zeros((len(arm.tree_joint_names),) * 2)
     for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
@@ -166,14 +164,13 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
 
 
 def rotor_links(arm: Arm) -> set[str]:
-    """Returns the links that represent balanced rotors: they carry nothing, and no dh_ frame marks them as a link.
+    """Returns the links that represent balanced rotors: they carry nothing, and no DH frame marks them as a link.
 
     Only an SDF with DH frames can have such links. Their joint is revolute, and their centre of mass is on its axis, so
     their rotation does not change the torque of gravity.
     """
     plant = shared_plant(arm)
-    frames = [plant.get_frame(i) for i in plant.GetFrameIndices(plant.GetBodyByName("base_link").model_instance())]
-    framed = {frame.body().name() for frame in frames if frame.name().startswith("dh_")}
+    framed = {frame.body().name() for frame in arm_frames(plant) if frame.name().startswith(DH_PREFIX)}
     if not framed:
         return set()
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]

@@ -82,13 +82,12 @@ class HandScenario:
 
     Attributes:
         path: Joint positions and times.
-        frame: Frame of the arm's SDF that the hand holds: dh_7 for the handle of an MTM, dh_6 for the instrument of a
-            PSM.
+        frame: Frame of the arm's SDF that the hand holds. Default: the frame `frames.hand` of the arm.
         stiffness, damping, rotational_stiffness, rotational_damping, max_force, max_torque: Parameters of the `Grip`.
     """
 
     path: list[Target] = field(default_factory=list)
-    frame: str = "dh_7"
+    frame: str = ""
     stiffness: float = field(default=Grip.stiffness, metadata=_GRIP["stiffness"].metadata)
     damping: float = field(default=Grip.damping, metadata=_GRIP["damping"].metadata)
     rotational_stiffness: float = field(

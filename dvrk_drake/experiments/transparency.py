@@ -14,7 +14,7 @@ from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.kinematics import ArmFrame, handle_frame
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.experiments.simulation import advance, samples, simulated_holding_error
 from dvrk_drake.models.arm import Arm
@@ -153,11 +153,11 @@ def simulate_operator(
         compensation: Compensation by the motors.
         effects: Simulated effects of the real arm, e.g. `arm.effects`. None for no effects.
         grip: Grip of the hand. None for the default grip.
-        frame_name: Name of the handle's frame. If it is empty, `handle_frame` selects the frame.
+        frame_name: Name of the handle's frame. Default: `arm.frames.hand`.
         seed: Seed of the effects' noise.
         progress: Function called with the finished share, 0..1.
     """
-    name, frame = arm.name.lower(), ArmFrame(arm, frame_name := frame_name or handle_frame(arm))
+    name, frame = arm.name.lower(), ArmFrame(arm, frame_name)
     knots = np.arange(path.start_time(), path.end_time(), 0.02)
     poses = [frame.pose(path.value(t).ravel()) for t in knots]
     builder = DiagramBuilder()

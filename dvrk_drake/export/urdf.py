@@ -17,7 +17,7 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.export.sdf import MeshFormat, copy_meshes, redirect_meshes, to_text, with_inertias
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.models.plant import package_map, set_arm_positions
+from dvrk_drake.models.plant import base_body, package_map, set_arm_positions
 from dvrk_drake.models.sdf_elements import DRAKE
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.urdf import to_urdf
@@ -89,7 +89,7 @@ def touching_shapes(arm: Arm) -> tuple[tuple[str, str], ...]:
     parser = Parser(plant)
     parser.package_map().AddMap(package_map())
     parser.AddModelsFromString(ElementTree.tostring(root, encoding="unicode"), "sdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
+    plant.WeldFrames(plant.world_frame(), base_body(plant).body_frame())
     plant.Finalize()
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     carried = {frozenset((j.parent_body(), j.child_body())) for j in joints if not plant.IsAnchored(j.parent_body())}

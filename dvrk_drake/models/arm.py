@@ -16,6 +16,7 @@ from dvrk_drake.models.arm_schema import (
     EFFORTS,
     GRAVITIES,
     CoupledLimit,
+    Frames,
     Gains,
     IdentificationSettings,
     LoopClosure,
@@ -71,7 +72,9 @@ class Arm:
         console_gravity_compensation: Whether the dVRK's controller can compensate the gravity of this arm.
         locked_joints: Positions of the joints that are locked [rad, m], which are not among the independent joints; see
             `dvrk_drake.models.locked_joints.lock_joints`.
-        view: Close-ups, remote centre and tip for 3D views.
+        frames: Frames of the SDF that have a purpose, e.g. the frame at which a hand holds the arm.
+        view: Close-ups for 3D views.
+        published_gains: Gains of a publication, for comparisons. Without numbers if there are none.
         position_offsets: Mapping from a joint to the position in the model at the recorded position 0 [rad, m]. Offsets
             are a part of `linkage` and of all limits; see `with_position_offsets`. Joints without an entry have none.
 
@@ -108,7 +111,9 @@ class Arm:
     separate_joint: str = ""
     console_gravity_compensation: bool = False
     locked_joints: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
+    frames: Frames = field(default_factory=Frames)
     view: ViewSettings = field(default_factory=ViewSettings)
+    published_gains: Gains = field(default_factory=Gains)
     position_offsets: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
 
     def __post_init__(self) -> None:

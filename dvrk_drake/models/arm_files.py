@@ -19,6 +19,7 @@ from dvrk_drake.models.arm import Arm, checked_gravity
 from dvrk_drake.models.arm_schema import (
     ArmDescription,
     CoupledLimit,
+    Frames,
     Gains,
     IdentificationSettings,
     Instrument,
@@ -123,6 +124,9 @@ effort_limits:{per_joint(arm.effort_limits)}
 
 # Gravity in the frame of the base [m/s^2].
 gravity: {arm.gravity.tolist()}
+
+# Frame of a link, or of a part that is fixed to a link, at which a hand or a task holds the arm.
+frames: {{hand: {_yaml_text(arm.frames.hand)}}}
 
 # Positions in the model at the recorded positions 0 [rad; m], if the robot's controller has other zeros.
 # position_offsets: {{{first}: 1.5708}}
@@ -296,7 +300,9 @@ def _build_arm(
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
         separate_joint=instrument.separate_joint,
         console_gravity_compensation=mechanism.console_gravity_compensation,
+        frames=_frames(path, mechanism.frames, instrument.frames, facts),
         view=_view_settings(path, mechanism.view, instrument.view, facts),
+        published_gains=mechanism.published_gains,
     )
     arm = arm.with_position_offsets(description.position_offsets)
     if has_gains:
@@ -311,19 +317,21 @@ def _name_of(path: Path) -> str:
     return re.sub(r"\W", "_", path.name.partition(".")[0], flags=re.ASCII)
 
 
+def _frames(path: Path, mechanism: Frames, instrument: Frames, facts: SdfFacts) -> Frames:
+    """Returns the frames of mechanism and instrument. The entries of the instrument take precedence."""
+    stated = {key: getattr(instrument, key) or frame for key, frame in vars(mechanism).items()}
+    for key, frame in stated.items():
+        if frame and frame not in facts.frame_names | facts.link_names:
+            raise ArmError(f"{path}: frames.{key}: the SDF has no frame {frame}")
+    return Frames(**(stated | {"hand": stated["hand"] or facts.last_link}))
+
+
 def _view_settings(path: Path, mechanism: ViewSettings, instrument: ViewSettings, facts: SdfFacts) -> ViewSettings:
     """Returns the settings of mechanism and instrument. The entries of the instrument take precedence."""
-    view = ViewSettings(
-        {**mechanism.close_ups, **instrument.close_ups},
-        instrument.remote_center or mechanism.remote_center,
-        instrument.tip or mechanism.tip,
-    )
+    view = ViewSettings({**mechanism.close_ups, **instrument.close_ups})
     for name, links in view.close_ups.items():
         if unknown := sorted(set(links) - facts.link_names):
             raise ArmError(f"{path}: view.close_ups.{name}: the SDF has no link {', '.join(unknown)}")
-    for key, frame in (("remote_center", view.remote_center), ("tip", view.tip)):
-        if frame and frame not in facts.frame_names | facts.link_names:
-            raise ArmError(f"{path}: view.{key}: the SDF has no frame {frame}")
     return view
 
 

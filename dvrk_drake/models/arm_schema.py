@@ -135,13 +135,26 @@ class ViewSettings(Shared):
 
     Attributes:
         close_ups: Mapping from the name of a camera position, e.g. "gimbal", to the links that fill its view.
-        remote_center: SDF frame with its origin at the remote centre of motion, which is drawn as a sphere, or "".
-        tip: SDF frame whose origin leaves a trace, or "".
     """
 
     close_ups: dict[str, list[str]] = field(default_factory=dict)
+
+
+@dataclass
+class Frames(Shared):
+    """Frames of the SDF that have a purpose. The frame of a link has the name of the link.
+
+    Attributes:
+        hand: Frame at which a hand or a task holds the arm: the handle of a master, or the tool frame of an instrument.
+            On ROS topics, poses of the arm are poses of this frame. Default: the link that the last joint moves.
+        remote_center: Frame with its origin at the remote centre of motion, or "" if there is none.
+        shaft: Frame whose z axis is the axis of a shaft through the remote centre, from there to the tip, and whose
+            origin is at the end of the shaft. "" if there is none.
+    """
+
+    hand: str = ""
     remote_center: str = ""
-    tip: str = ""
+    shaft: str = ""
 
 
 @dataclass
@@ -154,12 +167,14 @@ class Mechanism:
     sensor effects of the real arm. A simulation includes only those that are named in `simulated_effects`.
     `console_gravity_compensation` states whether the dVRK's controller can compensate the gravity of this arm. It then
     publishes the efforts on the ROS topic gravity_compensation/setpoint_js. `view` are the parts that a 3D view shows.
+    `published_gains` are gains of a publication, with which `dvrk-drake tune` compares its gains.
     """
 
     format: str = field(default="", metadata=FileFormat("dvrk_drake mechanism", 1).metadata)
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
     gains: Gains = field(default_factory=Gains)
+    published_gains: Gains = field(default_factory=Gains)
     transmission: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
     coupled_limits: list[CoupledLimit] = field(default_factory=list)
     loop_closures: list[LoopClosure] = field(default_factory=list)
@@ -168,6 +183,7 @@ class Mechanism:
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
     console_gravity_compensation: bool = False
+    frames: Frames = field(default_factory=Frames)
     view: ViewSettings = field(default_factory=ViewSettings)
 
 
@@ -178,8 +194,8 @@ class Instrument:
     `joint_from_actuator` is the disc coupling as defined by the dVRK: joint position = sum of coefficient * actuator
     position. `friction_coordinates` are additional coordinates along which friction acts, besides joints and actuators.
     Each name is mapped to the joint coefficients of its coordinate: coordinate = sum of coefficient * joint position.
-    `separate_joint` is the joint that the dVRK publishes on separate topics `/<ARM>/<joint>/...`, or "". `view` adds
-    to the close-ups of the mechanism, and replaces its other entries.
+    `separate_joint` is the joint that the dVRK publishes on separate topics `/<ARM>/<joint>/...`, or "". `frames`
+    replaces entries of the mechanism, and `view` adds to those of the mechanism.
     """
 
     format: str = field(default="", metadata=FileFormat("dvrk_drake instrument", 1).metadata)
@@ -193,6 +209,7 @@ class Instrument:
     motion: MotionSettings = field(default_factory=MotionSettings)
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
+    frames: Frames = field(default_factory=Frames)
     view: ViewSettings = field(default_factory=ViewSettings)
 
 

@@ -138,6 +138,7 @@ def _locked(arm: Arm, positions: tuple[tuple[str, float], ...]) -> Arm:
         coupled_limits=tuple(_coupled_limits(arm, names, stated)),
         linkage=LinearMap(G[:, free], arm.linkage.offset + G[:, locked] @ q_locked),
         transmission=LinearMap(J[np.ix_(free, free)], arm.transmission.offset[free]),
+        published_gains=Gains(),  # they are those of all joints
         gains=Gains(*([getattr(arm.gains, key)[j] for j in free] for key in ("kp", "kd", "ki"))),
         friction_coordinates=coordinates,
         identification=dataclasses.replace(

@@ -32,6 +32,7 @@ from pydrake.multibody.tree import (
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.sdf_elements import (
+    BASE_LINK,
     DRAKE,
     add_element,
     add_pose,
@@ -176,7 +177,7 @@ class _Model:
         for joint in self.joints:
             children.setdefault(joint.parent_body().index(), []).append(joint)
         links: list[_Link] = []
-        open_links = [_Link("base_link", {self.plant.world_body().index(): RigidTransform()})]
+        open_links = [_Link(BASE_LINK, {self.plant.world_body().index(): RigidTransform()})]
         while open_links:
             link = open_links.pop(0)
             links.append(link)
@@ -207,7 +208,7 @@ class _Model:
     def _name(self, body: RigidBody) -> str:
         """Returns the name of a body, with the name of its model if another body has the same name."""
         name = body.name()
-        if name in self._names or name in ("base_link", "world"):
+        if name in self._names or name in (BASE_LINK, "world"):
             name = f"{self.plant.GetModelInstanceName(body.model_instance())}_{name}"
         self._names.add(name)
         return name

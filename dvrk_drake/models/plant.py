@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, MultibodyForces, SpatialInertia
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Frame,
+    ModelInstanceIndex,
+    MultibodyForces,
+    RigidBody,
+    SpatialInertia,
+)
 from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
@@ -20,11 +27,14 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
+from dvrk_drake.models.sdf_elements import BASE_LINK
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 #: Bandwidth [rad/s] of derived gains, and ratio ki / kp [1/s]: within the 16 to 30 rad/s and 1.2 to 1.5 1/s of the
 #: gains of the MTM, which were tuned in simulation.
 _BANDWIDTH, _INTEGRAL_RATE = 20.0, 1.2
+#: Prefix of the names of the frames of the dVRK's DH convention: dh_0, dh_1, ..., and those of the linkage.
+DH_PREFIX = "dh_"
 
 
 def package_map() -> PackageMap:
@@ -100,7 +110,7 @@ def add_arm(
         if closure == "ball":
             for loop in arm.loop_closures:
                 pin_loop(plant, instance, loop)
-        base = plant.GetFrameByName("base_link", instance)
+        base = base_body(plant, instance).body_frame()
         plant.WeldFrames(parent_frame or plant.world_frame(), base, X_PB or RigidTransform())
         for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
             plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
@@ -132,11 +142,38 @@ def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
     where = ", ".join(arm.sdf)
     if floating := [plant.get_body(index).name() for index in plant.GetFloatingBaseBodies()]:
         raise ArmError(f"{where}: no joint connects {', '.join(sorted(floating))} to the base")
-    instance = plant.GetBodyByName("base_link").model_instance()
-    names = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
-    numbers = {int(match[1]) for name in names if (match := re.fullmatch(r"dh_(\d+)", name))}
+    numbers = dh_frames(plant).keys()
     if missing := set(range(max(numbers, default=0))) - numbers:
         raise ArmError(f"{where}: frame dh_{min(missing)} is missing, but there is a frame dh_{max(numbers)}")
+
+
+def base_body(plant: MultibodyPlant, instance: ModelInstanceIndex | None = None) -> RigidBody:
+    """Returns the base of an arm: the link that none of its joints moves.
+
+    Args:
+        plant: Plant with the arm.
+        instance: Model instance that `add_arm` returned. None: the plant contains one arm.
+    """
+    return plant.GetBodyByName(BASE_LINK) if instance is None else plant.GetBodyByName(BASE_LINK, instance)
+
+
+def arm_frames(plant: MultibodyPlant) -> list[Frame]:
+    """Returns the frames of the arm in a plant with one arm, including those of its links."""
+    return [plant.get_frame(index) for index in plant.GetFrameIndices(base_body(plant).model_instance())]
+
+
+def dh_frames(plant: MultibodyPlant) -> dict[int, Frame]:
+    """Returns number -> frame of the frames dh_0, dh_1, ... of the dVRK's DH convention, in ascending order."""
+    frames = (frame for frame in arm_frames(plant) if re.fullmatch(rf"{DH_PREFIX}\d+", frame.name()))
+    return dict(sorted((int(frame.name().removeprefix(DH_PREFIX)), frame) for frame in frames))
+
+
+def main_frames(arm: Arm) -> list[str]:
+    """Returns the frames that 3D views show: the DH frames, or else the base and the links of independent joints."""
+    plant = shared_plant(arm)
+    joints = map(plant.GetJointByName, arm.joint_names)
+    dh = [frame.name() for frame in dh_frames(plant).values()]
+    return dh or [BASE_LINK, *(joint.child_body().name() for joint in joints)]
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:

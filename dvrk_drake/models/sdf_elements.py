@@ -15,6 +15,8 @@ from pydrake.multibody.tree import SpatialInertia
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.files import MAX_TEXT, read_input
 
+#: Name of the link that no joint of an arm moves.
+BASE_LINK = "base_link"
 #: Prefix of the names of Drake's extensions of SDF and URDF.
 DRAKE = "{http://drake.mit.edu}"
 #: Maximum nesting of elements; the models of the dVRK's arms have 7 levels.

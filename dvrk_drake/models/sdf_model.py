@@ -14,7 +14,7 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.model_file import MODEL_SUFFIXES, convert_model
 from dvrk_drake.models.schema_fault import Range
-from dvrk_drake.models.sdf_elements import DRAKE, read_xml
+from dvrk_drake.models.sdf_elements import BASE_LINK, DRAKE, read_xml
 
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"
@@ -62,6 +62,7 @@ class SdfFacts:
         prismatic: Names of the prismatic joints; all others are revolute.
         link_names: Names of the links.
         frame_names: Names of the frames that are not frames of links.
+        last_link: Link that the last moving joint moves, or "" if there is no joint.
     """
 
     joint_names: tuple[str, ...]
@@ -71,6 +72,7 @@ class SdfFacts:
     prismatic: frozenset[str]
     link_names: frozenset[str]
     frame_names: frozenset[str]
+    last_link: str
 
 
 def is_in_degrees(pose: ElementTree.Element) -> bool:
@@ -125,17 +127,17 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     """Reads the moving joints from a composed model.
 
     Raises:
-        ArmError: The link base_link is missing, another link has no mass, two joints have the same name, or the
+        ArmError: The link `BASE_LINK` is missing, another link has no mass, two joints have the same name, or the
             model has an unsupported joint. Unsupported are joint types other than revolute, prismatic and fixed;
             `<friction>`, which Drake ignores silently; and `drake:mimic` of a fixed joint or with a multiplier of 0.
     """
-    if root.find("model/link[@name='base_link']") is None:
-        raise ArmError("the SDF has no link base_link")
+    if root.find(f"model/link[@name='{BASE_LINK}']") is None:
+        raise ArmError(f"the SDF has no link {BASE_LINK}")
     for link in root.findall("model/link"):
         # If the mass is missing, Drake uses 1 kg without a warning.
-        if link.get("name") != "base_link" and not float(link.findtext("inertial/mass") or 0.0) > 0:
+        if link.get("name") != BASE_LINK and not float(link.findtext("inertial/mass") or 0.0) > 0:
             raise ArmError(f"link {link.get('name')} of the SDF needs a positive <inertial><mass>")
-    names, mimics, efforts, positions, prismatic = [], {}, {}, {}, set()
+    names, mimics, efforts, positions, prismatic, last_link = [], {}, {}, {}, set(), ""
     for joint in root.findall("model/joint"):
         name = joint.get("name", "")
         mimic = joint.find(f"{DRAKE}mimic")
@@ -152,6 +154,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         if name in names:
             raise ArmError(f"the SDF has two joints named {name}")
         names.append(name)
+        last_link = joint.findtext("child", "")
         if joint.get("type") == "prismatic":
             prismatic.add(name)
         if mimic is not None:
@@ -171,7 +174,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     links, frames = (
         frozenset(part.get("name", "") for part in root.findall(f"model/{tag}")) for tag in ("link", "frame")
     )
-    return SdfFacts(tuple(names), mimics, efforts, positions, frozenset(prismatic), links, frames)
+    return SdfFacts(tuple(names), mimics, efforts, positions, frozenset(prismatic), links, frames, last_link)
 
 
 def _read(path: Path, may_convert: bool) -> ElementTree.Element:
@@ -181,7 +184,7 @@ def _read(path: Path, may_convert: bool) -> ElementTree.Element:
     root = read_xml(path)
     tags = [element.tag for element in root.iter() if element.tag in ("model", "include")]
     is_one_model = root.find("model") is not None and tags == ["model"]
-    if may_convert and not (is_one_model and root.find("model/link[@name='base_link']") is not None):
+    if may_convert and not (is_one_model and root.find(f"model/link[@name='{BASE_LINK}']") is not None):
         return _convert(path)
     if not is_one_model:
         raise ArmError(f"{path}: <sdf> must contain exactly one <model>, without a nested <model> or <include>")

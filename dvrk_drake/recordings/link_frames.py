@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ElementTree
 from typing import NamedTuple
 
@@ -12,14 +11,12 @@ from pydrake.multibody.tree import Frame, WeldJoint
 
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import set_arm_positions, shared_plant
+from dvrk_drake.models.plant import dh_frames, set_arm_positions, shared_plant
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.urdf import to_urdf
 
 #: Frame to which the base of the arm is welded.
 WORLD = "world"
-#: Names of the frames of the dVRK's kinematics (Denavit-Hartenberg convention).
-_DH_FRAME = re.compile(r"dh_\d+")
 #: Elements of a URDF for programs that draw the arm.
 _DRAWN = ("link", "joint")
 #: Colour of the links (red, green, blue, alpha), which is visible on a white and on a black background.
@@ -56,10 +53,7 @@ class LinkFrames:
                 self.static.append(self._transform(joint.parent_body().body_frame(), joint.child_body().body_frame()))
             else:
                 self._joints.append(joint)
-        for index in plant.GetFrameIndices(plant.GetBodyByName("base_link").model_instance()):
-            frame = plant.get_frame(index)
-            if _DH_FRAME.fullmatch(frame.name()):
-                self.static.append(self._transform(frame.body().body_frame(), frame))
+        self.static += [self._transform(frame.body().body_frame(), frame) for frame in dh_frames(plant).values()]
 
     def moving(self, q: ArrayLike) -> list[FrameTransform]:
         """Returns the transforms of all moving links at the pose q (n,) of the independent joints [rad, m].

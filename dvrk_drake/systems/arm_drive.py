@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import set_arm_positions
+from dvrk_drake.models.plant import base_body, set_arm_positions
 from dvrk_drake.systems.arm_effects.drive_step import DriveStep
 from dvrk_drake.systems.arm_effects.drive_with_effects import add_drive_with_effects
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
@@ -112,7 +112,7 @@ def add_arm_drive(
         >>> builder.Connect(controller.GetOutputPort("effort"), drive.effort_commanded)
     """
     arm.refuse_locked_joints("a drive")
-    if plant.IsAnchored(plant.GetBodyByName("base_link", instance)):
+    if plant.IsAnchored(base_body(plant, instance)):
         gravity = gravity_at_base(plant, instance)
         if np.linalg.norm(gravity - arm.gravity) > GRAVITY_TOLERANCE:
             expected, found = (", ".join(f"{g:.3f}" for g in vector) for vector in (gravity, arm.gravity))
@@ -132,6 +132,5 @@ def add_arm_drive(
 
 def gravity_at_base(plant: MultibodyPlant, instance: ModelInstanceIndex) -> NDArray[np.float64]:
     """Returns the gravity vector (3,) of a finalized plant in the base frame of an arm at the default pose [m/s^2]."""
-    base = plant.GetFrameByName("base_link", instance)
-    R_WB = base.CalcPoseInWorld(plant.CreateDefaultContext()).rotation()
+    R_WB = base_body(plant, instance).EvalPoseInWorld(plant.CreateDefaultContext()).rotation()
     return np.asarray(R_WB.inverse() @ plant.gravity_field().gravity_vector())

@@ -81,12 +81,12 @@ class Hand(LeafSystem):
     While an input is not finite, the hand exerts no force.
     """
 
-    def __init__(self, arm: Arm, frame_name: str = "dh_7", grip: Grip | None = None, time_step: float = 1e-3) -> None:
+    def __init__(self, arm: Arm, frame_name: str = "", grip: Grip | None = None, time_step: float = 1e-3) -> None:
         """Creates a hand.
 
         Args:
             arm: Arm that the hand moves.
-            frame_name: Name of the frame G in the arm's SDF. The default is the handle of an MTM.
+            frame_name: Name of the frame G in the arm's SDF. Default: `arm.frames.hand`.
             grip: Properties of the grip. None: `Grip()`.
             time_step: Time step h of the plant [s].
 
@@ -201,7 +201,7 @@ class HandPath(LeafSystem):
 
         Args:
             arm: Arm with n joints.
-            frame_name: Name of the frame G in the arm's SDF.
+            frame_name: Name of the frame G in the arm's SDF. If it is empty, the frame is `arm.frames.hand`.
             trajectory: Joint trajectory (n) [rad, m].
 
         Raises:

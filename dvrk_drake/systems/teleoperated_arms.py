@@ -1,4 +1,4 @@
-"""Simulated teleoperation: a hand moves a master arm in gravity compensation, and a PSM follows it."""
+"""Simulated teleoperation: a hand moves a master arm in gravity compensation, and another arm follows it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Hand
-from dvrk_drake.systems.teleoperation import FOLLOWER_FRAME, MASTER_FRAME, Teleoperation
+from dvrk_drake.systems.teleoperation import Teleoperation
 
 #: Viscous friction of the simulated master's joints, divided by their effort limits [s].
 MASTER_DAMPING = 0.03
@@ -39,7 +39,7 @@ class TeleoperatedArms(Diagram):
         - following
         - fault
 
-    `mtml` and `psm` stand for the arms' lower-case names.
+    `mtml` and `psm` are examples: the names are the arms' lower-case names.
 
     - `X_MG_desired` (RigidTransform): desired pose of the master's handle in the master's base, towards which the hand
       pulls. Unconnected: the hand exerts no force.
@@ -65,8 +65,8 @@ class TeleoperatedArms(Diagram):
         """Builds the diagram. The controllers have exact gravity models. The master has viscous joint friction.
 
         Args:
-            master: MTM.
-            follower: PSM.
+            master: Arm that the hand moves, e.g. an MTM.
+            follower: Arm that follows, e.g. a PSM.
             scale: Ratio of the displacements; see `Teleoperation`.
             R_FM: Rotation from the master's base to the follower's base; see `Teleoperation`.
             meshcat: Meshcat in which both arms are drawn, below paths of their lower-case names. `SetTransform` places
@@ -83,7 +83,7 @@ class TeleoperatedArms(Diagram):
         self.teleoperation = builder.AddNamedSystem(
             "teleoperation", Teleoperation(master, follower, scale=scale, R_FM=R_FM)
         )
-        hand = builder.AddNamedSystem("hand", Hand(master, MASTER_FRAME))
+        hand = builder.AddNamedSystem("hand", Hand(master))
 
         M, F = master.name.lower(), follower.name.lower()
         state_M, state_F = (
@@ -119,12 +119,12 @@ class TeleoperatedArms(Diagram):
 
     def CalcX_MG(self, context: Context) -> RigidTransform:
         """Returns the pose of the master's handle in the master's base."""
-        return self._pose(self.master, MASTER_FRAME, context)
+        return self._pose(self.master, context)
 
     def CalcX_FT(self, context: Context) -> RigidTransform:
         """Returns the pose of the follower's tip in the follower's base."""
-        return self._pose(self.follower, FOLLOWER_FRAME, context)
+        return self._pose(self.follower, context)
 
-    def _pose(self, station: ArmStation, frame_name: str, context: Context) -> RigidTransform:
+    def _pose(self, station: ArmStation, context: Context) -> RigidTransform:
         plant_context = station.GetSubsystemContext(station.plant, self.GetSubsystemContext(station, context))
-        return station.plant.GetFrameByName(frame_name).CalcPoseInWorld(plant_context)
+        return station.plant.GetFrameByName(station.arm.frames.hand).CalcPoseInWorld(plant_context)

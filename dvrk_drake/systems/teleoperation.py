@@ -1,4 +1,4 @@
-"""Teleoperation of a patient-side manipulator by a master arm: scaled translation, unscaled rotation, clutch."""
+"""Teleoperation of an arm by a master arm: scaled translation, unscaled rotation, clutch."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from dvrk_drake.dynamics.kinematics import ArmFrame, PsmInverseKinematics
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.plant import make_arm_plant
 
-#: Frames of the master and of the follower. They are the frames of the dVRK's measured_cp, at the wrist centre of the
-#: MTM and at the wrist yaw axis of the PSM.
-MASTER_FRAME, FOLLOWER_FRAME = "dh_7", "dh_6"
-#: Minimum distance [m] of the follower's wrist centre from the remote centre of motion. At the remote centre, yaw and
-#: pitch are singular.
+#: Minimum distance [m] of the end of the follower's shaft beyond the remote centre of motion. At the remote centre, the
+#: joints that rotate the shaft are singular.
 MIN_DEPTH = 0.02
+#: Tolerance of this distance for commanded positions [m], for rounding errors.
+_DEPTH_TOLERANCE = 1e-6
+#: Steps of the inverse kinematics per period. One suffices, because the next period continues.
+_MAX_STEPS = 1
 #: Largest lag of the follower [s]. The allowed position error of a joint is its velocity limit times this lag.
 MAX_LAG = 0.1
 
 
 class Teleoperation(LeafSystem):
-    """Commands a follower (PSM) from the handle of a master (MTM) that an operator moves.
+    """Commands a follower from the handle of a master that an operator moves, e.g. a PSM from an MTM.
 
     .. pydrake_system::
 
@@ -44,14 +45,16 @@ class Teleoperation(LeafSystem):
     - `master_position` (n of the master), `follower_position` (n of the follower): measured joint positions.
     - `engaged` (1): clutch state. Above 0.5, the clutch is closed and the follower follows. On a dVRK, pressing the
       clutch pedal opens the clutch.
-    - `jaw_angle` (1): desired opening of the jaw, e.g. the master's gripper angle. Unconnected: the jaw does not move.
+    - `jaw_angle` (1): desired position of the follower's `separate_joint`, e.g. the master's gripper angle for a jaw.
+      Unconnected: this joint does not move. An arm without this joint ignores the input.
     - `desired_state` (2n of the follower): commanded joint positions, then their rates, for `GravityPidController`.
     - `following` (1): 1 while the follower follows the master, else 0.
     - `fault` (1): 1 while an input is not valid or the follower is not at its commanded position, else 0.
 
     **Control law.** X_MG is the pose of the handle in the master's base. X_FT is the pose of the tip in the follower's
-    base. Both are stored when the clutch closes; the stored poses have the index 0. R_FM is the rotation from the
-    master's to the follower's base, as seen by the operator:
+    base. Handle and tip are the frames `Arm.frames.hand` of both arms. Both poses are stored when the clutch closes;
+    the stored poses have the index 0. R_FM is the rotation from the master's to the follower's base, as seen by the
+    operator:
 
         p_FT = p_FT0 + scale R_FM (p_MG - p_MG0),    R_FT = R_FM R_MG R_MG0' R_FM' R_FT0
 
@@ -59,11 +62,10 @@ class Teleoperation(LeafSystem):
     (The software of the dVRK instead moves the master's wrist to align both orientations. A master in gravity
     compensation has no controller for this motion.)
 
-    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits. Each commanded position
-    then moves towards the clamped position within the velocity limit of the joint. If the inverse kinematics has no
-    solution for a desired pose, e.g. at and above the remote centre of motion, only the jaw moves. If the handle moves
-    beyond a limit, the tip stops at the limit. When the handle returns, the tip moves again as defined by the control
-    law.
+    **Limits.** `ArmFrame.approach` finds joint positions within the limits at which the tip is nearest to the desired
+    pose. Each commanded position moves towards them within the velocity limit of the joint. If the shaft would be drawn
+    into the cannula (see below), only the jaw moves. If the handle moves beyond a limit, the tip stops at the limit.
+    When the handle returns, the tip moves again as defined by the control law.
 
     **Hold.** `desired_state` is constant with zero rates in any of these cases:
 
@@ -71,7 +73,8 @@ class Teleoperation(LeafSystem):
     - A number of an input is not finite, or its magnitude exceeds 1e6.
     - A joint of the follower is farther from its commanded position than its velocity limit times `MAX_LAG`. The jaw is
       not checked, because it may press on an object.
-    - The instrument is inside the cannula, i.e. its wrist centre is less than `MIN_DEPTH` beyond the remote centre.
+    - The instrument is inside the cannula, i.e. the end of its shaft (`Frames.shaft`) is less than `MIN_DEPTH` beyond
+      the remote centre. An arm without these frames has no cannula.
 
     After each of these cases, X_MG and X_FT are stored again, as when the clutch closes. If the follower was moved
     externally while the clutch was open, the command is set to the measured position. Before the first finite
@@ -91,7 +94,7 @@ class Teleoperation(LeafSystem):
         R_FM: RotationMatrix | None = None,
         period: float = 1e-3,
     ) -> None:
-        """Creates the system for a `master` with the frame "dh_7" and a `follower` with the kinematics of a PSM.
+        """Creates the system.
 
         Args:
             master: Arm that the operator moves.
@@ -101,19 +104,23 @@ class Teleoperation(LeafSystem):
             period: Period of the update [s].
 
         Raises:
-            ArmError: The master has no frame "dh_7", or the follower does not have the kinematics of a PSM.
             ControllerError: Scale or period is out of range, or the follower has no velocity limits.
         """
         super().__init__()
         if not (np.isfinite(period) and period > 0):
             raise ControllerError(f"period must be a positive number of seconds; got {period}")
         self._period = float(period)
-        self._master, self._follower = ArmFrame(master, MASTER_FRAME), ArmFrame(follower, FOLLOWER_FRAME)
-        self._inverse = PsmInverseKinematics(follower, FOLLOWER_FRAME, MIN_DEPTH)
+        self._master, self._follower = ArmFrame(master), ArmFrame(follower)
+        frames = follower.frames
+        self._shaft, self._p_remote = None, np.zeros(3)
+        if frames.shaft and frames.remote_center:
+            self._shaft = ArmFrame(follower, frames.shaft)
+            self._p_remote = ArmFrame(follower, frames.remote_center).pose(np.zeros(follower.num_joints)).translation()
         self._R_FM = R_FM or RotationMatrix()
         self._lower, self._upper = follower.position_lower, follower.position_upper
         self._speed = _velocity_limits(follower)
-        self._max_lag = np.where(np.arange(follower.num_joints) < 6, MAX_LAG * self._speed, np.inf)
+        self._is_jaw = np.array([name == follower.separate_joint for name in follower.joint_names])
+        self._max_lag = np.where(self._is_jaw, np.inf, MAX_LAG * self._speed)
 
         n = follower.num_joints
         self.DeclareVectorInputPort(name="master_position", size=master.num_joints)
@@ -155,7 +162,7 @@ class Teleoperation(LeafSystem):
         desired = state.get_mutable_value(_DESIRED)
         q_d, v_d = np.split(desired, 2)  # views
         q_master, q_follower, engaged = (self._read(context, port) for port in range(3))
-        jaw = self._read(context, _JAW) if self.get_input_port(_JAW).HasValue(context) else q_d[6:]
+        jaw = self._read(context, _JAW) if self.get_input_port(_JAW).HasValue(context) else q_d[self._is_jaw]
         is_engaged = engaged[0] > 0.5
 
         lags = not np.all(np.abs(q_follower - q_d) <= self._max_lag)  # also true for NaN
@@ -163,12 +170,14 @@ class Teleoperation(LeafSystem):
             q_d[:] = q_follower
             lags = False
         fault = lags or not (_is_valid(q_master) and _is_valid(jaw) and _is_valid(engaged))
-        inserted = q_d[2] + self._inverse.depth_at_zero >= MIN_DEPTH - 1e-6
-        follows = is_engaged and not fault and inserted
+        depth = self._depth(q_d) if is_engaged and not fault else -np.inf
+        follows = depth >= MIN_DEPTH - _DEPTH_TOLERANCE
         v_d[:] = 0.0
         if follows:
             X_FT = self._target(q_master, q_d, state)
             v_d[:] = self._rates(X_FT, jaw, q_d)
+            if self._depth(q_d + self._period * v_d) < min(MIN_DEPTH, depth):
+                v_d[~self._is_jaw] = 0.0
             q_d += self._period * v_d
         state.get_mutable_value(_FOLLOWING)[0] = float(follows)
         state.get_mutable_value(_FAULT)[0] = float(fault)
@@ -188,10 +197,16 @@ class Teleoperation(LeafSystem):
 
     def _rates(self, X_FT: RigidTransform, jaw: NDArray[np.float64], q_d: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the joint rates (n,) for one period towards the pose and jaw angle, inside all limits."""
-        solution = self._inverse.solve(X_FT, q_d)
-        target = np.concatenate([q_d[:6] if solution is None else solution, jaw])
-        change = np.clip(target, self._lower, self._upper) - q_d
-        return np.clip(change / self._period, -self._speed, self._speed)
+        target = self._follower.approach(X_FT, q_d, _MAX_STEPS)
+        target[self._is_jaw] = np.clip(jaw, self._lower[self._is_jaw], self._upper[self._is_jaw])
+        return np.clip((target - q_d) / self._period, -self._speed, self._speed)
+
+    def _depth(self, q: NDArray[np.float64]) -> float:
+        """Returns the distance of the end of the shaft beyond the remote centre [m]; infinite without a shaft."""
+        if self._shaft is None:
+            return np.inf
+        X_FS = self._shaft.pose(q)
+        return float(X_FS.rotation().col(2) @ (X_FS.translation() - self._p_remote))
 
     def _read(self, context: Context, port: int) -> NDArray[np.float64]:
         vector = self.EvalVectorInput(context, port)

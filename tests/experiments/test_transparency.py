@@ -9,7 +9,6 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.kinematics import handle_frame
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.experiments.transparency import Compensation, random_path, recorded_path, simulate_operator
 from dvrk_drake.models.arm_files import load_arm
@@ -79,7 +78,6 @@ def test_recorded_path_respects_limits_and_speed():
 
 def test_hand_moves_psm_at_its_instrument():
     psm = load_arm("psm")
-    assert (handle_frame(ARM), handle_frame(psm)) == ("dh_7", "dh_6")
     pose = np.clip(0.1, psm.position_lower, psm.position_upper)
     path = PiecewisePolynomial.ZeroOrderHold([0.0, 1.1], np.array([pose, pose]).T)
     assert (

@@ -15,7 +15,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.experiments.scenario import load_scenario
-from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response, band, published_gains, step_size
+from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response, band, step_size
 from dvrk_drake.experiments.tuning.model_based import (
     GAIN_MARGIN,
     MAX_COUNT_EFFORT,
@@ -304,13 +304,6 @@ def test_best_gains_settle_most_often_then_fastest():
     assert comparison.best(settling) == "fast"
     assert comparison.best(["never", "fails", "slow"]) == "slow"
     assert comparison.best(["never", "fails"]) == "fails"
-
-
-def test_published_gains_are_per_second_and_for_mtm():
-    gains = published_gains(load_arm("mtmr"))
-    # One sample of 10 ms with an error of 1 adds Ki to the effort.
-    assert gains.ki[3] * 0.01 == pytest.approx(4e-4)
-    assert published_gains(load_arm("psm")) is None
 
 
 def test_scenario_reads_gains_file(tmp_path):

@@ -11,8 +11,8 @@ from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 from dvrk_drake.systems.ros.crtk_client import other_publishers  # noqa: E402
@@ -145,7 +145,7 @@ def test_client_controls_the_arm(monkeypatch):
     assert [state.is_busy for state in client.reached[before:]] == [True, False]
     client.until(lambda: np.max(np.abs(client.position() - goal)) < 2e-3, "the arm arrives at the goal")
     np.testing.assert_allclose(client.new("setpoint_js").position, goal, rtol=0, atol=1e-12)
-    kinematics = CrtkKinematics(client.arm)
+    kinematics = ArmFrame(client.arm)
     for name in ("measured_cp", "setpoint_cp"):
         p = client.new(name).pose.position
         np.testing.assert_allclose([p.x, p.y, p.z], kinematics.pose(goal).translation(), rtol=0, atol=5e-3)

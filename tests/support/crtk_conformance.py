@@ -57,11 +57,11 @@ class Observer:
     """
 
     def __init__(self, subject, arm):
+        from dvrk_drake.dynamics.kinematics import ArmFrame
         from dvrk_drake.systems.ros import messages
-        from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 
         self.subject, self.arm, self.m, self.found = subject, arm, messages, {}
-        self.kinematics = CrtkKinematics(arm)
+        self.kinematics = ArmFrame(arm)
 
     def wait_for(self, condition, seconds=LONGEST):
         """Waits at most some seconds for a condition. Returns whether it holds."""

@@ -36,14 +36,14 @@ def angle(R):
 class Loop:
     """`Teleoperation` with a follower that reaches each command immediately, unless specified otherwise."""
 
-    def __init__(self, q_follower=Q_F, **arguments):
-        self.system = Teleoperation(MTM, PSM, **arguments)
+    def __init__(self, q_follower=Q_F, q_master=Q_M, arms=(MTM, PSM), **arguments):
+        self.system, self.num_joints = Teleoperation(*arms, **arguments), arms[1].num_joints
         self.context = self.system.CreateDefaultContext()
-        self.inputs = {"master_position": Q_M, "follower_position": q_follower, "engaged": 0.0, "jaw_angle": 0.5}
+        self.inputs = {"master_position": q_master, "follower_position": q_follower, "engaged": 0.0, "jaw_angle": 0.5}
         self.step()
 
     def step(self, follower=None, **inputs):
-        """Runs one update; returns the desired positions (7,) and velocities (7,)."""
+        """Runs one update; returns the desired positions (n,) and velocities (n,)."""
         self.inputs.update(inputs)
         if follower is not None:
             self.inputs["follower_position"] = follower
@@ -53,11 +53,11 @@ class Loop:
         state.SetFrom(self.system.EvalUniquePeriodicDiscreteUpdate(self.context))
         desired = self.system.GetOutputPort("desired_state").Eval(self.context)
         if follower is None and np.all(np.isfinite(desired)):
-            self.inputs["follower_position"] = desired[:7].copy()
-        return desired[:7].copy(), desired[7:].copy()
+            self.inputs["follower_position"] = desired[: self.num_joints].copy()
+        return desired[: self.num_joints].copy(), desired[self.num_joints :].copy()
 
     def move(self, q_master, steps=400):
-        """Moves the master to q_master (7,) in `steps` steps, then waits. Returns the desired positions (m, 7)."""
+        """Moves the master to q_master (n,) in `steps` steps, then waits. Returns the desired positions (m, n)."""
         start = np.array(self.inputs["master_position"])
         positions = [self.step(master_position=start + s * (q_master - start))[0] for s in np.linspace(0, 1, steps)]
         return np.array(positions + [self.step()[0] for _ in range(steps)])

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
+from robot_file import write_robot
 from teleoperation_loop import MTM, PERIOD, PSM, Q_F, Q_M, SPEED, Loop, angle, handle, tip
 
-from dvrk_drake.errors import ArmError, ControllerError
-from dvrk_drake.systems.teleoperation import MAX_LAG, MIN_DEPTH, Teleoperation, _velocity_limits
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.systems.teleoperation import MAX_LAG, MIN_DEPTH, Teleoperation
 
 pytestmark = pytest.mark.numeric
 
@@ -28,6 +30,15 @@ def test_tip_follows_handle_scaled_and_rotated(seed):
     wanted = (handle(q_M).rotation() @ handle(Q_M).rotation().inverse()).matrix()
     assert angle(RotationMatrix(turned)) > 0.05
     np.testing.assert_allclose(turned, R @ wanted @ R.T, atol=1e-9)
+
+
+def test_arm_of_a_urdf_follows_its_twin(tmp_path):
+    """The desired pose is reachable although the arm has three joints, because both arms have the same poses."""
+    arm = load_arm(write_robot(tmp_path))
+    q, goal = np.array([0.2, 0.1, 0.3]), np.array([0.4, 0.15, 0.1])
+    loop = Loop(q, q, (arm, arm), scale=1.0)
+    loop.step(engaged=1.0)
+    np.testing.assert_allclose(loop.move(goal, steps=200)[-1], goal, atol=1e-9)
 
 
 def test_commanded_velocity_is_the_derivative_of_position():
@@ -97,8 +108,8 @@ def test_tip_returns_from_limits_with_the_master(turn):
     q_start = np.array([1.2, -0.7, 0.22, 3.0, 1.0, 1.0, 0.5])
     loop = Loop(q_start, scale=1.0)
     loop.step(engaged=1.0)
-    away = loop.move(Q_M + turn, steps=3000)
-    back = loop.move(Q_M, steps=3000)
+    away = loop.move(Q_M + turn, steps=1500)
+    back = loop.move(Q_M, steps=1500)
     way = np.vstack([away, back])
     assert np.all(way >= PSM.position_lower - 1e-12)
     assert np.all(way <= PSM.position_upper + 1e-12)
@@ -113,10 +124,10 @@ def test_tip_stops_below_remote_centre_and_returns():
     loop.step(engaged=1.0)
     up = np.array([0.1, 1.0, -0.3, 0.2, 1.0, 0.1, 0.3])
     assert handle(up).translation()[2] - handle(Q_M).translation()[2] > 0.1
-    away = loop.move(up, steps=2000)
+    away = loop.move(up, steps=1000)
     assert away[:, 2].min() == pytest.approx(0.0156 + MIN_DEPTH, abs=2e-3)
     assert away[:, 2].min() >= 0.0156 + MIN_DEPTH - 1e-12
-    np.testing.assert_allclose(loop.move(Q_M, steps=2000)[-1], [0, 0, 0.05, 0, 0, 0, 0.5], atol=1e-9)
+    np.testing.assert_allclose(loop.move(Q_M, steps=1000)[-1], [0, 0, 0.05, 0, 0, 0, 0.5], atol=1e-9)
 
 
 def test_instrument_in_its_cannula_does_not_follow():
@@ -207,10 +218,8 @@ def test_scale_out_of_range_is_refused(scale):
 def test_other_invalid_arguments_are_refused():
     with pytest.raises(ControllerError, match="period must be a positive number"):
         Teleoperation(MTM, PSM, period=0.0)
-    with pytest.raises(ArmError, match="MTML does not have the kinematics of a PSM"):
+    with pytest.raises(ControllerError, match="MTML: a joint has no velocity limit"):
         Teleoperation(MTM, MTM)
-    with pytest.raises(ArmError, match='PSM: the SDF has no frame "dh_7"; available frames: dh_0'):
-        Teleoperation(PSM, PSM)
     system = Teleoperation(MTM, PSM)
     with pytest.raises(ControllerError, match="input port master_position is not connected"):
         Simulator(system).Initialize()
@@ -218,5 +227,3 @@ def test_other_invalid_arguments_are_refused():
 
 def test_velocity_limits_come_from_the_sdf():
     assert np.array_equal(Loop().system._speed, SPEED)
-    with pytest.raises(ControllerError, match="no velocity limit"):
-        _velocity_limits(MTM)

@@ -8,10 +8,9 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.models.plant import add_arm, set_arm_positions
+from dvrk_drake.models.plant import add_arm, base_body, set_arm_positions
 
 
 class CollisionDetector:
@@ -41,27 +40,21 @@ class CollisionDetector:
         self._plant_context = self._plant.GetMyMutableContextFromRoot(self._context)
 
     def tip(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the position (3,) of the tip in the base frame at a pose (n,) [m].
-
-        Raises:
-            ExcitationError: The arm file does not name the frame of the tip.
-        """
-        if not self._arm.view.tip:
-            raise ExcitationError(f"{self._arm.name}: the arm file does not name a frame of the tip (view.tip)")
+        """Returns the position (3,) of the tip, the frame `Arm.frames.hand`, in the base frame at a pose (n,) [m]."""
         set_arm_positions(self._plant, self._plant_context, self._arm, pose, self._instance)
-        frame = self._plant.GetFrameByName(self._arm.view.tip, self._instance)
+        frame = self._plant.GetFrameByName(self._arm.frames.hand, self._instance)
         return np.asarray(frame.CalcPoseInWorld(self._plant_context).translation())
 
     def collision(self, pose: NDArray[np.float64]) -> str:
         """Returns the description of the first collision at a pose (n,), or "" if there is none."""
-        plant, inspector = self._plant, self._inspector
+        plant, inspector, base = self._plant, self._inspector, base_body(self._plant, self._instance)
         set_arm_positions(plant, self._plant_context, self._arm, pose, self._instance)
         for pair in self._query_port.Eval(self._graph_context).ComputePointPairPenetration():
             ids = pair.id_A, pair.id_B
             bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in ids]
             bodies.sort(key=lambda body: (body.model_instance() != self._instance, body.name()))
             # The base is mounted at the table or at another object, and objects may touch each other.
-            if all(body.model_instance() != self._instance or body.name() == "base_link" for body in bodies):
+            if all(body.model_instance() != self._instance or body is base for body in bodies):
                 continue
             return f"collision of {' and '.join(map(self._name, bodies))}"
         return ""

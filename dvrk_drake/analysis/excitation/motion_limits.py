@@ -246,10 +246,6 @@ def spectral_derivative(x: NDArray[np.float64], period: float, order: int) -> ND
 
 
 def tip_positions(arm: Arm, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the positions (m, 3) of the tip in the base frame at poses q (m, n) [m].
-
-    Raises:
-        ExcitationError: The arm file does not name the frame of the tip.
-    """
+    """Returns the positions (m, 3) of the tip in the base frame at poses q (m, n) [m], see `CollisionDetector.tip`."""
     detector = CollisionDetector(arm)
     return np.array([detector.tip(pose) for pose in q]).reshape(-1, 3)

@@ -21,10 +21,10 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import Reportable
-from dvrk_drake.models.plant import shared_plant
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 
@@ -438,13 +438,4 @@ def _problem(
 
 def _in_base(arm: Arm, link: str, position: NDArray[np.float64]) -> NDArray[np.float64]:
     """Transforms a position (3,) from the link frame to the base frame, with all joint positions at 0 [m]."""
-    plant = shared_plant(arm)
-    context = plant.CreateDefaultContext()
-    for name, x in zip(arm.tree_joint_names, arm.linkage.position(np.zeros(arm.num_joints)), strict=True):
-        joint = plant.GetJointByName(name)
-        start = joint.position_start()
-        positions = plant.GetPositions(context)
-        positions[start] = x
-        plant.SetPositions(context, positions)
-    X_BL = plant.CalcRelativeTransform(context, plant.GetFrameByName("base_link"), plant.GetFrameByName(link))
-    return np.asarray(X_BL @ position, dtype=float)
+    return np.asarray(ArmFrame(arm, link).pose(np.zeros(arm.num_joints)) @ position, dtype=float)

@@ -16,6 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import moving_bodies
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
@@ -93,27 +94,6 @@ def middle_pose(arm: Arm) -> NDArray[np.float64]:
 def rounded_gains(joints: Iterable[tuple[float, float, float]]) -> Gains:
     """Rounds (kp, kd, ki) of each joint to three digits, as in a gains file."""
     return Gains(*([float(f"{value:.3g}") for value in column] for column in zip(*joints, strict=True)))
-
-
-#: Gains of the joints of an MTM in the paper's simulation (Rutfield, Zia, Boos, Santoso, Sujumnong, WPI 2015), from
-#: the controller node that the team published.
-_PUBLISHED_JOINTS = (
-    *("outer_yaw", "shoulder_pitch", "elbow_pitch"),
-    *("wrist_platform", "wrist_pitch", "wrist_yaw", "wrist_roll"),
-)
-_PUBLISHED_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
-_PUBLISHED_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
-_PUBLISHED_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
-#: Rate of the published controller [Hz]. This controller sums the errors of all samples, so a published Ki of 1 equals
-#: 100 N m/(rad s).
-_PUBLISHED_RATE = 100.0
-
-
-def published_gains(arm: Arm) -> Gains | None:
-    """Returns the published gains with Ki in N m/(rad s). Returns None for an arm without the joints of an MTM."""
-    if arm.joint_names != _PUBLISHED_JOINTS:
-        return None
-    return Gains(list(_PUBLISHED_KP), list(_PUBLISHED_KV), [_PUBLISHED_RATE * ki for ki in _PUBLISHED_KI])
 
 
 #: Period of the controller and step of the plant [s].
@@ -225,9 +205,7 @@ def _scaled_links(plant: MultibodyPlant, factor: float) -> dict[str, SpatialIner
     """Returns the inertias of the links scaled by `factor`, or an empty dict for a factor of 1."""
     if factor == 1.0:
         return {}
-    instance = plant.GetBodyByName("base_link").model_instance()
-    links = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
-    inertias = {link.name(): link.default_spatial_inertia() for link in links if link.name() != "base_link"}
+    inertias = {link.name(): link.default_spatial_inertia() for link in moving_bodies(plant)}
     return {
         name: SpatialInertia(factor * M.get_mass(), M.get_com(), M.get_unit_inertia()) for name, M in inertias.items()
     }

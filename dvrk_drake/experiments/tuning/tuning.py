@@ -18,7 +18,6 @@ from dvrk_drake.experiments.tuning.bench import (
     Response,
     band,
     bench_of,
-    published_gains,
     rounded_gains,
     step_size,
     tuning_poses,
@@ -184,8 +183,8 @@ def tune_arm(
     arm = load_arm(name)
     share = PROCEDURE_SHARE if "paper" in methods else 0.0
     gains = {OWN: arm.gains}
-    if (published := published_gains(arm)) is not None:
-        gains[PUBLISHED] = published
+    if arm.published_gains.kp:
+        gains[PUBLISHED] = arm.published_gains
     procedure = design = None
     with local_executor() as executor:
         if "paper" in methods:

@@ -16,7 +16,7 @@ from dvrk_drake.experiments.reproduction.mechanisms import (
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM, TABLE_1
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.plant import base_body, make_arm_plant
 from dvrk_drake.reports.figures.colours import FITTED, REFERENCE
 from dvrk_drake.reports.reproduction.drift import plot_largest_drifts
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
@@ -154,4 +154,4 @@ def _facts() -> ResultTable:
 
 
 def _instance(plant: MultibodyPlant) -> str:
-    return plant.GetModelInstanceName(plant.GetBodyByName("base_link").model_instance())
+    return plant.GetModelInstanceName(base_body(plant).model_instance())

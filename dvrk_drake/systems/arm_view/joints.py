@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import Joint
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import set_arm_positions, shared_plant
+from dvrk_drake.models.plant import main_frames, set_arm_positions, shared_plant
 
 
 class ArmJoints:
     """Poses of joints and frames in the base frame, at the last pose that was set.
 
     Attributes:
-        frame_names: SDF frames to draw. These are the frames dh_0, dh_1, ... of the dVRK's DH convention. For an SDF
-            without such frames, they are the base link and the links that the independent joints move.
+        frame_names: SDF frames to draw, see `main_frames`.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -26,10 +23,7 @@ class ArmJoints:
         self._arm, self._plant = arm, shared_plant(arm)
         self._context = self._plant.CreateDefaultContext()
         self._joints = [self._plant.GetJointByName(name) for name in arm.joint_names]
-        instance = self._joints[0].model_instance()
-        names = [self._plant.get_frame(index).name() for index in self._plant.GetFrameIndices(instance)]
-        dh = sorted((name for name in names if re.fullmatch(r"dh_\d+", name)), key=lambda name: int(name[3:]))
-        self.frame_names = dh or ["base_link", *(joint.child_body().name() for joint in self._joints)]
+        self.frame_names = main_frames(arm)
 
     def set_positions(self, q: ArrayLike) -> None:
         """Sets the pose q (n,) [rad, m]."""

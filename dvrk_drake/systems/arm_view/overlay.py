@@ -90,9 +90,9 @@ class ArmOverlay:
         self._frames = FrameAxes(self._joints, self._scene, _AXIS * size)
         self._ghosts: dict[str, GhostArm] = {}
         self._shows_names, self._shows_efforts, self._has_legend = False, False, legend
-        rcm = arm.view.remote_center
+        rcm = arm.frames.remote_center
         self._rcm = RemoteCenter(self._joints, self._scene, rcm, _RCM * size) if rcm else None
-        self._trace = TipTrace(self._joints, self._scene, arm.view.tip) if arm.view.tip else None
+        self._trace = TipTrace(self._joints, self._scene, arm.frames.hand)
         self._scene.set_visible("names", False)
         self._legend_drawn = False
         self._tracked = RigidTransform()
@@ -140,8 +140,7 @@ class ArmOverlay:
                 ghost.hide(time)
         self._efforts.move(time, self._scale)
         self._frames.move(time, self._scale)
-        if self._trace is not None:
-            self._trace.draw()
+        self._trace.draw()
         self._draw_names()
 
     def set_phase(self, text: str, time: float | None = None) -> None:
@@ -176,8 +175,7 @@ class ArmOverlay:
 
     def clear_trace(self) -> None:
         """Deletes the trace of the tip."""
-        if self._trace is not None:
-            self._trace.clear()
+        self._trace.clear()
 
     @property
     def camera_presets(self) -> tuple[str, ...]:

@@ -10,15 +10,17 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.ros.crtk_joint_group import JointGroup
 
 State = Literal["DISABLED", "ENABLED", "PAUSED", "FAULT"]
-#: Function that returns the joint positions (n,) for a commanded pose and the present set-point (n,), or None if the
-#: arm cannot reach the pose.
-Inverse = Callable[[Sequence[float], NDArray[np.float64]], NDArray[np.float64] | None]
+#: Function that returns the joint positions (n,) for a commanded pose of the tool in the base frame and the present
+#: set-point (n,), or None if the arm cannot reach the pose.
+Inverse = Callable[[RigidTransform, NDArray[np.float64]], NDArray[np.float64] | None]
 
 _STATE_COMMANDS = ("enable", "disable", "pause", "resume", "home", "unhome")
 #: Mapping from each command of joints to its values, for messages.
@@ -244,7 +246,9 @@ class CrtkArmState:
         if not (is_plausible and abs(np.linalg.norm(pose[3:]) - 1.0) < _QUATERNION_TOLERANCE):
             return f"the pose must have finite numbers below {IMPLAUSIBLE:g} and a unit quaternion"
         n = len(self._effort_limits)
-        q = None if self._inverse is None else self._inverse(pose, self.desired_state[:n])
+        x, y, z, w = np.asarray(pose[3:], float) / np.linalg.norm(pose[3:])
+        X_BT = RigidTransform(Quaternion(wxyz=[w, x, y, z]), pose[:3])
+        q = None if self._inverse is None else self._inverse(X_BT, self.desired_state[:n])
         if q is None:
             return "the arm cannot reach the pose from the present set-point"
         self._main.servo_jp(q[self._main.joints])

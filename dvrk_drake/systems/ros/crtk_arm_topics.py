@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.ros.crtk_arm_state import ArmValues, CrtkArmState, CrtkCommand
-from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.messages import (
     Bool,
@@ -44,7 +44,7 @@ class CrtkArmTopics:
     published when it changes.
     """
 
-    def __init__(self, arm: Arm, namespace: str, domain: RosDomain, kinematics: CrtkKinematics) -> None:
+    def __init__(self, arm: Arm, namespace: str, domain: RosDomain, tool: ArmFrame) -> None:
         """Creates the topics.
 
         Args:
@@ -52,9 +52,10 @@ class CrtkArmTopics:
                 measured only, at the angle 0.
             namespace: Namespace of the topics, e.g. "/MTML".
             domain: ROS domain.
-            kinematics: Kinematics of the arm.
+            tool: Frame whose poses are published, in the base frame: `Arm.frames.hand`. A dVRK can add the pose of the
+                base on its cart, and an instrument can add an offset of the tool tip.
         """
-        self._kinematics = kinematics
+        self._tool = tool
         self._base = f"{namespace.rpartition('/')[2]}_base"
         jaw = arm.separate_joint
         self._main = [i for i, name in enumerate(arm.joint_names) if name != jaw]
@@ -135,11 +136,11 @@ class CrtkArmTopics:
         if name == "setpoint_js":
             return self._joint_state(header, self._main, values.setpoint_q, values.setpoint_v, values.setpoint_effort)
         if name == "measured_cp":
-            return _pose(header, self._kinematics.pose(values.q))
+            return _pose(header, self._tool.pose(values.q))
         if name == "setpoint_cp":
-            return _pose(header, self._kinematics.pose(values.setpoint_q))
+            return _pose(header, self._tool.pose(values.setpoint_q))
         if name == "measured_cv":
-            V = self._kinematics.velocity(values.q, values.v).tolist()
+            V = (self._tool.jacobian(values.q) @ values.v).tolist()
             return TwistStamped(header, Twist(Vector3(*V[3:]), Vector3(*V[:3])))
         if name == "gravity_compensation/setpoint_js":
             return self._joint_state(header, self._main, effort=values.gravity_effort)

@@ -10,12 +10,12 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.ros.crtk_arm_state import ArmValues, CrtkArmState, CrtkCommand
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
-from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
@@ -174,13 +174,13 @@ class SimCrtkDriver(Diagram):
         """
         super().__init__()
         model = model or driver.load_model(arm) or IdentifiedModel.from_arm(arm)
-        kinematics = CrtkKinematics(arm)
-        machine = CrtkArmState(arm, gravity_compensation=driver.gravity_compensation, inverse=kinematics.inverse)
+        tool = ArmFrame(arm)
+        machine = CrtkArmState(arm, gravity_compensation=driver.gravity_compensation, inverse=tool.solve)
         topics = None
         if domain is not None:
             from dvrk_drake.systems.ros.crtk_arm_topics import CrtkArmTopics
 
-            topics = CrtkArmTopics(arm, driver.arm_namespace(arm), domain, kinematics)
+            topics = CrtkArmTopics(arm, driver.arm_namespace(arm), domain, tool)
         builder = DiagramBuilder()
         self._server = builder.AddNamedSystem("server", CrtkArmServer(arm, machine, driver.rate, topics, report))
         controller = builder.AddNamedSystem("position_controller", GravityPidController(model, period=PERIOD))

@@ -189,5 +189,5 @@ def test_unknown_frames_in_the_arm_file_are_refused(tmp_path):
     (tmp_path / "mechanism.yaml").write_text(mechanism)
     arm = (MODELS_FOLDER / "arms/psm.yaml").read_text().replace("mechanism: psm", "mechanism: mechanism.yaml")
     (tmp_path / "arm.yaml").write_text(arm)
-    with pytest.raises(ArmError, match=r"view\.remote_center: the SDF has no frame dh_x"):
+    with pytest.raises(ArmError, match=r"frames\.remote_center: the SDF has no frame dh_x"):
         load_arm(tmp_path / "arm.yaml")

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.ros.crtk_arm_state import CrtkArmState, CrtkCommand
@@ -225,7 +226,7 @@ def test_servo_cp_uses_the_inverse_kinematics():
     bench = Bench(PSM, inverse=inverse)
     bench.home()
     bench.step(CrtkCommand("servo_cp", (0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)))
-    assert poses[0][0] == (0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)
+    assert poses[0][0].IsExactlyEqualTo(RigidTransform([0.1, 0.2, 0.3]))
     np.testing.assert_allclose(bench.machine.desired_state[:7], [0.2] * 6 + [0.0], rtol=0, atol=1e-12)
     for wrong in ([0.0] * 7, [math.nan, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1e9], [0] * 6):
         bench.step(CrtkCommand("servo_cp", wrong))

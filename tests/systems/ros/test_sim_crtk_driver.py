@@ -6,13 +6,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ModelError, StationError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
-from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 from dvrk_drake.systems.ros.sim_crtk_driver import SimCrtkDriver
 
 pytestmark = pytest.mark.drake_api
@@ -160,7 +160,7 @@ def test_jaw_has_a_control_mode_of_its_own():
 def test_servo_cp_moves_the_last_frame(name):
     simulated = Simulated(name)
     q = simulated.home()
-    kinematics = CrtkKinematics(simulated.arm)
+    kinematics = ArmFrame(simulated.arm)
     X = kinematics.pose(q)
     r = X.rotation().ToQuaternion()
     p = X.translation() + np.array([0.01, -0.005, 0.008])

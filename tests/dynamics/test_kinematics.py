@@ -1,22 +1,17 @@
-"""Cartesian pose, velocity and inverse kinematics of the simulated dVRK arm, against Drake and known positions."""
+"""Pose, velocity and inverse kinematics of the hand frame, against Drake and known positions."""
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
+from robot_file import write_robot
 
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
-from dvrk_drake.systems.ros.crtk_kinematics import CrtkKinematics
 
 pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
 
 ARMS = ("mtml", "mtmr", "psm")
-
-
-def numbers(X):
-    """Returns x, y, z and the quaternion x, y, z, w of a pose."""
-    rotation = X.rotation().ToQuaternion()
-    return [*X.translation(), rotation.x(), rotation.y(), rotation.z(), rotation.w()]
 
 
 @pytest.mark.parametrize(
@@ -30,7 +25,7 @@ def numbers(X):
     ],
 )
 def test_known_positions(name, q, p):
-    np.testing.assert_allclose(CrtkKinematics(load_arm(name)).pose(np.array(q, float)).translation(), p, atol=1e-12)
+    np.testing.assert_allclose(ArmFrame(load_arm(name)).pose(np.array(q, float)).translation(), p, atol=1e-12)
 
 
 def dh(theta, a, alpha, d, modified):
@@ -70,7 +65,7 @@ TOOL = {"psm": RigidTransform(RotationMatrix(np.array([[0.0, -1, 0], [0, 0, 1], 
 @pytest.mark.parametrize("name", TABLES)
 def test_pose_is_the_product_of_the_dh_table(name):
     arm = load_arm(name)
-    kinematics = CrtkKinematics(arm)
+    kinematics = ArmFrame(arm)
     for q in arm.sample_poses(20, np.random.default_rng(0)):
         X = RigidTransform()
         tool = TOOL.get(name, RigidTransform())
@@ -83,7 +78,7 @@ def test_pose_is_the_product_of_the_dh_table(name):
 @pytest.mark.parametrize("name", ARMS)
 def test_pose_is_that_of_drake_and_velocity_is_its_derivative(name):
     arm, generator = load_arm(name), np.random.default_rng(0)
-    kinematics, plant = CrtkKinematics(arm), make_arm_plant(arm)
+    kinematics, plant = ArmFrame(arm), make_arm_plant(arm)
     context, frame = plant.CreateDefaultContext(), plant.GetFrameByName("dh_6" if name == "psm" else "dh_7")
     for q in arm.sample_poses(20, generator):
         set_arm_positions(plant, context, arm, q)
@@ -93,30 +88,39 @@ def test_pose_is_that_of_drake_and_velocity_is_its_derivative(name):
         ahead, behind = kinematics.pose(q + h * v), kinematics.pose(q - h * v)
         rotation = ahead.rotation().multiply(behind.rotation().inverse()).ToAngleAxis()
         V = np.concatenate([rotation.angle() * rotation.axis(), ahead.translation() - behind.translation()]) / (2 * h)
-        np.testing.assert_allclose(kinematics.velocity(q, v), V, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(kinematics.jacobian(q) @ v, V, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ARMS)
 def test_inverse_finds_near_poses_within_the_limits(name):
     arm, generator = load_arm(name), np.random.default_rng(2)
-    kinematics = CrtkKinematics(arm)
+    kinematics = ArmFrame(arm)
     lower, upper = arm.position_lower.copy(), arm.position_upper
     if name == "psm":
         lower[2] = 0.03  # at the remote centre of motion, yaw and pitch are not determined
     for q in generator.uniform(lower, upper, (100, 7)):
         goal = np.clip(q + 0.1 * generator.uniform(lower - upper, upper - lower), lower, upper)
         X = kinematics.pose(goal)
-        found = kinematics.inverse(numbers(X), q)
+        found = kinematics.solve(X, q)
         assert found is not None and np.all((found >= arm.position_lower) & (found <= upper))
         np.testing.assert_allclose(kinematics.pose(found).GetAsMatrix4(), X.GetAsMatrix4(), rtol=0, atol=2e-7)
-        same = kinematics.inverse(numbers(kinematics.pose(q)), q)
+        same = kinematics.solve(kinematics.pose(q), q)
         np.testing.assert_allclose(same, q, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ARMS)
 def test_unreachable_poses_are_refused(name):
     arm = load_arm(name)
-    kinematics, q = CrtkKinematics(arm), np.clip(0.1, arm.position_lower, arm.position_upper)
-    pose = numbers(kinematics.pose(q))
+    kinematics, q = ArmFrame(arm), np.clip(0.1, arm.position_lower, arm.position_upper)
+    R = kinematics.pose(q).rotation()
     for far in ([1.0, 1.0, 1.0], [0.0, 0.0, 1e5]):
-        assert kinematics.inverse([*far, *pose[3:]], q) is None
+        assert kinematics.solve(RigidTransform(R, far), q) is None
+
+
+def test_hand_frame_of_a_urdf_is_its_last_link_or_stated(tmp_path):
+    arm = load_arm(write_robot(tmp_path))
+    (tmp_path / "crane.yaml").write_text("sdf: crane.urdf\nframes: {hand: tip}\n")
+    q = np.array([0.2, 0.1, 0.3])
+    X_BH, X_BT = ArmFrame(arm).pose(q), ArmFrame(load_arm(tmp_path / "crane.yaml")).pose(q)
+    assert arm.frames.hand == "hand"
+    np.testing.assert_allclose((X_BH.inverse() @ X_BT).translation(), [0.1, 0, 0], atol=1e-12)
