@@ -9,7 +9,7 @@ from dvrk_drake.models.schema_fault import within
 
 #: Allowed ranges of estimates, standard errors and efforts. They detect wrong units and misplaced decimal points (see
 #: docs/number_ranges.md), and are wide because parameters that a recording does not identify can have any value.
-ESTIMATES = within(-1e5, 1e5, "kg, kg m or kg m^2")
+ESTIMATES = within(-1e9, 1e9, "kg, kg m or kg m^2")
 STANDARD_ERRORS = within(0.0, 1e9)
 RMS_EFFORTS = within(0.0, 1e6, "N m or N")
 #: Ranges from 0 to 1 and from -1 to 1, with a tolerance for rounding.
@@ -69,7 +69,7 @@ class RotorEstimate:
     """Inertia of a motor's rotor in actuator coordinates [kg m^2; kg for a prismatic actuator]."""
 
     actuator: str = ""
-    value: float = field(default=0.0, metadata=within(0.0, 1e4, "kg m^2 or kg"))
+    value: float = field(default=0.0, metadata=within(0.0, 1e9, "kg m^2 or kg"))
     standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
 
 

@@ -15,6 +15,7 @@ from dvrk_drake.models.arm_schema import (
     COUPLINGS,
     EFFORTS,
     GRAVITIES,
+    POSITIONS,
     CoupledLimit,
     Frames,
     Gains,
@@ -27,7 +28,7 @@ from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.immutable import cached, immutable
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault
 
 #: Maximum norm of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0
@@ -95,8 +96,8 @@ class Arm:
     tree_joint_names: tuple[str, ...]
     sdf: tuple[str, ...]
     mirrored_links: dict[str, tuple[str, ...]]
-    position_lower: NDArray[np.float64] = field(metadata=within(-12.6, 12.6, "rad or m"))
-    position_upper: NDArray[np.float64] = field(metadata=within(-12.6, 12.6, "rad or m"))
+    position_lower: NDArray[np.float64] = field(metadata=POSITIONS)
+    position_upper: NDArray[np.float64] = field(metadata=POSITIONS)
     effort_limits: NDArray[np.float64] = field(metadata={RANGE: EFFORTS})
     prismatic: NDArray[np.bool_]
     coupled_limits: tuple[CoupledLimit, ...]
@@ -110,11 +111,11 @@ class Arm:
     effects: ArmEffects
     separate_joint: str = ""
     console_gravity_compensation: bool = False
-    locked_joints: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
+    locked_joints: dict[str, float] = field(default_factory=dict, metadata=POSITIONS)
     frames: Frames = field(default_factory=Frames)
     view: ViewSettings = field(default_factory=ViewSettings)
     published_gains: Gains = field(default_factory=Gains)
-    position_offsets: dict[str, float] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
+    position_offsets: dict[str, float] = field(default_factory=dict, metadata=POSITIONS)
 
     def __post_init__(self) -> None:
         for part in dataclasses.fields(self):

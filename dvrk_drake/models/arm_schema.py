@@ -14,22 +14,25 @@ from dvrk_drake.models.immutable import Shared
 from dvrk_drake.models.schema_fault import RANGE, Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
-#: Accepted position limits of a joint. The roll joint of an MTM reaches -8.4 rad, and the joints of a UR10e reach 6.3
-#: rad.
-ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-2.0, 2.0, "m")
+#: Accepted position limits of a joint. Two turns in each direction suffice for a joint with stops: the roll joint of an
+#: MTM reaches -8.4 rad, and the joints of a UR10e reach 6.3 rad. Joints without stops get the two turns. The ranges do
+#: not depend on the arm, because they detect limits in degrees, and in mm: no gantry is longer than 30 m.
+ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-30.0, 30.0, "m")
 #: Accepted differences between the upper and the lower position limit of a joint.
-ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 2.0, "m")
+ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 30.0, "m")
+#: Accepted positions of a joint of unknown type. `Arm` checks the limits of a joint with the range of its type.
+POSITIONS = within(TRAVELS.low, TRAVELS.high, "rad or m")
+#: Largest accepted absolute value of positions, velocities and efforts in inputs and recordings [rad, m, rad/s, m/s, N
+#: m, N]. No arm reaches this value in any of these units. Products of smaller numbers with gains remain finite.
+IMPLAUSIBLE = 1e6
 #: Accepted effort limits of a joint. Examples: 0.023 N m for the roll joint of an MTM, 330 N m for the shoulder of a
-#: UR10e.
-EFFORTS = Range(0.001, 2000.0, "N m or N")
+#: UR10e, 1e6 N for a cylinder of an excavator.
+EFFORTS = Range(0.001, IMPLAUSIBLE, "N m or N")
 #: Accepted position limits in files, for both joint types. `Arm` checks the narrower range `ANGLES` or `TRAVELS`.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
 #: Accepted coefficients between joint and actuator positions. Examples: 0.6 to 1.6 for a dVRK, 32 to 48 for the gears
 #: of a TX40.
 COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
-#: Largest accepted absolute value of positions, velocities and efforts in inputs and recordings [rad, m, rad/s, m/s, N
-#: m, N]. No arm reaches this value in any of these units. Products of smaller numbers with gains remain finite.
-IMPLAUSIBLE = 1e6
 #: Accepted components of the gravity vector. `Arm` additionally checks the norm of the vector.
 GRAVITIES = within(-30.0, 30.0, "m/s^2")
 _CUT_OFFS = within(0.1, 1000.0, "Hz")
@@ -60,9 +63,9 @@ class Gains(Shared):
     The ranges in this class apply to all arms. `Arm.gains_fault` checks the narrower ranges of one arm.
     """
 
-    kp: list[float] = field(default_factory=list, metadata=within(1e-5, 1e7, "N m/rad or N/m"))
-    kd: list[float] = field(default_factory=list, metadata=within(1e-8, 1e6, "N m s/rad or N s/m", also=(0.0,)))
-    ki: list[float] = field(default_factory=list, metadata=within(1e-8, 1e8, "N m/(rad s) or N/(m s)", also=(0.0,)))
+    kp: list[float] = field(default_factory=list, metadata=within(1e-5, 1e9, "N m/rad or N/m"))
+    kd: list[float] = field(default_factory=list, metadata=within(1e-8, 1e8, "N m s/rad or N s/m", also=(0.0,)))
+    ki: list[float] = field(default_factory=list, metadata=within(1e-8, 1e9, "N m/(rad s) or N/(m s)", also=(0.0,)))
 
 
 @dataclass
@@ -98,8 +101,8 @@ class MotionSettings(Shared):
 class BoxCorners(Shared):
     """Axis-aligned box in a link frame, given by its lower and upper corners (3,) [m]."""
 
-    lower: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
-    upper: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
+    lower: list[float] = field(default_factory=list, metadata=within(-50.0, 50.0, "m"))
+    upper: list[float] = field(default_factory=list, metadata=within(-50.0, 50.0, "m"))
 
 
 @dataclass

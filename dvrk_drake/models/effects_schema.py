@@ -141,7 +141,7 @@ class ArmEffects(Shared):
     springs: list[DriveEffect] = field(default_factory=list)
     stops: bool = False
     stretch: dict[str, Cable] = field(default_factory=dict)
-    saturation: dict[str, float] = field(default_factory=dict, metadata=within(0.001, 2000.0, "N m or N"))
+    saturation: dict[str, float] = field(default_factory=dict, metadata=within(0.001, 1e6, "N m or N"))
     encoder: EncoderEffect | None = None
     effort: EffortEffect | None = None
     delay: DelayEffect | None = None

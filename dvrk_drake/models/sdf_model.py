@@ -7,10 +7,11 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm_schema import EFFORTS
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.model_file import MODEL_SUFFIXES, convert_model
 from dvrk_drake.models.schema_fault import Range
@@ -23,8 +24,9 @@ _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
 _LENGTHS = Range(1e-6, 10.0, "m")
 #: Mapping from an element or attribute to the range of its numbers. The links of a dVRK have masses of 1 g to 10 kg,
-#: those of a UR10e up to 13 kg. All these links are shorter than 1 m. -1 and 0 denote unspecified limits of velocity or
-#: effort.
+#: those of a UR10e up to 13 kg. All these links are shorter than 1 m. The ranges of `_SIZE_EXPONENTS` grow with the
+#: arm. The other ranges do not, because they detect typing errors such as degrees in place of radians. -1 and 0 denote
+#: unspecified limits of velocity or effort.
 _RANGES = {
     "mass": Range(1e-6, 200.0, "kg"),
     **{f"i{axis}": _MOMENTS for axis in ("xx", "yy", "zz")},
@@ -34,7 +36,7 @@ _RANGES = {
     "lower": Range(-1000.0, 1000.0, "rad or m", also=_NO_LIMIT),
     "upper": Range(-1000.0, 1000.0, "rad or m", also=_NO_LIMIT),
     "velocity": Range(1e-3, 100.0, "rad/s or m/s", also=(-1.0, 0.0, math.inf)),
-    "effort": Range(1e-3, 2000.0, "N m or N", also=(-1.0, 0.0)),
+    "effort": replace(EFFORTS, also=(-1.0, 0.0)),
     "damping": Range(0.0, 1000.0, "N m s/rad or N s/m"),
     "scale": Range(1e-6, 1e4, either_sign=True),
     **dict.fromkeys(("radius", "length", "size"), _LENGTHS),
@@ -42,6 +44,15 @@ _RANGES = {
     f"{DRAKE}gear_ratio": Range(1e-3, 1e4, either_sign=True),
     "multiplier": Range(1e-3, 1e3, also=(0.0,), either_sign=True),
     "offset": Range(-12.6, 12.6, "rad or m"),
+}
+#: Largest effort limit of an arm [N m, N] for which the ranges are as stated. If an arm is k times as large in all
+#: directions, its efforts are k^4 times as large, and the upper bounds of these elements grow with these powers of k.
+_USUAL_EFFORT = 2000.0
+_SIZE_EXPONENTS = {
+    **dict.fromkeys(("pose", "radius", "length", "size"), 1),
+    "mass": 3,
+    "damping": 4,
+    **dict.fromkeys(("ixx", "iyy", "izz", "ixy", "ixz", "iyz", f"{DRAKE}rotor_inertia"), 5),
 }
 #: Ranges of the angles of a pose (roll, pitch, yaw) in radians and degrees.
 _POSE_ANGLES, _POSE_DEGREES = Range(-12.6, 12.6, "rad"), Range(-720.0, 720.0, "degrees")
@@ -219,6 +230,8 @@ def _converted(path: Path, state: tuple[int, int]) -> ElementTree.Element:
 
 def _check_numbers(path: Path, root: ElementTree.Element) -> None:
     """Raises ArmError for a number that is invalid, not finite or outside its range in `_RANGES`."""
+    efforts = [_number(effort.text or "") for effort in root.iterfind("model/joint/axis/limit/effort")]
+    size = max([1.0, *(effort / _USUAL_EFFORT for effort in efforts if effort in EFFORTS)]) ** 0.25
     for part in root.iterfind("model/*"):
         for element in part.iter():
             texts = [(element.tag, f"<{element.tag}>", element.text)] if element.tag in _RANGES else []
@@ -226,16 +239,20 @@ def _check_numbers(path: Path, root: ElementTree.Element) -> None:
                 texts = [(name, name, element.get(name, "1")) for name in ("multiplier", "offset")]
             for name, what, text in texts:
                 where = f"{path}: {part.tag} {part.get('name')}: {what.replace(DRAKE, 'drake:')}"
-                for value, allowed in zip(*_numbers_of(where, name, text or "", element), strict=True):
+                for value, allowed in zip(*_numbers_of(where, name, text or "", element, size), strict=True):
                     if fault := allowed.fault(where, value):
                         raise ArmError(fault)
 
 
-def _numbers_of(where: str, name: str, text: str, element: ElementTree.Element) -> tuple[list[float], list[Range]]:
-    """Returns the numbers of an element or attribute, and the range of each."""
+def _numbers_of(
+    where: str, name: str, text: str, element: ElementTree.Element, size: float
+) -> tuple[list[float], list[Range]]:
+    """Returns the numbers of an element or attribute, and the range of each for the size of the arm."""
     counts = _COUNTS.get(name, (1,))
     values = [_number(word) for word in text.split()]
-    allowed = [_RANGES[name]] * len(values)
+    factor, usual = size ** _SIZE_EXPONENTS.get(name, 0), _RANGES[name]
+    # Ranges that begin above 0 begin at a rounding error, which does not depend on the size.
+    allowed = [replace(usual, low=min(usual.low, factor * usual.low), high=factor * usual.high)] * len(values)
     if name == "pose":
         allowed[3:] = [_POSE_DEGREES if is_in_degrees(element) else _POSE_ANGLES] * len(values[3:])
     are_numbers = all(math.isfinite(v) or v in a for v, a in zip(values, allowed, strict=True))

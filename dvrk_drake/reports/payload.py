@@ -16,7 +16,6 @@ from dvrk_drake.analysis.payload.payload import (
     contradicting_links,
     equally_good_links,
 )
-from dvrk_drake.analysis.payload.point_mass import MAX_MASS
 from dvrk_drake.models.locked_joints import locked_option
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -124,7 +123,7 @@ def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
         first = elsewhere[0]
         share = f"{100 * first.relative_error:.1f} %"
         return answer + f"A payload on {first.link} explains the change of the efforts (cross-validated error {share})."
-    if payload.largest_at_com > MAX_MASS:
+    if payload.largest_at_com > payload.max_mass:
         return answer + "With this motion, a payload at the centre of mass of the link cannot be detected."
     largest = f"{1e3 * payload.largest_at_com:.3g} g ({100 * CONFIDENCE:.0f} %)"
     return answer + f"The mass of a payload at the centre of mass of the link is below {largest}."

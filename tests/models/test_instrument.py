@@ -73,7 +73,7 @@ def test_custom_instrument_is_simulated_without_self_collision(folder, name):
     ("limits", "message"),
     [
         ("[0.0, .nan]", r"is nan; allowed: a finite number"),
-        ("[0.0, 240]", r"\[1\] is 240; allowed: -2\.\.2 m; is it in mm\?"),
+        ("[0.0, 240]", r"\[1\] is 240; allowed: -30\.\.30 m; is it in mm\?"),
         ("[0.2]", r"is \[0\.2\]; allowed: \[lower, upper\]"),
     ],
 )

@@ -15,10 +15,12 @@ from dvrk_drake.recordings.recording import MAX_MOTION_STEP, Recording
 
 #: Largest number of poses at which efforts are compared with the gravity of the SDF model. It limits the time to 30 ms.
 MAX_COMPARED = 500
-#: Smallest RMS gravity effort of the SDF model [N m], [N], and its smallest share of the measured RMS effort, for a
-#: check of the sign. The torque of a cable can exceed a smaller gravity effort. Half or twice these values changes no
-#: finding on the public recordings.
-MIN_GRAVITY, GRAVITY_SHARE = (0.1, 1.0), 0.5
+#: Smallest RMS gravity effort of the SDF model for a check of the sign, as a share of the measured RMS effort.
+GRAVITY_SHARE = 0.5
+#: Gravity must also exceed the effects of the drive, because the torque of a cable can exceed a smaller gravity effort.
+#: The share of the effort limit is for effects that the arm file does not state. In joints of an MTM and a PSM, a
+#: gravity effort above the other shares of the largest effort limit (revolute, prismatic joints) exceeds all effects.
+EFFECTS_SHARE, SUFFICIENT_SHARE = 0.02, (0.03, 0.1)
 #: An effort has the wrong sign if its regression coefficient on gravity is more than `MIN_ERRORS` standard errors below
 #: 0, and if the correlation of effort and gravity is below minus this number. Half or twice the value changes no
 #: finding on the public recordings.
@@ -61,7 +63,7 @@ def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool
     if recording.coordinates == "actuator":
         gravity = arm.transmission.inverse.pull_back_effort(gravity)
     findings = []
-    for j, least in enumerate(arm.per_joint(*MIN_GRAVITY)):
+    for j, least in enumerate(_least_gravity(arm)):
         use = usable[rows, j]
         if np.sum(use) >= MIN_POSES and np.sqrt(np.mean(gravity[use, j] ** 2)) >= least:
             correlation = _significant_correlation(gravity[use, j], tau[use, j])
@@ -73,6 +75,17 @@ def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool
                 )
                 findings.append(Finding("refusal", "effort sign", arm.joint_names[j], what, advice, (j,), correlation))
     return findings
+
+
+def _least_gravity(arm: Arm) -> NDArray[np.float64]:
+    """Returns the RMS gravity efforts (n,) from which the sign of an effort is checked [N m, N]."""
+    effects = arm.dry_friction() + EFFECTS_SHARE * arm.effort_limits
+    for effect in arm.effects.position_dependent:
+        # The coefficient of a spring is its stiffness, and its scale is the largest deflection.
+        largest = effect.coefficient * (effect.scale if effect.kind == "spring" else 1.0)
+        effects += np.abs(largest * (arm.effect_coordinates[effect.coordinate] @ arm.transmission.matrix))
+    strongest = [np.max(arm.effort_limits, initial=0.0, where=arm.prismatic == slides) for slides in (False, True)]
+    return np.minimum(effects, arm.per_joint(*strongest) * arm.per_joint(*SUFFICIENT_SHARE))
 
 
 def _significant_correlation(gravity: NDArray[np.float64], tau: NDArray[np.float64]) -> float:

@@ -14,9 +14,10 @@ from dvrk_drake.models.arm import Arm
 #: parameter (`LinkScale`). Half or twice the value increases the mean cross-validated errors of the public motions
 #: `mtm_one` and `psm_one`.
 LINK_DEVIATION = 0.3
-#: Smallest prior standard deviation of a rotor inertia [kg m^2; kg]. It is less than that of the smallest rotor of this
-#: package's arms (4e-6, wrist roll of an MTM), so that it applies only to rotors that a model omits.
-MIN_ROTOR_DEVIATION = 3e-6
+#: Smallest prior standard deviation of a rotor inertia, as a share of the smallest rotor that the model states for the
+#: same type of joints. It is for rotors without a stated inertia beside others: the model contains them as links. For
+#: an MTM, the deviation is 3e-6 kg m^2.
+UNSTATED_ROTOR_SHARE = 0.22
 #: Acceleration of a rotor by the effort limit of its joint [rad/s^2, m/s^2] at one prior standard deviation of its
 #: inertia, if the model states no rotors. The drives of published robots (UR, Franka, Staubli) reach 10 to 100 rad/s^2.
 ROTOR_ACCELERATION = 100.0, 30.0
@@ -46,11 +47,10 @@ def rigid_deviations(regressor: DynamicRegressor, num_rigid: int, link_scale: fl
     for link, deviation in zip(regressor.links, links, strict=True):
         if link.link in rotors_as_links:
             deviation[1:4] *= _BALANCE
-    stated = regressor.values[10 * len(links) : num_rigid]
-    if np.any(stated) or rotors_as_links:
-        rotors = np.maximum(LINK_DEVIATION * stated, MIN_ROTOR_DEVIATION)
-    else:
-        rotors = _unstated_rotor_deviations(regressor.arm)
+    stated, rotors = regressor.values[10 * len(links) : num_rigid], _unstated_rotor_deviations(regressor.arm)
+    for joints in (regressor.arm.prismatic, ~regressor.arm.prismatic):
+        if np.any(of_type := joints & (stated > 0)):
+            rotors[joints] = np.maximum(LINK_DEVIATION * stated[joints], UNSTATED_ROTOR_SHARE * np.min(stated[of_type]))
     return np.concatenate([*links, rotors])
 
 

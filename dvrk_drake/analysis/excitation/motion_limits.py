@@ -13,6 +13,7 @@ from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import POSITIONS
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.soft_walls import SoftWalls
@@ -58,7 +59,7 @@ class MotionLimits:
     speed_time: float = field(default=0.2, metadata=within(0.01, 100.0, "s"))
     acceleration_time: float = field(default=0.1, metadata=within(0.001, 100.0, "s"))
     effort: float = field(default=0.8, metadata=within(0.05, 1.0))
-    positions: dict[str, tuple[float, float]] = field(default_factory=dict, metadata=within(-12.6, 12.6, "rad or m"))
+    positions: dict[str, tuple[float, float]] = field(default_factory=dict, metadata=POSITIONS)
     tip_box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     environment: Environment = field(default_factory=Environment)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,12 @@ from dvrk_drake.analysis.payload.point_mass import PointMass, PointMassProblem
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.inertial_parameters import LinkInertia
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import Reportable
+from dvrk_drake.models.plant import link_poses
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 
@@ -40,6 +42,8 @@ AUTOREGRESSION_ORDER, NUM_WHITENING_ITERATIONS = 2, 2
 #: Smallest RMS effort of the payload on an actuator, as a share of the RMS difference of the efforts. At smaller
 #: values, the payload does not load the actuator.
 MIN_LOAD = 1e-6
+#: Number of random poses at which the reach of the arm is measured.
+NUM_REACH_POSES = 50
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ class Payload:
         position_error: Standard errors (3,) of the position [m], nan for coordinates that are not identifiable.
         quantile: Half-width of the confidence interval (`CONFIDENCE`), in standard errors.
         largest_at_com: Upper end of the confidence interval for a mass at the link's own centre of mass [kg].
+        max_mass: Largest mass that the estimation allows [kg].
         position_in_base: Position (3,) of the payload in the base frame, with all joint positions at 0 [m].
         relative_error: Cross-validated RMS error with the payload divided by the error without a payload [1], as the
             geometric mean over the actuators. The folds are intervals of the phase of the motion.
@@ -86,6 +91,7 @@ class Payload:
     position_error: NDArray[np.float64]
     quantile: float
     largest_at_com: float
+    max_mass: float
     position_in_base: NDArray[np.float64]
     relative_error: float
     actuators: list[PayloadActuator]
@@ -368,6 +374,7 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
         position_error=np.where(body.determined, standard_errors[1:], np.nan),
         quantile=quantile,
         largest_at_com=max(at_com, 0.0) + quantile * float(at_com_errors[0]),
+        max_mass=problem.max_mass,
         position_in_base=_in_base(arm, link.link, body.position),
         relative_error=float(np.exp(np.mean(np.log(with_payload / without)) / 2)),
         actuators=actuators,
@@ -433,7 +440,19 @@ def _problem(
     independent = 2 * grid.settings.effort_cut_off / grid.rate
     com = link.parameters[1:4] / link.parameters[0]
     precision = np.mean(difference.changes**2, axis=0) / difference.deviation**2
-    return PointMassProblem(equations, min(independent, 1.0), com, precision, len(tau))
+    mass, distance = _largest(grid.arm)
+    return PointMassProblem(equations, min(independent, 1.0), com, precision, len(tau), mass, distance)
+
+
+@cache
+def _largest(arm: Arm) -> tuple[float, float]:
+    """Returns the largest mass [kg] of a payload, and its largest distance from the centre of mass of its link [m].
+
+    An arm carries less than the mass of its own links. A tool extends the reach of its links by less than one half.
+    """
+    poses = arm.sample_poses(NUM_REACH_POSES, np.random.default_rng(0))
+    reach = max(float(np.linalg.norm(X.translation())) for q in poses for X in link_poses(arm, q).values())
+    return sum(float(link.parameters[0]) for link in link_inertias(arm)), 1.5 * reach
 
 
 def _in_base(arm: Arm, link: str, position: NDArray[np.float64]) -> NDArray[np.float64]:

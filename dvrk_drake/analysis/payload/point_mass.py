@@ -15,14 +15,11 @@ from scipy.optimize import least_squares
 
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 
-#: Largest distance of the point mass from the link's own centre of mass along each axis [m]. All arms are shorter.
-MAX_DISTANCE = 1.0
-#: Largest mass of the point mass [kg].
-MAX_MASS = 10.0
-#: Largest standard error of an identifiable coordinate [m].
+#: Largest standard error of an identifiable coordinate, as a share of the largest distance. A larger error
+#: does not determine the side of the link on which the payload is.
 MAX_STANDARD_ERROR = 0.5
-#: Distances of the initial positions from the link's own centre of mass [m]. The centre of mass is also an initial
-#: position.
+#: Distances of the initial positions from the link's own centre of mass, as shares of the largest distance. The centre
+#: of mass is also an initial position.
 _INITIAL_DISTANCES = (0.15, 0.4)
 #: Number of inertial parameters of a rigid body.
 _RIGID = 10
@@ -73,6 +70,8 @@ class PointMassProblem:
     Attributes:
         equations: Normal equations. The ten columns of the link come first, then the nuisance parameters.
         com: Centre of mass (3,) of the link in the link frame [m].
+        max_mass: Largest mass of the point mass [kg].
+        max_distance: Largest distance of the point mass from `com` along each axis [m].
     """
 
     def __init__(
@@ -82,6 +81,8 @@ class PointMassProblem:
         com: NDArray[np.float64],
         precision: NDArray[np.float64],
         rows: int,
+        max_mass: float,
+        max_distance: float,
     ) -> None:
         """Constructs the problem.
 
@@ -91,8 +92,10 @@ class PointMassProblem:
             com: Centre of mass (3,) of the link in the link frame [m].
             precision: Reciprocal prior variances (n, k) of the nuisance parameters, 0 if there is no prior.
             rows: Number of rows.
+            max_mass: Largest mass of the point mass [kg].
+            max_distance: Largest distance of the point mass from `com` along each axis [m].
         """
-        self.equations, self.com = equations, com
+        self.equations, self.com, self.max_mass, self.max_distance = equations, com, max_mass, max_distance
         self._total = equations.total.dense()
         self._count, self._precision = rows * independent, precision
 
@@ -120,9 +123,10 @@ class PointMassProblem:
                 weights = self._count / np.maximum(_squared_residuals(reduced, body), _TINY)
             errors = self._standard_errors(self._reduced(self._total, weights), weights, body)
             # A coordinate at the boundary of the search region is not identifiable.
-            position_errors = np.where(np.abs(body.position - self.com) > MAX_DISTANCE - 1e-6, np.inf, errors[1:])
+            at_boundary = np.abs(body.position - self.com) > (1 - 1e-6) * self.max_distance
+            position_errors = np.where(at_boundary, np.inf, errors[1:])
             worst = int(np.argmax(np.where(determined, position_errors, 0.0)))
-            if not determined[worst] or not position_errors[worst] > MAX_STANDARD_ERROR:
+            if not determined[worst] or not position_errors[worst] > MAX_STANDARD_ERROR * self.max_distance:
                 return body, weights, errors
             start, determined = None, determined & (np.arange(3) != worst)
 
@@ -212,21 +216,26 @@ class PointMassProblem:
     ) -> PointMass:
         """Returns the best of several fits with different initial values."""
         offsets = [np.zeros(3)] + [
-            s * d * axis for d in _INITIAL_DISTANCES for axis in np.eye(3)[determined] for s in (1, -1)
+            s * d * self.max_distance * axis
+            for d in _INITIAL_DISTANCES
+            for axis in np.eye(3)[determined]
+            for s in (1, -1)
         ]
         H, b = _weighted(reduced, weights)
         bodies = []
         for offset in offsets:
             unit = point_mass_parameters(1.0, self.com + offset)
-            mass = float(np.clip(float(unit @ b) / max(float(unit @ H @ unit), _TINY), 1e-3, MAX_MASS / 2))
+            mass = float(
+                np.clip(float(unit @ b) / max(float(unit @ H @ unit), _TINY), 1e-4 * self.max_mass, self.max_mass / 2)
+            )
             bodies.append(self._refine(reduced, weights, PointMass(mass, self.com + offset, determined)))
         return min(bodies, key=lambda body: float(weights @ _squared_residuals(reduced, body)))
 
     def _refine(self, reduced: NDArray[np.float64], weights: NDArray[np.float64], start: PointMass) -> PointMass:
         A, b = _rows(reduced, weights)
         free = np.concatenate([[True], start.determined])
-        lower = np.concatenate([[0.0], self.com - MAX_DISTANCE])[free]
-        upper = np.concatenate([[MAX_MASS], self.com + MAX_DISTANCE])[free]
+        lower = np.concatenate([[0.0], self.com - self.max_distance])[free]
+        upper = np.concatenate([[self.max_mass], self.com + self.max_distance])[free]
         full = np.concatenate([[start.mass], start.position])
 
         def all_values(x: NDArray[np.float64]) -> NDArray[np.float64]:

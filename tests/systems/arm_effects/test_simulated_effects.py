@@ -72,7 +72,7 @@ def test_unknown_part_is_an_error(tmp_path):
         (
             "outer_yaw: 1.861",
             "outer_yaw: -1.861",
-            "effects.saturation.outer_yaw is -1.861; allowed: 0.001..2000 N m or N",
+            "effects.saturation.outer_yaw is -1.861; allowed: 0.001..1e.06 N m or N",
         ),
         ("measurement: 1", "measurement: -1", "effects.delay.measurement is -1; allowed: 0..100 time steps"),
         (
