@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 #: Arm with four moving joints: a turning column, a carriage on it, and two links of which the second mimics the first.
 #: The column has two bodies, and the base is fixed to the world by a turned joint.
 URDF = """<robot name="crane">
@@ -57,6 +59,40 @@ URDF = """<robot name="crane">
   <joint name="tip_joint" type="fixed"><parent link="hand"/><child link="tip"/><origin xyz="0.1 0 0"/></joint>
 </robot>
 """
+
+
+def random_robot(folder: Path, seed: int, size: float = 1.0) -> Path:
+    """Writes the model file of a random arm with four joints and returns its path.
+
+    One joint is prismatic, and the last joint mimics a revolute one. The first joint is continuous. An arm with another
+    size has geometrically similar links of the same density. Motors can hold the arm in every pose.
+    """
+    generator = np.random.default_rng(seed)
+    joints = ["continuous", *generator.permutation(["prismatic", "revolute"]), "mimic"]
+    masses, text = size**3 * generator.uniform(0.2, 1.0, 4), '<robot name="random"><link name="link_0"/>'
+    force = 3 * 9.81 * masses.sum()
+
+    def vector(length: float) -> str:
+        return " ".join(map(str, length * generator.uniform(-1, 1, 3)))
+
+    for i, (kind, mass) in enumerate(zip(joints, masses, strict=True), 1):
+        x, y, z = (size * generator.uniform(0.1, 0.3, 3)) ** 2
+        moments = {"ixx": y + z, "iyy": x + z, "izz": x + y, "ixy": 0, "ixz": 0, "iyz": 0}
+        inertia = " ".join(f'{name}="{mass / 12 * moment}"' for name, moment in moments.items())
+        reach, effort = (0.4 * size, force) if kind == "prismatic" else (2.0, force * size)
+        mimic = f'<mimic joint="joint_{1 + joints.index("revolute")}" multiplier="-0.7" offset="0.2"/>'
+        text += f"""
+          <link name="link_{i}"><inertial><origin xyz="{vector(0.15 * size)}"/><mass value="{mass}"/>
+            <inertia {inertia}/></inertial></link>
+          <joint name="joint_{i}" type="{"revolute" if kind == "mimic" else kind}">
+            <parent link="link_{i - 1}"/><child link="link_{i}"/>
+            <origin xyz="{vector(0.3 * size)}" rpy="{vector(1.5)}"/><axis xyz="{vector(1.0)}"/>
+            <limit lower="{-reach}" upper="{reach}" effort="{effort}" velocity="3"/>
+            {mimic if kind == "mimic" else ""}
+          </joint>"""
+    path = folder / "random.urdf"
+    path.write_text(text + "</robot>")
+    return path
 
 
 def write_robot(folder: Path, *changes: tuple[str, str], name: str = "crane.urdf", text: str = URDF) -> Path:
