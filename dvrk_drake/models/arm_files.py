@@ -300,7 +300,7 @@ def _build_arm(
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
         separate_joint=instrument.separate_joint,
         console_gravity_compensation=mechanism.console_gravity_compensation,
-        frames=_frames(path, mechanism.frames, instrument.frames, facts),
+        frames=_frames(path, mechanism, instrument, facts),
         view=_view_settings(path, mechanism.view, instrument.view, facts),
         published_gains=mechanism.published_gains,
     )
@@ -317,13 +317,15 @@ def _name_of(path: Path) -> str:
     return re.sub(r"\W", "_", path.name.partition(".")[0], flags=re.ASCII)
 
 
-def _frames(path: Path, mechanism: Frames, instrument: Frames, facts: SdfFacts) -> Frames:
+def _frames(path: Path, mechanism: Mechanism, instrument: Instrument, facts: SdfFacts) -> Frames:
     """Returns the frames of mechanism and instrument. The entries of the instrument take precedence."""
-    stated = {key: getattr(instrument, key) or frame for key, frame in vars(mechanism).items()}
-    for key, frame in stated.items():
+    frames = {key: getattr(instrument.frames, key) or frame for key, frame in vars(mechanism.frames).items()}
+    # The joints of an instrument are the last ones.
+    frames["hand"] = instrument.frames.hand or (not instrument.sdf and mechanism.frames.hand) or facts.last_link
+    for key, frame in frames.items():
         if frame and frame not in facts.frame_names | facts.link_names:
             raise ArmError(f"{path}: frames.{key}: the SDF has no frame {frame}")
-    return Frames(**(stated | {"hand": stated["hand"] or facts.last_link}))
+    return Frames(**frames)
 
 
 def _view_settings(path: Path, mechanism: ViewSettings, instrument: ViewSettings, facts: SdfFacts) -> ViewSettings:

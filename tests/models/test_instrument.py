@@ -61,6 +61,12 @@ def test_custom_instrument_is_attached_to_the_arm(folder):
     assert abs(torque[3]) > 1e-3  # its centre of mass is off the shaft axis
 
 
+@pytest.mark.parametrize(("name", "hand"), [("arm.yaml", "probe_link"), ("bare.yaml", "dh_3")])
+def test_hand_holds_the_instrument_if_there_is_one(folder, name, hand):
+    frames = load_arm(str(folder / name)).frames
+    assert (frames.hand, frames.remote_center, frames.shaft) == (hand, "dh_0", "")
+
+
 @pytest.mark.parametrize("name", ["arm.yaml", "bare.yaml"])
 def test_custom_instrument_is_simulated_without_self_collision(folder, name):
     station = ArmStation(load_arm(str(folder / name)), closure="ball")
