@@ -15,8 +15,9 @@ from dvrk_drake.models.schema_fault import RANGE, Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: Accepted position limits of a joint. Two turns in each direction suffice for a joint with stops: the roll joint of an
-#: MTM reaches -8.4 rad, and the joints of a UR10e reach 6.3 rad. Joints without stops get the two turns. The ranges do
-#: not depend on the arm, because they detect limits in degrees, and in mm: no gantry is longer than 30 m.
+#: MTM reaches -8.4 rad, and the joints of a UR10e reach 6.3 rad. Joints without stops get one turn in each
+#: direction, see `CONTINUOUS`. The ranges do not depend on the arm, because they detect limits in degrees, and in mm:
+#: no gantry is longer than 30 m.
 ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-30.0, 30.0, "m")
 #: Accepted differences between the upper and the lower position limit of a joint.
 ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 30.0, "m")
