@@ -21,8 +21,9 @@ _LENGTH = 0.01
 _WEIGHTS = np.array([1.0] * 3 + [1.0 / _LENGTH] * 3)
 #: Largest step of a revolute and of a prismatic joint per iteration [rad, m].
 _MAX_STEP = (0.5, 0.05)
-#: Damping factors of the inverse kinematics: at the start, smallest, smallest after a failed step, and largest.
-_START_DAMPING, _MIN_DAMPING, _FAILED_DAMPING, _MAX_DAMPING = 1e-4, 1e-12, 1e-8, 1e4
+#: Damping factors of the inverse kinematics: at the start, smallest and largest. The smallest one exceeds the rounding
+#: errors of J J' if joints at their limits make it singular.
+_START_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e-8, 1e4
 
 
 class ArmFrame:
@@ -106,7 +107,7 @@ class ArmFrame:
             if np.linalg.norm(e_next) < np.linalg.norm(e):
                 q, e, damping, max_steps = q_next, e_next, max(0.1 * damping, _MIN_DAMPING), max_steps - 1
             else:
-                damping = 10.0 * max(damping, _FAILED_DAMPING)
+                damping *= 10.0
         return q
 
     def _error(self, X_BF: RigidTransform, q: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from robot_file import write_robot
 
 from dvrk_drake.dynamics.kinematics import ArmFrame
@@ -115,6 +115,11 @@ def test_unreachable_poses_are_refused(name):
     R = kinematics.pose(q).rotation()
     for far in ([1.0, 1.0, 1.0], [0.0, 0.0, 1e5]):
         assert kinematics.solve(RigidTransform(R, far), q) is None
+
+
+def test_joints_at_their_limits_cause_no_singular_equations():
+    X = RigidTransform(RollPitchYaw(2.123, -0.157, 1.893), [-0.039, 0.231, 0.053])
+    assert ArmFrame(load_arm("psm")).solve(X, [0.145, -0.794, 0.085, 1.623, -1.101, 1.266, 1.265]) is None
 
 
 def test_hand_frame_of_a_urdf_is_its_last_link_or_stated(tmp_path):
