@@ -34,7 +34,7 @@ class ArmObservation:
         first, last: First and last status.
         count: Number of received statuses after the first.
         lost: Number of statuses that were not received.
-        seconds: Time between both statuses on the clock of the arm [s].
+        seconds: Time between both statuses on the clock of this process [s].
     """
 
     first: lcmt_dvrk_status
@@ -53,6 +53,9 @@ class ArmObservation:
         first, last = self.first, self.last
         arm = f"--arm {last.arm_name.lower()}"
         reset = f"look at the arm, remove the cause, then: dvrk-drake run {arm} --reset"
+        if last.utime == first.utime and first.utime:
+            why = f"no new measurement arrives ({last.fault_text or 'no fault'})"
+            return why, f"check the process of the arm and its connection. Then {reset}"
         if last.fault_code != lcmt_dvrk_status.FAULT_NONE:
             return f"fault: {last.fault_text}", reset
         if last.guard_state == lcmt_dvrk_status.STATE_OFF:
@@ -87,10 +90,10 @@ def observe(link: ArmLink, seconds: float = 0.5) -> ArmObservation:
         ControllerError: No status arrives.
     """
     first = last = link.next_status(FIRST_WAIT)
-    lost, count, end = link.lost, 0, link.now() + seconds
-    while link.now() < end:
+    lost, count, start = link.lost, 0, link.now()
+    while link.now() < start + seconds:
         last, count = link.next_status(SILENCE), count + 1
-    return ArmObservation(first, last, count, link.lost - lost, max(1e-6 * (last.utime - first.utime), 1e-6))
+    return ArmObservation(first, last, count, link.lost - lost, link.now() - start)
 
 
 def stop_arm(link: ArmLink, *, power_off: bool = False) -> lcmt_dvrk_status:

@@ -89,6 +89,17 @@ def own_gravity(link):
     link.status.gravity_compensation = True
 
 
+def silent(link):
+    next_status = link.next_status
+
+    def repeated(seconds):
+        status = next_status(seconds)
+        status.utime = 10**9  # the bridge repeats the status of the last measurement
+        return status
+
+    link.next_status = repeated
+
+
 def refused(link):
     wrong = Command()
     wrong.arm_name, wrong.num_joints, wrong.session_id = ARM.name, ARM.num_joints, link.guard.session_id
@@ -109,6 +120,7 @@ def ignored(link):
         (watchdog_hold, "until an operator resumes: its period is 20 ms.", "dvrk-drake run --arm mtml --reset"),
         (own_gravity, "the arm adds its own gravity compensation", "switch off gravity_compensation"),
         (lambda link: None, "MTML: hold, no controller sends commands.", "dvrk-drake run --arm mtml"),
+        (silent, "MTML: hold, no new measurement arrives", "check the process of the arm and its connection."),
         (refused, "MTML: hold, commands are refused: ", "correct or end the controller"),
         (ignored, "MTML: hold, messages are ignored: ", "give the arm's key to the controller"),
     ],

@@ -28,6 +28,7 @@ class SubstituteClient:
         self.measurement, self.gravity_compensation, self.not_ready_reason = None, 0.0, ""
         self.others, self.domain = [], SimpleNamespace(num_changes=0, clear=lambda: None)
         self.sent, self.is_new, self.other_hold, self.confirms = [], False, False, True
+        self.num_read_again = 0
         #: Effort of the dVRK's own gravity compensation after it was switched off; None: no message arrives.
         self.gravity_after_switch = 0.0
 
@@ -41,6 +42,9 @@ class SubstituteClient:
 
     def other_publishers(self):
         return self.others
+
+    def read_state_again(self):
+        self.num_read_again += 1
 
     def take_other_hold(self):
         taken, self.other_hold = self.other_hold, False

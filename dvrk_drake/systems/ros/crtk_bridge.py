@@ -109,7 +109,7 @@ class CrtkBridge:
         self._jaw_sent: tuple[str, float] = ("", 0.0)
         self._was_ready = False
         self._num_measured, self._good_rates, self._rate_problem = 0, 0, ""
-        self._num_changes, self._other_publishers = -1, ""
+        self._num_changes, self._other_publishers, self._was_pushed = -1, "", False
         self._problem = self._described = self._blocked = ""
         self._last_sent = self._last_report = 0
         self._rate_problem = self._check_rate()
@@ -209,6 +209,9 @@ class CrtkBridge:
         not_ready = client.not_ready_reason
         if not_ready:
             guard.report_fault(f"{client.namespace}: {not_ready}", has_power=False)
+            if self._was_ready:
+                # The last effort would act on if the message is wrong, e.g. that of another process.
+                self._hold()
         elif not self._was_ready:
             self._switch_gravity_compensation_off()
         self._was_ready = not not_ready
@@ -216,6 +219,8 @@ class CrtkBridge:
             self._find_other_publishers()
         if self._other_publishers:
             guard.report_fault(f"another process publishes {self._other_publishers}. {END_OTHER_PROCESS}")
+        elif guard.state != lcmt_dvrk_status.STATE_FAULT:
+            self._was_pushed = False
         self._blocked = self._block_reason()
         guard.block(self._blocked)
         output = self._step_guard(now)
@@ -252,9 +257,11 @@ class CrtkBridge:
             return
         is_effort = output.control_mode == lcmt_dvrk_command.EFFORT
         all_implausible = np.all(output.joint_flags & lcmt_dvrk_status.FLAG_IMPLAUSIBLE)
-        if all_implausible or (is_effort and self._blocked):
+        is_released = self._was_pushed and not self._other_publishers
+        if all_implausible or is_released or (is_effort and self._blocked):
             # The arm measures its joints itself, so it can still hold its pose. After a measurement fault, the guard
-            # commands efforts, which are not safe for example with the gravity compensation of the dVRK.
+            # commands efforts, which are not safe for example with the gravity compensation of the dVRK. After the
+            # end of another process, the target of the guard is the pose from which that process moved the arm.
             if now >= self._last_sent + _REPEAT:
                 self._hold()
                 self._last_sent = now
@@ -350,7 +357,11 @@ class CrtkBridge:
         """Finds the topics on which another process could move the arm, after publishers have appeared or ended."""
         if self._client.domain.num_changes != self._num_changes:
             self._num_changes = self._client.domain.num_changes
-            self._other_publishers = ", ".join(self._client.other_publishers())
+            others, self._other_publishers = self._other_publishers, ", ".join(self._client.other_publishers())
+            self._was_pushed |= bool(self._other_publishers)
+            if others and not self._other_publishers:
+                self._last_sent = 0  # the next output is `hold`, without a pause
+                self._client.read_state_again()
 
     def _describe(self) -> None:
         """Reports a change of the state of the guard."""

@@ -83,7 +83,7 @@ class CrtkClient:
         self._reader = JointStateReader(arm, self._topic("measured_js"))
         subscribe = domain.subscribe
         self._measured: Subscription[JointState] = subscribe(self._topic("measured_js"), JointState, wakes=not polled)
-        self._state = subscribe(self._topic("operating_state"), OperatingState, depth=100, latched=True)
+        self._state = self._subscribe_to_state()
         self._gravity = subscribe(self._topic("gravity_compensation/setpoint_js"), JointState)
         self._other_hold = subscribe(self._topic("hold"), Empty, ignore_own=True, wakes=False)
         self._jaw = None if self._separate is None else subscribe(self._jaw_topic("measured_js"), JointState)
@@ -135,6 +135,11 @@ class CrtkClient:
             is_complete = len(message.effort) == self.arm.num_joints and np.isfinite(message.effort).all()
             if message.header.nanoseconds and is_complete:
                 self.gravity_compensation = float(np.max(np.abs(message.effort)))
+
+    def read_state_again(self) -> None:
+        """Forgets the operating state, and subscribes again to the last message of each of its publishers."""
+        self._state.close()
+        self.operating_state, self._state = None, self._subscribe_to_state()
 
     def take_other_hold(self) -> bool:
         """Returns whether another process has published `hold` since the last call."""
@@ -229,6 +234,9 @@ class CrtkClient:
         """Returns the topics on which another process of the domain could move the arm, see `other_publishers`."""
         return other_publishers(self.domain, self.arm, self.namespace)
 
+    def _subscribe_to_state(self) -> Subscription[OperatingState]:
+        return self.domain.subscribe(self._topic("operating_state"), OperatingState, depth=100, latched=True)
+
     def _position_command(self, name: str, q: ArrayLike, v: ArrayLike | None) -> JointState:
         message = JointState(Header.now(), position=self._main(self._checked(name, q)))
         if v is not None:
@@ -266,7 +274,8 @@ class CrtkClient:
 def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
     """Returns the topics on which another process of the domain could move an arm, without duplicates.
 
-    With two publishers of measured_js, e.g. an arm and a simulated arm, this topic is included too.
+    Topics of the arm with two publishers, e.g. an arm and a simulated arm, are included too. A wrong operating_state
+    would end the commands.
 
     Args:
         domain: ROS domain of the arm.
@@ -276,8 +285,8 @@ def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
     names = [*_MOTION_TOPICS, *(f"{arm.separate_joint}/{name}" for name in _SEPARATE_TOPICS if arm.separate_joint)]
     motion = {f"{namespace}/{name}" for name in names}
     topics = [endpoint.topic for endpoint in domain.publishers() if not endpoint.is_own]
-    measured = f"{namespace}/measured_js"
-    return sorted(motion.intersection(topics)) + [measured] * (topics.count(measured) > 1)
+    of_arm = (f"{namespace}/{name}" for name in ("measured_js", "operating_state"))
+    return sorted(motion.intersection(topics)) + [topic for topic in of_arm if topics.count(topic) > 1]
 
 
 def find_arm(

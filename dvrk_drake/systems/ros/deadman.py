@@ -32,6 +32,9 @@ _POLL, _CONNECTION = 0.005, 0.05
 _CONFIRMATION = 2.0
 #: Longest time until a new deadman process is ready [s]. Longest time until it has ended [s].
 _START, _END = 20.0, 4.0
+#: Longest time between two reports of the deadman process [s]: 20 times the period, for a busy computer on which the
+#: process has no real-time priority.
+_SILENCE = 1.0
 #: Lines with which the process reports whether it receives the commands of the bridge and can hold the arm.
 _READY, _BLIND = "ready", "blind"
 #: Real-time priority, above that of the other processes of this package.
@@ -41,11 +44,12 @@ _PRIORITY = 60
 class Deadman:
     """Publishes `hold` when an arm has received no command on servo_jf or servo_jp for 50 ms.
 
-    The process that sends commands ends them with `hold`. Without further commands, the deadman then does nothing. It
-    also does nothing while the arm is not enabled.
+    The process that sends commands ends them with `hold`. Without further commands, the deadman then does nothing.
 
-    The deadman repeats `hold` without a time limit until the arm has confirmed it, e.g. after a loss of the network, or
-    until the arm is not enabled. DDS confirms that the arm's process has received the message, not that the arm holds.
+    The deadman repeats `hold` without a time limit until the arm has confirmed it, e.g. after a loss of the network.
+    DDS confirms that the arm's process has received the message, not that the arm holds. If operating_state is not
+    ENABLED, it publishes `hold` all the same, because another process may have published this state, but repeats it
+    only if the arm confirms it.
     """
 
     def __init__(self, domain: RosDomain, namespace: str, report: Callable[[str], None]) -> None:
@@ -88,18 +92,16 @@ class Deadman:
             bridge: File descriptor of a pipe from the bridge process. The end of this process closes the pipe. The
                 bridge process writes to it before its end if the arm has confirmed the last `hold` of the bridge. None:
                 there is no such pipe.
-            report_connected: Function that is called with each change of `is_connected`.
+            report_connected: Function that is called with `is_connected` every 0.05 s, also as a sign of life.
         """
         pipes = [] if bridge is None else [bridge]
-        connected, next_check = False, 0.0
+        next_check = 0.0
 
         def is_over() -> bool:
-            nonlocal connected, next_check
+            nonlocal next_check
             if (now := time.monotonic()) >= next_check:
                 next_check = now + _CONNECTION
-                if self.is_connected() != connected:
-                    connected = not connected
-                    report_connected(connected)
+                report_connected(self.is_connected())
             return stopped()
 
         while not is_over() or pipes:
@@ -120,7 +122,7 @@ class Deadman:
                 self._is_confirmed = False
         holds = [published for _, published in self._ends.take()]
         self._update_state()
-        if (holds and max(holds) >= self._last_published) or not self._is_enabled:
+        if holds and max(holds) >= self._last_published:
             self._last_command = None
 
     def _update_state(self) -> None:
@@ -187,7 +189,7 @@ class DeadmanProcess:
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
         )
-        self.pid, self._is_blind = self._process.pid, False
+        self.pid, self._is_blind, self._last_report = self._process.pid, False, time.monotonic()
         is_ready = False
         try:
             end = time.monotonic() + _START
@@ -209,7 +211,9 @@ class DeadmanProcess:
         if self._process.poll() is not None:
             return "the deadman process has ended. Restart the bridge"
         if self._has_line(0.0):
-            self._is_blind = not self._is_ready()
+            self._is_blind, self._last_report = not self._is_ready(), time.monotonic()
+        elif time.monotonic() - self._last_report > _SILENCE:
+            return f"the deadman process {self.pid} does not respond. Restart the bridge"
         return "the deadman process is not connected to the topics of the arm" if self._is_blind else ""
 
     def _has_line(self, seconds: float) -> bool:
@@ -267,7 +271,8 @@ def _report(line: str) -> None:
 
 
 def _report_connected(connected: bool) -> None:
-    # The bridge may have ended. With PYTHONUNBUFFERED, `print` would write the end of the line separately.
+    # The bridge may have ended, or be suspended, so that the pipe is full. With PYTHONUNBUFFERED, `print` would write
+    # the end of the line separately.
     with contextlib.suppress(OSError):
         os.write(sys.stdout.fileno(), f"{_READY if connected else _BLIND}\n".encode())
 
@@ -283,6 +288,7 @@ def main(namespace: str, domain: str) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
     request_priority()
+    os.set_blocking(sys.stdout.fileno(), False)
     deadman = Deadman(open_ros_domain(int(domain) if domain else None), namespace, _report)
     deadman.run(lambda: bool(received), sys.stdin.fileno(), _report_connected)
     # Without the destructors of Cyclone DDS, which may wait for ever if another participant ends at the same time.

@@ -99,7 +99,7 @@ def state(text):
     [
         ("hold", 6, None, True),
         ("hold", 4, None, False),
-        ("operating_state", 6, state("DISABLED"), True),
+        ("operating_state", 6, state("DISABLED"), False),  # it may be a message of another process
         ("operating_state", 6, state("ENABLED"), False),
     ],
 )
@@ -281,19 +281,32 @@ def test_stand_alone_command_requests_priority_before_dds(monkeypatch, capsys):
     assert capsys.readouterr().out == f"deadman of {ARM}; Ctrl-C ends it; it has {requested}\n"
 
 
-def test_changes_of_the_connection_are_reported():
+def test_connection_is_reported_in_each_period():
     bench = Bench()
     bench.hold.connections = 0
     changes = [(bench.hold, 1), (bench.subscribed["servo_jf"], 0), (bench.subscribed["servo_jf"], 1)]
 
     def change_after_each_report():
-        if len(bench.connected) == 3 - len(changes) and changes:
+        if len(bench.connected) == 4 - len(changes) and changes:
             topic, connections = changes.pop(0)
             topic.connections = connections
-        return len(bench.connected) == 3
+        return len(bench.connected) == 5
 
     bench.run(change_after_each_report)
-    assert bench.connected == [True, False, True]
+    assert bench.connected == [False, True, False, True, True]
+
+
+def test_silence_of_the_process_is_a_problem():
+    """A process that is suspended holds no arm."""
+    process, (read_end, write_end) = DeadmanProcess.__new__(DeadmanProcess), os.pipe()
+    with open(read_end, "rb", buffering=0) as stdout, open(write_end, "wb", buffering=0) as reports:
+        process._process, process.pid, process._is_blind = SimpleNamespace(poll=lambda: None, stdout=stdout), 7, False
+        process._last_report = time.monotonic() - 2 * deadman._SILENCE
+        assert process.problem() == "the deadman process 7 does not respond. Restart the bridge"
+        reports.write(b"ready\n")
+        assert process.problem() == ""
+        reports.write(b"ready\nblind\n")
+        assert "is not connected to the topics" in process.problem()
 
 
 def test_report_is_one_write_without_buffers():
