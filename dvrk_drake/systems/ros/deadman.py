@@ -193,9 +193,10 @@ class DeadmanProcess:
         is_ready = False
         try:
             end = time.monotonic() + _START
-            while not (has_line := self._has_line(_CONNECTION)) and not stopped() and time.monotonic() < end:
-                pass
-            is_ready = has_line and self._is_ready() and not stopped()
+            # The first reports may be from before the connection to the topics of the arm.
+            while not is_ready and self._process.poll() is None and not stopped() and time.monotonic() < end:
+                is_ready = self._has_line(_CONNECTION) and self._is_ready()
+            is_ready = is_ready and not stopped()
         finally:
             if not is_ready:
                 # The bridge has not commanded the arm. So the process must end without `hold`.
