@@ -77,14 +77,32 @@ def least_squares(columns: list[NDArray[np.float64]], efforts: list[NDArray[np.f
     return np.linalg.lstsq(A / size, b, rcond=1e-8)[0] / size
 
 
+def print_other_robots(models: dict[str, dvrk.IdentifiedModel], recordings: dict[str, dvrk.Recording]) -> None:
+    """Prints for how many pairs of a model and a recording `check` reports another individual arm."""
+    arm_of = {file: name for name, files in ARMS.items() for file in files}
+    for relation in ("the same arm", "another arm"):
+        found = {
+            (source, target): [f.where for f in dvrk.check(recording, model).warnings if f.kind == "other robot"]
+            for source, model in models.items()
+            for target, recording in recordings.items()
+            if source != target and (arm_of[source] == arm_of[target]) == (relation == "the same arm")
+        }
+        count = sum(map(bool, found.values()))
+        print(f"`check --model` reports another robot in {count} of {len(found)} pairs: {relation}")
+        for (source, target), where in found.items():
+            if where and relation == "the same arm":
+                print(f"  {source} -> {target}: {where[0]}")
+
+
 def main() -> None:
-    """Prints one table per arm, and the mean errors."""
+    """Prints one table per arm, how often another individual arm is reported, and the mean errors."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
     parser.add_argument("--json", help="file for the errors")
     options = parser.parse_args()
     arm = dvrk.lock_joints(dvrk.load_arm("psm"), LOCKED)
     regressor, console, results = DynamicRegressor(arm), Console(highlight=False, width=200), []
+    all_models, all_recordings = dict[str, dvrk.IdentifiedModel](), dict[str, dvrk.Recording]()
     for name, files in ARMS.items():
         recordings = {file: dvrk.read_recording(options.folder / f"{file}.csv", arm) for file in files}
         columns = {file: least_squares_columns(recording, regressor) for file, recording in recordings.items()}
@@ -110,6 +128,9 @@ def main() -> None:
             if arm_name == name:
                 table.add_row(source, target, method, *(f"{e:.1f}" for e in errors), f"{errors.mean():.1f}")
         console.print(f"{name}: error [%]", table, sep="\n\n")
+        all_models |= models
+        all_recordings |= recordings
+    print_other_robots(all_models, all_recordings)
     for method in ("identify", "least squares"):
         one = [errors for _, source, _, used, errors in results if used == method and source != "all others"]
         console.print(f"mean over all pairs, {method}: {np.mean(one):.1f} %")

@@ -230,8 +230,8 @@ def transparency(
         friction_ratio: Share of the friction to compensate, 0 to 0.6. Default: 0.5, or 0 for an arm file without
             friction.
         simulated_effects: Effects to simulate (docs/simulated_effects.md), e.g. friction cables. Default: all.
-        frame: SDF frame at which the operator holds the arm. Default: frames.hand of the arm file, or
-            the last link.
+        frame: SDF frame at which the operator holds the arm. Default: frames.hand of the arm
+            file, or the last link.
         output: CSV file for the results.
     """
     from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator

@@ -21,9 +21,8 @@ from dvrk_drake.recordings.recording import GAP, MIN_GAP
 
 #: Number of frequencies of the sine and cosine functions in the position-dependent error.
 _HARMONICS = 2
-#: Smallest ratio of an error to the one expected on another day that is reported. Between recordings of two PSMs, it is
-#: exceeded in 10 of 12 pairs. Between recordings of one arm, the largest ratio is 1.1, but 3.2 for the insertion of one
-#: recording of a PSM (docs/benchmarks.md, three joints).
+#: Smallest ratio of an error to the one expected on another day that is reported. It is exceeded in 12 of 12 pairs of
+#: recordings of two PSMs, and in 2 of 8 pairs of one PSM (benchmarks/three_joint_recordings.py).
 OTHER_ROBOT_RATIO = 1.75
 
 

@@ -48,8 +48,7 @@ class DriveStep(LeafSystem):
 
     **Start.** Initialization sets the measurements to those of an arm that has been at rest at its present pose. With a
     delay, systems that read `state_estimated` during initialization still get the measurements at the pose of the last
-    call of `SetAtRest`, or at the default pose of
-    the plant.
+    call of `SetAtRest`, or at the default pose of the plant.
     """
 
     def __init__(self, parts: PlantEffects, num_actuators: int) -> None:

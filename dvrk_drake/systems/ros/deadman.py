@@ -48,8 +48,8 @@ class Deadman:
 
     The deadman repeats `hold` without a time limit until the arm has confirmed it, e.g. after a loss of the network.
     DDS confirms that the arm's process has received the message, not that the arm holds. If operating_state is not
-    ENABLED, it publishes `hold` all the same, because another process may have published this state, but repeats it
-    only if the arm confirms it.
+    ENABLED, the deadman publishes `hold` without waiting for a confirmation, because this state may be that of another
+    process.
     """
 
     def __init__(self, domain: RosDomain, namespace: str, report: Callable[[str], None]) -> None:
@@ -111,7 +111,8 @@ class Deadman:
             if silence > TIMEOUT:
                 self._hold_arm(f"no command for {1e3 * silence:.0f} ms", is_over)
             if ended:
-                if not os.read(pipes[0], 1) and self._is_enabled and not self._is_confirmed:
+                has_commanded = self._is_enabled or self._last_command is not None
+                if not os.read(pipes[0], 1) and has_commanded and not self._is_confirmed:
                     self._hold_arm("the bridge has ended", is_over)
                 return
 

@@ -146,6 +146,8 @@ def test_end_of_the_bridge_of_a_disabled_arm_leads_to_nothing():
     bench = Bench()
     bench.send("operating_state", 1, state("DISABLED"))
     assert run_until_bridge_ends(bench) == 0
+    bench.send("servo_jf", 2)  # so the state was that of another process
+    assert run_until_bridge_ends(bench) == TWICE
 
 
 def test_hold_is_not_repeated_after_the_end_of_the_bridge():
