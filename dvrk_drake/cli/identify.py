@@ -27,6 +27,7 @@ from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
+    load_model,
     mounted,
     plots_folder,
     print_notes,
@@ -170,7 +171,7 @@ def _model_and_recording(
     model: str, recording: str, file: FileOptions, steps: Steps
 ) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
     """Loads a model and a recording of its arm, and prints the notes on the recording."""
-    loaded = dvrk.IdentifiedModel.load(model)
+    loaded = load_model(model, None)
     read = file.read(recording, loaded.arm, steps)
     print_notes(recording, read.notes)
     return loaded, read
@@ -356,7 +357,7 @@ def payload(
     if json is not None:
         check_output(json, *paths, overwrite=overwrite)
     check_report(report, *paths, model or "", overwrite=overwrite)
-    identified = None if model is None else dvrk.IdentifiedModel.load(model)
+    identified = None if model is None else load_model(model, None)
     recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
         recordings = [file.read(path, recorded_arm, steps) for path in paths]

@@ -25,6 +25,7 @@ from dvrk_drake.cli.app import (
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
+    load_model,
     mounted,
     new_folder,
     plots_folder,
@@ -85,7 +86,7 @@ def check(
 
     if model is not None and locked is not None:
         raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
-    identified = None if model is None else dvrk.IdentifiedModel.load(model)
+    identified = None if model is None else load_model(model, None)
     recorded_arm = mounted(dvrk.load_arm(arm or ""), None, locked) if identified is None else identified.arm
     if json is not None:
         check_output(json, recording, *([model] if model else []), overwrite=overwrite)

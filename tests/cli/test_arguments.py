@@ -58,6 +58,7 @@ def refused(capsys, *arguments):
         (["study", "s.yaml", "--output", "r.csv", "--workers", "1", "--scheduler", "x"], "give at most one of"),
         (["simulate", "psm"], "psm is an arm, not a scenario; use --arm psm"),
         (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; use --arm psm"),
+        (["check", "a.csv", "--model", "mtmr"], "mtmr is an arm, not a model; use --arm mtmr"),
         (["arm", "--arm", "psm", "--rate", "abc"], 'Invalid value for --rate: must be a number, not "abc"; see'),
         (["arm", "--arm", "psm", "--rate", "100"], "--rate requires --ros"),
         (["arm", "--arm", "psm", "--enabled", "--topic", "/P"], "--topic and --enabled require --ros"),

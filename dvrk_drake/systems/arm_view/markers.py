@@ -15,6 +15,9 @@ from dvrk_drake.systems.arm_view.scene import Scene
 #: Colours of the x, y and z axes of a frame, of the RCM and of the trace of the tip.
 AXES = (Rgba(0.85, 0.1, 0.1), Rgba(0.05, 0.6, 0.15), Rgba(0.1, 0.25, 0.9))
 RCM_COLOR, TRACE_COLOR = Rgba(0.6, 0.1, 0.65), Rgba(0.6, 0.1, 0.65)
+#: Distance between two positions of which the second one begins a new trace [m], e.g. of two poses without a motion. At
+#: 1 m/s, the positions of 30 pictures per second differ by 0.033 m.
+TRACE_JUMP = 0.1
 #: Shortest distance between two points of the trace [m]. Maximum number of points.
 TRACE_STEP, TRACE_POINTS = 5e-4, 2000
 
@@ -68,8 +71,11 @@ class TipTrace:
     def draw(self) -> None:
         """Adds the current position. Meshcat cannot record a growing line, so a recording shows the whole line."""
         p = self._joints.frame_pose(self._frame_name).translation()
-        if self._points and np.linalg.norm(p - self._points[-1]) < TRACE_STEP:
+        step = np.linalg.norm(p - self._points[-1]) if self._points else np.inf
+        if step < TRACE_STEP:
             return
+        if TRACE_JUMP < step < np.inf:
+            self.clear()
         self._points.append(p)
         if len(self._points) > 1:
             points = np.asfortranarray(np.array(self._points).T)
