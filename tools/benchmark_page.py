@@ -1,4 +1,4 @@
-"""Writes the measured results into docs/benchmarks.md: runs its commands and replaces their outputs.
+"""Writes the measured results into docs/benchmark_tables.md: runs its commands and replaces their outputs.
 
 DVRK_DRAKE_SHARED=FOLDER python tools/benchmark_page.py             # all commands, for hours
 DVRK_DRAKE_SHARED=FOLDER python tools/benchmark_page.py payload     # commands that contain a word
@@ -25,7 +25,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmark_tables.md"
 BLOCK = re.compile(r"<!-- run: (?P<command>.+?) -->\n(?P<output>.*?)<!-- end -->\n", re.DOTALL)
 
 
@@ -40,7 +40,8 @@ def commit() -> str:
     """Returns the commit of the repository, with "-dirty" if a file other than the page was changed."""
     git = ["git", "-C", str(ROOT)]
     name = subprocess.check_output([*git, "rev-parse", "--short=8", "HEAD"], text=True).strip()
-    changes = subprocess.check_output([*git, "status", "--porcelain", "-uno", ".", ":!docs/benchmarks.md"], text=True)
+    status = [*git, "status", "--porcelain", "-uno", ".", ":!docs/benchmark_tables.md"]
+    changes = subprocess.check_output(status, text=True)
     return f"{name}-dirty" if changes else name
 
 

@@ -2,7 +2,7 @@
 
 The thresholds follow from the two uses of a model. With gravity compensation only, dry friction must hold the joint
 despite the error. With position control, the error must not deflect the joint by more than 15 mrad at its stiffness.
-docs/benchmarks.md contains the evidence for the largest ratios.
+docs/benchmark_tables.md contains the evidence for the largest ratios.
 """
 
 from __future__ import annotations

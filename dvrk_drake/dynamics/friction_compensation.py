@@ -18,7 +18,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 #: Largest travel before sliding [rad], [m] of the presliding effects that are assumed to hold the arm at rest. It is
-#: the largest drift after a release that is accepted (figures 5, 6 and 8 in docs/benchmarks.md).
+#: the largest drift after a release that is accepted (figures 5, 6 and 8 in docs/benchmark_tables.md).
 HOLDING_TRAVEL = 0.015, 0.0015
 #: Largest `ActuatorEffect.scale` [rad/s], [m/s] of the Coulomb effects that are assumed to hold the arm at rest.
 HOLDING_SPEED = 0.25, 0.025

@@ -24,7 +24,7 @@ _HEADER = ("estimate", "95 % interval", "SDF")
 _NOTE = (
     "The intervals describe the scatter of the measurements. They do not include the selection of effects, and errors "
     "of the kinematics or of the effort calibration. On simulated arms, they contain less than 95 % of the true values "
-    "(docs/benchmarks.md, coverage of the intervals)."
+    "(docs/benchmark_tables.md, coverage of the intervals)."
 )
 
 
