@@ -2,9 +2,9 @@
 
     python benchmarks/command_flood.py [--seconds 5] [--kinds garbage,session,...] [--no-key]
 
-`dvrk-drake arm` runs at 1 kHz. A small controller sends an effort command for each status. A third process publishes
-foreign messages on the command channel as fast as possible. The benchmark measures without and with this flood, for
-each kind of message:
+`dvrk-drake sim-arm` runs at 1 kHz. A small controller sends an effort command for each status. A third process
+publishes foreign messages on the command channel as fast as possible. The benchmark measures without and with this
+flood, for each kind of message:
 
     garbage     300 random bytes
     session     a valid command of another session

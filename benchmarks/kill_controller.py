@@ -2,9 +2,9 @@
 
     python benchmarks/kill_controller.py [--kills 10] [--realtime]
 
-The script starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold` as separate processes. It kills the
-controller after its efforts have acted for 0.3 s to 0.6 s. Then it starts a new controller with `run --reset` for the
-next kill. The script measures on an otherwise idle computer, and with two busy processes.
+The script starts the arm of `dvrk-drake sim-arm` and `dvrk-drake control --mode hold` as separate processes. It kills
+the controller after its efforts have acted for 0.3 s to 0.6 s. Then it starts a new controller with `control --reset`
+for the next kill. The script measures on an otherwise idle computer, and with two busy processes.
 
 The measurement starts just before the call that sends the signal. It ends at the clock time of the step in which the
 guard changed to HOLD. All processes use the same monotonic clock. Therefore the result does not include delays of the
@@ -84,7 +84,7 @@ class Arm:
 
 
 def run_arm(name: str, realtime: bool) -> None:
-    """Runs an arm like `dvrk-drake arm`; prints state changes with the last clock reading of the guard [ns]."""
+    """Runs an arm like `dvrk-drake sim-arm`; prints state changes with the last clock reading of the guard [ns]."""
     arm = load_arm(name)
     read = [0]
 
@@ -127,7 +127,7 @@ def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subpr
 def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[float], list[str], int]:
     """Returns the times from the kill to HOLD [s], the reasons of the guard, and the number of holds before a kill."""
     options = ["--realtime"] if realtime else []
-    run = ["run", "--arm", name, "--mode", "hold", "--reset", *options]
+    run = ["control", "--arm", name, "--mode", "hold", "--reset", *options]
     forkserver = multiprocessing.get_context("forkserver")
     times: list[float] = []
     reasons: list[str] = []

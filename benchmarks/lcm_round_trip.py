@@ -1,4 +1,4 @@
-"""Measures the round-trip time of `dvrk-drake run` over LCM at 1 kHz, in comparison with a minimal Python echo.
+"""Measures the round-trip time of `dvrk-drake control` over LCM at 1 kHz, in comparison with a minimal Python echo.
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
@@ -6,9 +6,9 @@ The process of the arm measures the time from sending a status to receiving the 
 arms:
 
     standing    bridge that sends the messages of a driver at 1 kHz without physics, to time the controller
-    simulated   arm of `dvrk-drake arm`, which receives a command after it has computed its next state
+    simulated   arm of `dvrk-drake sim-arm`, which receives a command after it has computed its next state
 
-The controllers are separate processes: `dvrk-drake run --mode hold`, and an echo, which only decodes a status and
+The controllers are separate processes: `dvrk-drake control --mode hold`, and an echo, which only decodes a status and
 encodes a command. Each controller is measured under three conditions: on an otherwise idle computer, with `dvrk-drake
 view --live` and a client of its page, or with a busy process on every core. Each condition is measured without and with
 real-time scheduling (`--realtime`). With real-time scheduling, arm and controller have one core each.
@@ -53,7 +53,7 @@ ARM = load_arm("mtml")
 ARMS = ("standing", "simulated")
 SCHEDULINGS = {"normal": False, "real-time": True}
 CONDITIONS = ("quiet", "Meshcat client", "cores busy")
-RUN = ["-m", "dvrk_drake.cli", "run", "--arm", ARM.name.lower(), "--mode", "hold"]
+RUN = ["-m", "dvrk_drake.cli", "control", "--arm", ARM.name.lower(), "--mode", "hold"]
 
 
 class Times:
@@ -125,7 +125,7 @@ class StandingArm:
 
 
 class TimedSimulatedArm(SimulatedArm):
-    """Simulated arm of `dvrk-drake arm` that stores the times of its messages."""
+    """Simulated arm of `dvrk-drake sim-arm` that stores the times of its messages."""
 
     def __init__(self) -> None:
         self.times = Times()
@@ -298,7 +298,9 @@ def table(options: argparse.Namespace) -> None:
                     f"{name}: echo", measure([__file__, "--echo"], simulated, condition, options.seconds, realtime)
                 )
                 print("  1.00 |")
-                ours = report(f"{name}: dvrk-drake run", measure(RUN, simulated, condition, options.seconds, realtime))
+                ours = report(
+                    f"{name}: dvrk-drake control", measure(RUN, simulated, condition, options.seconds, realtime)
+                )
                 print(f" {ours / reference:5.2f} |")
 
 

@@ -284,7 +284,7 @@ WORK = (
 )
 #: Mapping from a command to the files that are damaged one after the other. Output names begin with "out".
 COMMANDS = {
-    "model --arm arm.yaml --format python --output out.py": (
+    "equations --arm arm.yaml --format python --output out.py": (
         "arm.yaml",
         "mechanism.yaml",
         "mechanism.sdf",
@@ -315,8 +315,8 @@ COMMANDS = {
     "study study.yaml --output results.csv": ("study.yaml", "results.csv"),
     "tune --arm arm.yaml --output out.yaml": ("arm.yaml",),
     "transparency --arm psm --path motion.csv --model psm.yaml": ("motion.csv", "psm.yaml"),
-    "arm --arm arm.yaml --driver driver.yaml": ("driver.yaml",),
-    "run --arm mtml --model mtml.yaml --mode hold --gains gains.yaml": ("mtml.yaml", "gains.yaml"),
+    "sim-arm --arm arm.yaml --driver driver.yaml": ("driver.yaml",),
+    "control --arm mtml --model mtml.yaml --mode hold --gains gains.yaml": ("mtml.yaml", "gains.yaml"),
     "collect --arm psm --poses poses.yaml --output collection.csv": ("poses.yaml", "collection.csv"),
     "collect --arm psm --poses poses.yaml --random 2": ("poses.yaml",),
     "record out.csv --arm arm.yaml": ("arm.yaml",),

@@ -30,7 +30,7 @@ class Background:
     """
 
     def __init__(self, command: str) -> None:
-        """Starts a command, for example "dvrk-drake arm --arm mtml"."""
+        """Starts a command, for example "dvrk-drake sim-arm --arm mtml"."""
         self.command = command
         self._folder = tempfile.TemporaryDirectory()
         self._log, self._shown = Path(self._folder.name) / "output", 0

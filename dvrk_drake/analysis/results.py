@@ -115,7 +115,7 @@ class Validation(Reportable, ABC):
         return self.model.provenance.includes(self.recording.sha256)
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the model with the verdicts. `dvrk-drake run` prints a warning for a model without verdicts.
+        """Writes the model with the verdicts. `dvrk-drake control` prints a warning for a model without verdicts.
 
         Args:
             path: File of the model, or a new file.

@@ -134,7 +134,7 @@ Key = Annotated[
     str | None,
     Parameter(
         metavar="FILE",
-        help="File with the key to sign and verify messages. dvrk-drake key creates this file. "
+        help="File with the key to sign and verify messages. dvrk-drake keygen creates this file. "
         "The arm and the controller need the same key.",
     ),
 ]

@@ -197,7 +197,7 @@ def _print_result(folder: Path, arm: LoadedArm, name: str) -> None:
         return
     model = folder / DYNAMIC
     print(
-        f"Next: dvrk-drake run --arm {name} --model {model} --friction-model {model} --friction-ratio 0.3\n"
+        f"Next: dvrk-drake control --arm {name} --model {model} --friction-model {model} --friction-ratio 0.3\n"
         f"In the driver's configuration of the arm: model: {model.resolve()}",
         flush=True,
     )

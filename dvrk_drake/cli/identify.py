@@ -196,7 +196,7 @@ def validate(
 
     Args:
         require: Exit with code 2 unless each joint with feedforward has at least this verdict.
-        save: Store the verdicts in the model file; dvrk-drake run checks them.
+        save: Store the verdicts in the model file; dvrk-drake control checks them.
     """
     from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console

@@ -49,7 +49,7 @@ class ControlledArm:
 
 
 @app.command(group=HARDWARE)
-def key(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
+def keygen(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
     """Create a key to sign LCM messages.
 
     Args:
@@ -65,7 +65,7 @@ def key(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
 
 
 @app.command(group=HARDWARE)
-def run(
+def control(
     *,
     controlled: ControlledArm,
     mode: Literal["gravity", "damped", "hold"] = "gravity",
@@ -316,7 +316,7 @@ def checked_start(
     if obstacle := path_obstacle(model.arm, q, q_end, environment, model):
         raise CollectionError(
             f"{model.arm.name} cannot move from its present pose to the first pose: {obstacle}. Move the arm by hand "
-            "to another pose first (dvrk-drake run --mode gravity)"
+            "to another pose first (dvrk-drake control --mode gravity)"
         )
     return q
 

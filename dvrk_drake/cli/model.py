@@ -14,7 +14,7 @@ from dvrk_drake.errors import DvrkDrakeError
 
 
 @app.command(group=MODEL)
-def model(
+def equations(
     *,
     arm: Arm,
     format: Literal["latex", "python", "c"] | None = None,

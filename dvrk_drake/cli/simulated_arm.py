@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class SimulatedRos:
-    """Options of `arm` for a simulated arm on ROS 2."""
+    """Options of `sim-arm` for a simulated arm on ROS 2."""
 
     ros: Annotated[
         bool, Parameter(show_default=False, help="Use ROS 2 instead of LCM, with the CRTK topics of a dVRK.")
@@ -60,7 +60,7 @@ _ROS = SimulatedRos()
 
 
 @app.command(group=HARDWARE)
-def arm(
+def sim_arm(
     *,
     arm: Arm,
     driver: Annotated[str | None, Parameter(metavar="FILE.yaml")] = None,
@@ -119,7 +119,7 @@ def arm(
 def _run_ros_arm(
     arm: LoadedArm, options: SimulatedRos, pose: list[float] | None, effects: ArmEffects | None, realtime: bool
 ) -> None:
-    """Runs the simulated arm of `arm --ros` until a signal.
+    """Runs the simulated arm of `sim-arm --ros` until a signal.
 
     Raises:
         DvrkDrakeError: An option is not valid, or the ROS domain cannot be used.

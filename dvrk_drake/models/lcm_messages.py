@@ -72,7 +72,7 @@ class MessageKey:
             size = f"more than {_MAX_LENGTH}" if len(key) > _MAX_LENGTH else str(len(key))
             raise KeyFileError(
                 f"{path}: the key has {size} bytes; allowed: {_MIN_LENGTH} to {_MAX_LENGTH}. "
-                "Create a key with: dvrk-drake key --output FILE"
+                "Create a key with: dvrk-drake keygen --output FILE"
             ) from error
 
     def sign(self, data: bytes) -> bytes:

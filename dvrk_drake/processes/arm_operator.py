@@ -52,7 +52,7 @@ class ArmObservation:
         """Returns why the arm is in its state, and what the operator can do next ("" if nothing is to be done)."""
         first, last = self.first, self.last
         arm = f"--arm {last.arm_name.lower()}"
-        reset = f"look at the arm, remove the cause, then: dvrk-drake run {arm} --reset"
+        reset = f"look at the arm, remove the cause, then: dvrk-drake control {arm} --reset"
         if last.utime == first.utime and first.utime:
             why = f"no new measurement arrives ({last.fault_text or 'no fault'})"
             return why, f"check the process of the arm and its connection. Then {reset}"
@@ -75,7 +75,7 @@ class ArmObservation:
                 "give the arm's key to the controller",
             )
         if not self.commands:
-            return "no controller sends commands", f"dvrk-drake run {arm}"
+            return "no controller sends commands", f"dvrk-drake control {arm}"
         return f"sender {last.command_sender_id} sends {self.commands / self.seconds:.0f} commands per second", ""
 
 

@@ -1,4 +1,4 @@
-"""Process that controls one arm over LCM, started by `dvrk-drake run`."""
+"""Process that controls one arm over LCM, started by `dvrk-drake control`."""
 
 from __future__ import annotations
 

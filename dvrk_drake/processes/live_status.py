@@ -1,4 +1,4 @@
-"""Live status of a control loop, displayed by `dvrk-drake run` and `collect`."""
+"""Live status of a control loop, displayed by `dvrk-drake control` and `collect`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Process that simulates one arm with an LCM interface, started by `dvrk-drake arm`."""
+"""Process that simulates one arm with an LCM interface, started by `dvrk-drake sim-arm`."""
 
 from __future__ import annotations
 

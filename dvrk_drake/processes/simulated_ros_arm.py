@@ -1,4 +1,4 @@
-"""Process that simulates one dVRK arm with CRTK topics over ROS 2, started by `dvrk-drake arm --ros`."""
+"""Process that simulates one dVRK arm with CRTK topics over ROS 2, started by `dvrk-drake sim-arm --ros`."""
 
 from __future__ import annotations
 

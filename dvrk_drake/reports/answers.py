@@ -49,7 +49,7 @@ def answer_of(
         result: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
         file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
-        saved: Whether the verdicts of a validation are stored in the model file, from which the command `run` reads
+        saved: Whether the verdicts of a validation are stored in the model file, from which the command `control` reads
             them.
     """
     if isinstance(result, Validation):
@@ -103,7 +103,7 @@ def _after_validation(validation: Validation, model_path: str, file_options: str
     if arm.locked_joints:  # run requires all joints
         command = f"dvrk-drake predict {source} --model {model_path} --output FILE.csv"
         return command, "Predict the efforts of a recording of these joints."
-    command = f"dvrk-drake run --arm {arm.source} --model {model_path} --mode damped"
+    command = f"dvrk-drake control --arm {arm.source} --model {model_path} --mode damped"
     return command, "Compensate gravity on the arm, with damping."
 
 

@@ -24,7 +24,7 @@ With a real arm:
 4. Disable the gravity compensation of the dVRK controller. Otherwise gravity is
    compensated twice. Keep a hand on the emergency stop.
 5. Only if no verdict is "do not use":
-   dvrk-drake run --arm {arm} --model model.yaml --mode damped
+   dvrk-drake control --arm {arm} --model model.yaml --mode damped
 """
 #: Note on the simulated arm and on the start of the release.
 GROUND_TRUTH = (

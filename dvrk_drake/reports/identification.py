@@ -105,7 +105,7 @@ def print_validation(
         validation: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
         file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
-        saved: Whether the verdicts are stored in the model file, from which the command `run` reads them.
+        saved: Whether the verdicts are stored in the model file, from which the command `control` reads them.
         verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
     """
     answer = answer_of(validation, model_path=model_path, file_options=file_options, saved=saved)

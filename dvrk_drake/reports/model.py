@@ -21,7 +21,7 @@ def print_symbolic_model(console: Console, gravity: SymbolicGravity, *, verbose:
     print_answer(
         console,
         f"The gravity torque of {arm.name} depends on {len(base.names)} base parameters.",
-        f"dvrk-drake model --arm {arm.source} --format latex",
+        f"dvrk-drake equations --arm {arm.source} --format latex",
     )
     table = make_table(f"{arm.name}: base parameters of gravity", "", "nominal value (SDF)", "unit")
     for name, value, unit in zip(base.names, gravity.base_values, base.units, strict=True):

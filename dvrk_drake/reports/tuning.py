@@ -37,7 +37,7 @@ def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = N
         f"Gains of method {best} are {verdict} {OWN}: settled steps and mean settling time {found}; {OWN}: {own}.",
         f"dvrk-drake tune --arm {name} --output GAINS.yaml"
         if gains_path is None
-        else f"dvrk-drake run --arm {name} --mode hold --gains {gains_path}",
+        else f"dvrk-drake control --arm {name} --mode hold --gains {gains_path}",
         "green" if verdict == "better than" else "yellow",
     )
     _print_summary(console, comparison)

@@ -39,7 +39,7 @@ class HardwareArmStation(Diagram):
     If the watchdog of the guard holds the arm, e.g. because this process stopped for 50 ms, an operator must resume:
 
     1. Stop this process and inspect the arm.
-    2. Run `dvrk-drake run --reset`, then stop it.
+    2. Run `dvrk-drake control --reset`, then stop it.
     3. Start this process again.
     """
 

@@ -1,4 +1,4 @@
-"""Verdict on each joint of a model: the rule, its evidence, and its use in `validate` and `run`."""
+"""Verdict on each joint of a model: the rule, its evidence, and its use in `validate` and `control`."""
 
 from __future__ import annotations
 

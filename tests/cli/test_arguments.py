@@ -26,18 +26,18 @@ def refused(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["modl"], 'Unknown command "modl". Did you mean "model"? See dvrk-drake --help'),
+        (["equation"], 'Unknown command "equation". Did you mean "equations"? See dvrk-drake --help'),
         (["--overwrite"], 'Unknown command "--overwrite"; see dvrk-drake --help'),
         (["predict", "r.csv", "--mdel", "m.yaml"], "--model is required. Did you mean --model instead of --mdel? See"),
         (["check", "r.csv", "--arm", "psm", "--arm", "psm"], "Parameter --arm specified multiple times; see"),
-        (["arm", "--arm", "psm", "--pose", "-0.1", "-2e-1"], "a pose of PSM is 7 finite numbers"),
+        (["sim-arm", "--arm", "psm", "--pose", "-0.1", "-2e-1"], "a pose of PSM is 7 finite numbers"),
         (["identify", "--nonsense"], "Unknown option: --nonsense; see dvrk-drake identify --help"),
         (
             ["identify", "a.csv", "--output", "b.yaml"],
             "--arm is required: mtml, mtmr, psm, or the path of a YAML, URDF, SDF or MJCF file; see",
         ),
         (["validate", "a.csv"], "--model is required: the model file that identify wrote; see"),
-        (["model", "--arm", __file__], f"{__file__} is not the file of an arm; known arms"),
+        (["equations", "--arm", __file__], f"{__file__} is not the file of an arm; known arms"),
         (["identify", "a.csv", "--arm", "psm"], "--output is required; see dvrk-drake identify --help"),
         (["validate", "a.csv", "b.csv", "--model", "m.yaml"], "Unexpected argument: b.csv; see"),
         (["tune", "--arm", "psm", "--method", "guess"], 'Invalid value "guess" for --method. Choose from: "paper"'),
@@ -59,10 +59,10 @@ def refused(capsys, *arguments):
         (["simulate", "psm"], "psm is an arm, not a scenario; use --arm psm"),
         (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; use --arm psm"),
         (["check", "a.csv", "--model", "mtmr"], "mtmr is an arm, not a model; use --arm mtmr"),
-        (["arm", "--arm", "psm", "--rate", "abc"], 'Invalid value for --rate: must be a number, not "abc"; see'),
-        (["arm", "--arm", "psm", "--rate", "100"], "--rate requires --ros"),
-        (["arm", "--arm", "psm", "--enabled", "--topic", "/P"], "--topic and --enabled require --ros"),
-        (["arm", "--arm", "psm", "--ros", "--lcm-url", "memq://"], "--lcm-url cannot be used with --ros"),
+        (["sim-arm", "--arm", "psm", "--rate", "abc"], 'Invalid value for --rate: must be a number, not "abc"; see'),
+        (["sim-arm", "--arm", "psm", "--rate", "100"], "--rate requires --ros"),
+        (["sim-arm", "--arm", "psm", "--enabled", "--topic", "/P"], "--topic and --enabled require --ros"),
+        (["sim-arm", "--arm", "psm", "--ros", "--lcm-url", "memq://"], "--lcm-url cannot be used with --ros"),
         (["record", "r.csv", "--arm", "psm", "--domain", "0"], "--domain requires --ros"),
         (
             ["collect", "--arm", "psm", "--poses", "p", "--output", "o", "--yes", "--topic", "/P", "--max-effort", "0"],
@@ -72,8 +72,8 @@ def refused(capsys, *arguments):
             ["simulate", "x.csv"],
             "x.csv is not a scenario: its name does not end in .yaml. Give a scenario file, or an arm",
         ),
-        (["model", "--arm", "mtmrr"], 'unknown arm "mtmrr"; did you mean "mtmr"'),
-        (["model", "--arm", "mtmx"], 'unknown arm "mtmx"; known arms'),
+        (["equations", "--arm", "mtmrr"], 'unknown arm "mtmrr"; did you mean "mtmr"'),
+        (["equations", "--arm", "mtmx"], 'unknown arm "mtmx"; known arms'),
     ],
 )
 def test_invalid_arguments_give_one_line(arguments, message, capsys):
@@ -81,7 +81,7 @@ def test_invalid_arguments_give_one_line(arguments, message, capsys):
 
 
 def test_rejects_too_few_numbers(capsys):
-    assert "--gravity needs 3 values, got 2" in refused(capsys, "model", "--arm", "psm", "--gravity", "1", "2")
+    assert "--gravity needs 3 values, got 2" in refused(capsys, "equations", "--arm", "psm", "--gravity", "1", "2")
 
 
 HELP = """

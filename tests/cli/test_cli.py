@@ -125,7 +125,7 @@ def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
     q = np.random.default_rng(0).uniform(-2, 2, (5, 7))
     expected = model.torque(q, model.gravity.base_values)
 
-    assert main(["model", "--arm", "mtml", "--format", "python"]) == 0
+    assert main(["equations", "--arm", "mtml", "--format", "python"]) == 0
     namespace: dict = {}
     exec(capsys.readouterr().out, namespace)
     beta = [value for value, _ in namespace["BASE_PARAMETERS"]]
@@ -136,7 +136,7 @@ def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
         np.testing.assert_allclose(out, tau, atol=1e-12)
         np.testing.assert_allclose(Y @ beta, tau, atol=1e-12)
 
-    assert main(["model", "--arm", "mtml", "--format", "c", "--output", str(tmp_path / "g.c")]) == 0
+    assert main(["equations", "--arm", "mtml", "--format", "c", "--output", str(tmp_path / "g.c")]) == 0
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         pytest.skip("no C compiler here: the exported C was not compiled")
@@ -155,7 +155,7 @@ def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
 
 
 def test_latex_contains_all_parameters_and_torques(capsys):
-    assert main(["model", "--arm", "mtml", "--format", "latex"]) == 0
+    assert main(["equations", "--arm", "mtml", "--format", "latex"]) == 0
     text = capsys.readouterr().out
     for i in range(1, 13):
         assert rf"\beta_{{{i}}} &=" in text
@@ -169,10 +169,10 @@ def test_latex_contains_all_parameters_and_torques(capsys):
 
 
 def test_gravity_option_changes_the_base_parameters(capsys):
-    assert main(["model", "--arm", "mtml", "--gravity", "0", "9.81", "0"]) == 0
+    assert main(["equations", "--arm", "mtml", "--gravity", "0", "9.81", "0"]) == 0
     assert "m1 c1x" in capsys.readouterr().out
     for language in ("c", "python", "latex"):
-        assert main(["model", "--arm", "mtml", "--format", language, "--gravity", "0", "9.81", "0"]) == 0
+        assert main(["equations", "--arm", "mtml", "--format", language, "--gravity", "0", "9.81", "0"]) == 0
         first = capsys.readouterr().out.splitlines()[0]
         assert "gravity (0, 9.81, 0) m/s^2" in first
 
@@ -184,7 +184,7 @@ def test_input_files_are_never_replaced(folder, capsys):
     assert "is an input" in fails(capsys, "predict", poses, "--model", model, "--output", poses)
     assert "is an input" in fails(capsys, "validate", poses, "--model", model, "--json", model)
     assert "not a regular file" in fails(capsys, "predict", poses, "--model", model, "--output", folder)
-    assert "--output requires --format" in fails(capsys, "model", "--arm", "mtml", "--output", folder / "x.txt")
+    assert "--output requires --format" in fails(capsys, "equations", "--arm", "mtml", "--output", folder / "x.txt")
     assert (poses.read_bytes(), model.read_bytes()) == before
 
 
@@ -202,16 +202,16 @@ WRITE_A_FILE = [
     "export --arm mtml --urdf",
     "export --arm mtml --dvrk-gc",
     "export --arm psm --dvrk-kinematic-gc",
-    "model --arm mtml --format c --output",
+    "equations --arm mtml --format c --output",
     "simulate --arm mtml --output",
     "tune --arm mtml --output",
     "transparency --arm mtml --output",
     "teleop --output",
-    "key --output",
+    "keygen --output",
     "record --arm mtml --lcm-url memq://",
 ]
 #: Commands that never replace a file.
-KEEP_ALWAYS = ("key", "record")
+KEEP_ALWAYS = ("keygen", "record")
 
 
 @pytest.mark.parametrize("command", WRITE_A_FILE)
@@ -264,7 +264,7 @@ def test_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkeypa
         ("export --model {0}/model.yaml --sdf o.sdf --urdf o.urdf", ["o.sdf", "o.urdf", "o_meshes"]),
         ("simulate --arm mtmr --set duration=0.02 --output o.csv --plots p", ["o.csv", "p"]),
         ("collect --arm psm --poses o.yaml --random 3", ["o.yaml"]),
-        ("key --output o.key", ["o.key"]),
+        ("keygen --output o.key", ["o.key"]),
     ],
 )
 def test_commands_print_the_written_paths(command, written, folder, tmp_path, monkeypatch, capsys):
@@ -288,7 +288,7 @@ def test_validate_keeps_a_folder_with_files(folder, tmp_path, capsys):
 def test_overwrite_replaces_an_existing_output(tmp_path, capsys):
     out = tmp_path / "g.c"
     out.write_text("mine")
-    assert main(["model", "--arm", "mtml", "--format", "c", "--output", str(out), "--overwrite"]) == 0
+    assert main(["equations", "--arm", "mtml", "--format", "c", "--output", str(out), "--overwrite"]) == 0
     assert "mtml_gravity_torque" in out.read_text()
     assert capsys.readouterr().out == f"wrote {out}\n"
 
@@ -306,7 +306,7 @@ def test_commands_accept_an_arm_file(folder, tmp_path, capsys):
     capsys.readouterr()
     arm_file.write_text(text + "coupled_limit_bounds:\n  parallelogramm: [-0.22, 0.5]\n")
     (tmp_path / "other.yaml").write_text(arm_file.read_text())
-    assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "model", "--arm", tmp_path / "other.yaml")
+    assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "equations", "--arm", tmp_path / "other.yaml")
 
 
 def test_validate_writes_null_for_a_joint_without_effort(folder, tmp_path):
@@ -325,7 +325,7 @@ def test_interrupt_during_import_gives_one_line_and_130():
         "real = importlib.import_module\n"
         "def interrupted(name): os.kill(os.getpid(), signal.SIGINT); return real(name)\n"
         "importlib.import_module = interrupted\n"
-        "sys.exit(cli.main(['model', '--arm', 'mtml']))\n"
+        "sys.exit(cli.main(['equations', '--arm', 'mtml']))\n"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert process.returncode == 130
@@ -356,7 +356,7 @@ def test_interrupt_at_any_import_gives_one_line(module):
     assert process.returncode == 130
 
 
-@pytest.mark.parametrize("command", ["arm", "run", "collect", "teach"])
+@pytest.mark.parametrize("command", ["sim-arm", "control", "collect", "teach"])
 def test_interrupt_is_not_lost_in_extension_modules(command, tmp_path, monkeypatch):
     poses, out = str(tmp_path / "poses.yaml"), str(tmp_path / "out.csv")
     words = [command]
@@ -462,7 +462,7 @@ def test_model_is_saved_before_a_closed_pipe(folder, tmp_path):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full here")
 def test_full_disk_gives_one_line():
-    command = [sys.executable, "-m", "dvrk_drake.cli", "model", "--arm", "mtml"]
+    command = [sys.executable, "-m", "dvrk_drake.cli", "equations", "--arm", "mtml"]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2

@@ -50,7 +50,7 @@ def test_commands_accept_a_model_file(tmp_path, monkeypatch, capsys):
         "simulate scenario.yaml --output held.csv",
         "transparency --arm random.urdf --path motion_0.csv --speed 5",
         "study study.yaml --output study.csv --workers 1",
-        "model --arm random.urdf --format c --output gravity.c",
+        "equations --arm random.urdf --format c --output gravity.c",
         "tune --arm random.urdf --method model --output gains.yaml",
         "export --model model.yaml --sdf identified.sdf",
         "export --model model.yaml --urdf identified.urdf",

@@ -65,7 +65,7 @@ def test_key_is_the_content_of_its_file(tmp_path, size):
         (
             KEY[:15],
             0o600,
-            r"a\.key: the key has 15 bytes; allowed: 16 to 64\. Create a key with: dvrk-drake key --output FILE",
+            r"a\.key: the key has 15 bytes; allowed: 16 to 64\. Create a key with: dvrk-drake keygen --output FILE",
         ),
         (b"", 0o600, r"a\.key: the key has 0 bytes"),
         (bytes(65), 0o600, r"a\.key: the key has more than 64 bytes"),
@@ -79,8 +79,8 @@ def test_invalid_keys_are_refused_in_one_line(tmp_path, content, mode, message, 
     with pytest.raises(KeyFileError, match=message):
         MessageKey.load(path)
     for command in (
-        ["run", "--arm", "mtml"],
-        ["arm", "--arm", "mtml"],
+        ["control", "--arm", "mtml"],
+        ["sim-arm", "--arm", "mtml"],
         ["record", str(tmp_path / "a.csv"), "--arm", "mtml"],
     ):
         assert main([*command, "--key", str(path), "--lcm-url", "memq://"]) == 2
@@ -97,7 +97,7 @@ def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
     first, second = tmp_path / "a.key", tmp_path / "b.key"
     before = os.umask(0)
     try:
-        assert main(["key", "--output", str(first)]) == main(["key", "--output", str(second)]) == 0
+        assert main(["keygen", "--output", str(first)]) == main(["keygen", "--output", str(second)]) == 0
     finally:
         os.umask(before)
     assert f"{first}: copy the file to the other computer" in capsys.readouterr().out
@@ -105,7 +105,7 @@ def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
     content = first.read_bytes()
     assert len(content) == 32 and content != second.read_bytes()
     MessageKey.load(first)
-    assert main(["key", "--output", str(first)]) == 2
+    assert main(["keygen", "--output", str(first)]) == 2
     assert "a.key already exists, and a key is never overwritten" in capsys.readouterr().err
     assert first.read_bytes() == content
     with pytest.raises(KeyFileError, match="cannot be written: No such file or directory"):

@@ -172,7 +172,7 @@ def test_implausible_gains_are_refused_in_files_and_python(arm, gain, value, tmp
     path.write_text(yaml.safe_dump(gains))
     with pytest.raises(ControllerError, match=rf"gains\.yaml: {gain}\[2\] is .*; allowed: "):
         load_gains(path)
-    assert main(["run", "--arm", arm.source, "--mode", "hold", "--gains", str(path)]) == 2
+    assert main(["control", "--arm", arm.source, "--mode", "hold", "--gains", str(path)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and f"{gain}[2] is " in error
 
@@ -284,7 +284,7 @@ def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message
     with pytest.raises(ArmError, match=message) as refused:
         load_arm(str(path))
     assert "\n" not in str(refused.value) and str(path.parent) in str(refused.value)
-    assert main(["model", "--arm", str(path)]) == 2
+    assert main(["equations", "--arm", str(path)]) == 2
     assert refusal(capsys.readouterr().err)
 
 
@@ -310,7 +310,7 @@ def test_implausible_numbers_in_an_sdf_are_refused(element, value, message, own_
     path = own_psm(sdf=(element, value))
     with pytest.raises(ArmError, match=message):
         load_arm(str(path))
-    assert main(["model", "--arm", str(path)]) == 2
+    assert main(["equations", "--arm", str(path)]) == 2
     assert refusal(capsys.readouterr().err)
 
 

@@ -115,11 +115,11 @@ def ignored(link):
 @pytest.mark.parametrize(
     ("prepare", "why", "next_step"),
     [
-        (fault, "MTML: fault, fault: the amplifier is hot.", "dvrk-drake run --arm mtml --reset"),
+        (fault, "MTML: fault, fault: the amplifier is hot.", "dvrk-drake control --arm mtml --reset"),
         (power_off, "MTML: off, the motors have no power.", "switch the power on"),
-        (watchdog_hold, "until an operator resumes: its period is 20 ms.", "dvrk-drake run --arm mtml --reset"),
+        (watchdog_hold, "until an operator resumes: its period is 20 ms.", "dvrk-drake control --arm mtml --reset"),
         (own_gravity, "the arm adds its own gravity compensation", "switch off gravity_compensation"),
-        (lambda link: None, "MTML: hold, no controller sends commands.", "dvrk-drake run --arm mtml"),
+        (lambda link: None, "MTML: hold, no controller sends commands.", "dvrk-drake control --arm mtml"),
         (silent, "MTML: hold, no new measurement arrives", "check the process of the arm and its connection."),
         (refused, "MTML: hold, commands are refused: ", "correct or end the controller"),
         (ignored, "MTML: hold, messages are ignored: ", "give the arm's key to the controller"),

@@ -136,7 +136,7 @@ def test_rejects_constant_status():
     ("measured", "reported", "refused"), [(1, 1, False), (5, 5, False), (10, 10, True), (10, 1, True)]
 )
 def test_rejects_slow_measurements(measured, reported, refused):
-    """Rejects a period above 5 ms. At the 100 Hz of a dVRK, `run --mode hold` oscillates with 0.9 rad."""
+    """Rejects a period above 5 ms. At the 100 Hz of a dVRK, `control --mode hold` oscillates with 0.9 rad."""
     link, count = GuardedArm(), itertools.count()
     good = link.next_status(1.0)
 
@@ -212,7 +212,7 @@ def test_run_prints_each_change_once(controller, monkeypatch, capsys):
     )
     monkeypatch.setattr("dvrk_drake.processes.control.control", control)
     monkeypatch.setattr("dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: None)
-    assert main(["run", "--arm", "mtml", "--reset"]) == 0
+    assert main(["control", "--arm", "mtml", "--reset"]) == 0
     output = capsys.readouterr()
     assert output.out.splitlines()[1:-1] == ["hold; 1 Hz", "hold; 3 Hz; refused: stale"] * 2
     assert not output.err
@@ -221,7 +221,7 @@ def test_run_prints_each_change_once(controller, monkeypatch, capsys):
 def test_friction_requires_holding_error(tmp_path, capsys):
     path = str(tmp_path / "model.yaml")
     IdentifiedModel.from_arm(ARM).save(path)
-    assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
+    assert main(["control", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
     said = capsys.readouterr().err
     assert "friction compensation requires a model identified from static poses" in said and said.count("\n") == 1
 

@@ -210,11 +210,11 @@ def test_driver_file(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["arm", "--arm", "mtml", "--pose", "1", "2"], "a pose of MTML is 7 finite numbers"),
-        (["arm", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),
-        (["arm", "--arm", "mtml", "--driver", "nowhere.yaml"], "nowhere.yaml"),
-        (["run", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),
-        (["run", "--arm", "nobody"], 'unknown arm "nobody"'),
+        (["sim-arm", "--arm", "mtml", "--pose", "1", "2"], "a pose of MTML is 7 finite numbers"),
+        (["sim-arm", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),
+        (["sim-arm", "--arm", "mtml", "--driver", "nowhere.yaml"], "nowhere.yaml"),
+        (["control", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),
+        (["control", "--arm", "nobody"], 'unknown arm "nobody"'),
     ],
 )
 def test_invalid_input_prints_one_line_and_exits_with_2(arguments, message, capfd):
@@ -226,7 +226,7 @@ def test_invalid_input_prints_one_line_and_exits_with_2(arguments, message, capf
 def test_rejects_model_of_another_arm(tmp_path, capfd):
     path = tmp_path / "model.yaml"
     IdentifiedModel.from_arm(load_arm("mtmr")).save(path)
-    assert main(["run", "--arm", "mtml", "--model", str(path)]) == 2
+    assert main(["control", "--arm", "mtml", "--model", str(path)]) == 2
     assert "model.yaml: the model is for MTMR, not for MTML" in capfd.readouterr().err
 
 

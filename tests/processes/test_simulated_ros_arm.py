@@ -1,4 +1,4 @@
-"""`dvrk-drake arm --ros`: a real process over DDS in a network namespace, and refused options."""
+"""`dvrk-drake sim-arm --ros`: a real process over DDS in a network namespace, and refused options."""
 
 import signal
 import sys
@@ -54,7 +54,7 @@ class Client:
 
     def __init__(self, arm, namespace, *options):
         self.arm = load_arm(arm)
-        self.process = dvrk_drake("arm", "--arm", arm, "--ros", *options)
+        self.process = dvrk_drake("sim-arm", "--arm", arm, "--ros", *options)
         self.domain, self.namespace = ros.RosDomain(0), namespace
         jaw = self.arm.separate_joint
         self.num_main = self.arm.num_joints - bool(jaw)
@@ -209,7 +209,7 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     client.send("servo_jp", 0.0, 0.0, 0.05, 0.0, 0.0, 0.0)
     client.until(lambda: abs(client.position()[2] - 0.05) < 2e-3, "insertion")
     # A second arm with the same topics is refused, and a client of the first arm would notice its measurements.
-    other = dvrk_drake("arm", "--arm", "psm", "--ros", "--topic", "dvrk/PSM2")
+    other = dvrk_drake("sim-arm", "--arm", "psm", "--ros", "--topic", "dvrk/PSM2")
     assert other.wait() == 2
     assert "another arm publishes /dvrk/PSM2/measured_js in ROS domain 0. End it, or " in other.output()
     second = client.domain.advertise("/dvrk/PSM2/measured_js", JointState)
@@ -237,11 +237,11 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     ],
 )
 def test_wrong_options_are_refused(options, message, capsys):
-    assert main(["arm", "--arm", "mtml", *options]) == 2
+    assert main(["sim-arm", "--arm", "mtml", *options]) == 2
     assert message in refusal(capsys.readouterr().err)
 
 
 def test_package_is_required(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
-    assert main(["arm", "--arm", "mtml", "--ros"]) == 2
+    assert main(["sim-arm", "--arm", "mtml", "--ros"]) == 2
     assert "ROS 2 needs the package cyclonedds: pip install cyclonedds" in refusal(capsys.readouterr().err)

@@ -20,7 +20,7 @@ SPEED, MAX_DISTANCE_BEYOND = 0.1, 0.01
 
 
 class Loop:
-    """SimulatedArm with the controller of `run --mode hold` and an injected wall clock, at 1 kHz.
+    """SimulatedArm with the controller of `control --mode hold` and an injected wall clock, at 1 kHz.
 
     The start takes longer than a stall. Each test forks the process, so that its stall changes only a copy.
     """
@@ -63,7 +63,7 @@ class Loop:
         self.arm.stall(seconds)
 
     def stall_process(self, seconds):
-        """The arm's clock and the simulation stand still, as when `dvrk-drake arm` is stopped."""
+        """The arm's clock and the simulation stand still, as when `dvrk-drake sim-arm` is stopped."""
         self.wait(seconds)
 
     def stall_controller(self, seconds):

@@ -116,11 +116,11 @@ def start_arm(name, *options):
     """Starts an arm at its pose of `POSES`. The default driver is `HALF_RATE_DRIVER`."""
     if "--driver" not in options:
         options += "--driver", HALF_RATE_DRIVER
-    return dvrk_drake("arm", "--arm", name, "--realtime", *options, "--pose", *POSES[name])
+    return dvrk_drake("sim-arm", "--arm", name, "--realtime", *options, "--pose", *POSES[name])
 
 
 def start_run(name, *options):
-    return dvrk_drake("run", "--arm", name, *options)
+    return dvrk_drake("control", "--arm", name, *options)
 
 
 def start_controller(name, *options):

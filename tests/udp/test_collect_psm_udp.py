@@ -22,7 +22,7 @@ def test_psm_collection_from_both_sides_completes(tmp_path):
     arm, poses, output = load_arm("psm"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
     assert main(["collect", "--arm", "psm", "--poses", str(poses), "--random", str(POSES), "--seed", "3"]) == 0
     observer = Observer("psm")
-    process = dvrk_drake("arm", "--arm", "psm", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
+    process = dvrk_drake("sim-arm", "--arm", "psm", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
     try:
         observer.until(lambda status: True, "first status", process=process)
         command = ["collect", "--arm", "psm", "--poses", poses, "--output", output]

@@ -29,7 +29,7 @@ FORGOTTEN = 0.6
 def observer():
     """Returns the output of a running arm."""
     observer = Observer("mtml")
-    process = dvrk_drake("arm", "--arm", "mtml", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
+    process = dvrk_drake("sim-arm", "--arm", "mtml", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
     observer.until(lambda status: True, "first status", process=process)
     yield observer
     said = process.end(signal.SIGINT)
@@ -73,7 +73,7 @@ def test_collect_kill_resume_identify_and_release(observer, tmp_path):
 
     model = tmp_path / "model.yaml"
     assert main(["identify", str(output), "--arm", "mtml", "--output", str(model)]) == 0
-    process = dvrk_drake("run", "--arm", "mtml", "--model", model, "--mode", "gravity", "--realtime")
+    process = dvrk_drake("control", "--arm", "mtml", "--model", model, "--mode", "gravity", "--realtime")
     begun = observer.until(accepts_efforts, "run", process=process)
     observer.during(3.0)
     released = np.array([status.position for status in observer.received[begun:]])

@@ -63,7 +63,7 @@ def loopback(monkeypatch):
 @contextlib.contextmanager
 def simulated_arm(*options):
     """Context in which a simulated MTML runs, enabled and homed."""
-    process = dvrk_drake("arm", "--arm", "mtml", "--ros", "--rate", "100", "--enabled", *options)
+    process = dvrk_drake("sim-arm", "--arm", "mtml", "--ros", "--rate", "100", "--enabled", *options)
     try:
         domain = ros.RosDomain(0)
         state = domain.subscribe("/MTML/operating_state", OperatingState, depth=100, latched=True)

@@ -240,11 +240,11 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
 @pytest.mark.watchdog
 @pytest.mark.parametrize("mode", ["gravity", "hold"])
 def test_run_starts_ramps_and_ends_in_hold(arm, mode):
-    """A watchdog test, since `run` ends if the computer stops the arm's guard for 0.5 s (`PATIENT`)."""
+    """A watchdog test, since `control` ends if the computer stops the arm's guard for 0.5 s (`PATIENT`)."""
     name, _, observer = arm
     expired = observer.last.num_expired
     starts = CommandLine if (name, mode) == ("mtml", "gravity") else dvrk_drake
-    process = starts("run", "--arm", name, "--mode", mode, "--realtime")
+    process = starts("control", "--arm", name, "--mode", mode, "--realtime")
     try:
         begun = observer.until(accepts_efforts, "run", process=process)
         observer.during(1.5)  # the ramp of the efforts takes a second
@@ -409,7 +409,7 @@ def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
 
 @pytest.mark.watchdog
 def test_restarted_arm_ignores_run_and_log(tmp_path):
-    """A watchdog test, since `run` ends if the computer stops the arm's guard for 40 ms."""
+    """A watchdog test, since `control` ends if the computer stops the arm's guard for 40 ms."""
     observer, on_other = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
     arm = start_arm("mtml", *PATIENT, *on_other)
     observer.until(lambda status: True, "first status", process=arm)

@@ -212,14 +212,14 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "width of 0.06-0.25 rad pushes joints 2 and 3 back, and less friction remains to resist the model error. "
         "The friction of joint 7 deflects by 15 mrad before it slips. An exact model causes the same drift. The "
         "published drifts of joints 2 and 3, up to 0.13 rad, have a similar size.",
-        f"**With compensated hysteresis** (`run --hysteresis-ratio {MAX_HYSTERESIS_RATIO:g}`, exact friction model), "
-        f"the arm is released at {len(hysteresis_compensated.positions)} poses. Number of failed releases by joint: "
-        f"{_any_lost(hysteresis_compensated)}. The largest drift is {_furthest(hysteresis_compensated)} mrad.",
+        f"**With compensated hysteresis** (`control --hysteresis-ratio {MAX_HYSTERESIS_RATIO:g}`, exact friction "
+        f"model), the arm is released at {len(hysteresis_compensated.positions)} poses. Number of failed releases by "
+        f"joint: {_any_lost(hysteresis_compensated)}. The largest drift is {_furthest(hysteresis_compensated)} mrad.",
         "**Without friction**, only an exact model keeps an arm at rest, because a small torque error accelerates "
         f"the wrist by tens of rad/s^2. Within {FRICTIONLESS_DURATION:g} s, the arm usually reaches a joint limit "
         f"with both models. No joint reaches a limit at {_num_staying(frictionless_paper)} (paper's) and "
         f"{_num_staying(frictionless_ours)} (ours) of {len(few)} poses. **No gravity compensation alone passes this "
-        "test.** With damping (`run --mode damped`), the arm creeps at the rates of the third table. Each rate is "
+        "test.** With damping (`control --mode damped`), the arm creeps at the rates of the third table. Each rate is "
         "the torque error divided by the damping. The arm does not accelerate.",
     )
     title = "Fig. 5: drift after release, all torques"

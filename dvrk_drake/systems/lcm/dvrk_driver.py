@@ -32,9 +32,9 @@ class DvrkDriver:
         control_modes: Modes that the arm accepts in addition to hold: position, effort and "off". Write "off" in
             quotes, because YAML reads off as false. "off" is not accepted by default, because an arm falls when its
             motors are off.
-        key_file: File with the key that signs commands and statuses, created by `dvrk-drake key`. The path is relative
-            to the driver's YAML file. If it is empty, messages are not authenticated, and any process on the network
-            can command the arm.
+        key_file: File with the key that signs commands and statuses, created by `dvrk-drake keygen`. The path is
+            relative to the driver's YAML file. If it is empty, messages are not authenticated, and any process on the
+            network can command the arm.
         gravity_compensation: If true, the arm adds its own gravity compensation to commanded efforts (an option of a
             dVRK).
         model: File of the identified model with which the guard checks measurements. The path is relative to the

@@ -97,11 +97,11 @@ def test_commands_accept_a_psm(arm, recording, tmp_path, capsys):
 
 
 def test_long_parameter_names_keep_all_digits(capsys):
-    assert main(["model", "--arm", "psm"]) == 0
+    assert main(["equations", "--arm", "psm"]) == 0
     text = capsys.readouterr().out
     assert "…" not in text
     assert "(m3+...+m6+m_finger_1+m_finger_2)" in text and "- m_counterweight" in text
-    assert main(["model", "--arm", "psm", "--format", "latex"]) == 0
+    assert main(["equations", "--arm", "psm", "--format", "latex"]) == 0
     text = capsys.readouterr().out
     assert "s_{6 - 7 / 2}" in text and "10^{-1" not in text
 
@@ -126,7 +126,7 @@ def test_bad_recordings_are_rejected_in_one_line(recording, tmp_path, capsys, sp
 
 def test_unknown_instrument_is_rejected_in_one_line(tmp_path, capsys):
     (tmp_path / "arm.yaml").write_text("name: PSM\nmechanism: psm\ninstrument: scissors\nposition_limits: {}\n")
-    assert main(["model", "--arm", str(tmp_path / "arm.yaml")]) == 2
+    assert main(["equations", "--arm", str(tmp_path / "arm.yaml")]) == 2
     assert 'unknown instrument "scissors"; known instruments: large_needle_driver' in refusal(capsys.readouterr().err)
 
 

@@ -124,7 +124,7 @@ def test_names_are_checked_before_the_search():
     [
         ["bridge"],
         ["deadman"],
-        ["arm", "--ros"],
+        ["sim-arm", "--ros"],
         ["record", "a.mcap", "--ros"],
         ["collect", "--ros", "--poses", "p.yaml", "--output", "p.csv"],
     ],
