@@ -51,7 +51,7 @@ GOAL = START + 0.1
 
 
 def serial_plant(arm: Arm) -> MultibodyPlant:
-    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    root = compose_sdf(arm.sdf)
     model = root.find("model")
     names = arm.joint_names
     ElementTree.register_namespace("drake", DRAKE.strip("{}"))

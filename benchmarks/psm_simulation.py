@@ -70,7 +70,7 @@ def motion(seconds: float) -> PiecewisePolynomial:
 
 def open_arm(folder: Path) -> Arm:
     """Returns the PSM without linkage; writes its SDF into `folder`."""
-    root = compose_sdf(ARM.sdf, ARM.mirrored_links)
+    root = compose_sdf(ARM.sdf)
     model = root.find("model")
     joints = {joint.get("name"): joint for joint in model.findall("joint")}
     joints["pitch"].find("child").text = "end_link"

@@ -11,11 +11,11 @@ from shapes import Body, write_gltf
 
 SDF_FOLDER = Path(__file__).parents[1] / "dvrk_drake/models/sdf"
 
-# Functions that make the bodies of a model, by the name of the model. Its SDF and its mesh folder have the same name.
-MODELS: dict[str, Callable[[Path], dict[str, Callable[[], Body]]]] = {
-    "mtm": mtm_shapes.bodies,
-    "psm": psm_shapes.bodies,
-    "large_needle_driver": needle_driver_shapes.bodies,
+# Mesh folder -> name of the SDF with the lengths, and function that makes the bodies.
+MODELS: dict[str, tuple[str, Callable[[Path], dict[str, Callable[[], Body]]]]] = {
+    "mtm": ("mtmr", mtm_shapes.bodies),
+    "psm": ("psm", psm_shapes.bodies),
+    "large_needle_driver": ("large_needle_driver", needle_driver_shapes.bodies),
 }
 
 
@@ -31,7 +31,8 @@ def main() -> None:
     for model in options.model or MODELS:
         folder = options.folder / model
         folder.mkdir(parents=True, exist_ok=True)
-        for link, body in MODELS[model](SDF_FOLDER / f"{model}.sdf").items():
+        sdf, bodies = MODELS[model]
+        for link, body in bodies(SDF_FOLDER / f"{sdf}.sdf").items():
             if not options.link or link in options.link:
                 path = folder / f"{link}.gltf"
                 write_gltf(body(), path)

@@ -1,7 +1,7 @@
 """Shapes of the links of the MTM.
 
 All numbers are millimetres in the link frame: +X to the operator's left, +Y toward the operator, +Z up. The lengths
-between joints are read from mtm.sdf. The links lie in parallel planes. The ranges of their parts along x are:
+between joints are read from mtmr.sdf. The links lie in parallel planes. The ranges of their parts along x are:
 
     -56 yoke | -34 pulleys, cables -27 | -25 arm 25 | 28 crank 37 | 39 coupler 47 | 56 yoke
 

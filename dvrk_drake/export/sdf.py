@@ -75,7 +75,7 @@ def with_inertias(
         ModelError: A link does not belong to the arm, an inertia is not physically consistent, or a rotor inertia is
             negative.
     """
-    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    root = compose_sdf(arm.sdf)
     elements = {link.get("name"): link for link in root.iterfind("model/link")}
     for change in changed_links(arm, links):
         element = elements[change.link]
@@ -121,7 +121,7 @@ def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mappi
     """Returns the unified diff from the arm's SDF to the SDF of `with_inertias`, or "" if nothing changes."""
     before, after = (
         to_text(root).splitlines(keepends=True)
-        for root in (compose_sdf(arm.sdf, arm.mirrored_links), with_inertias(arm, links, rotor_inertias))
+        for root in (compose_sdf(arm.sdf), with_inertias(arm, links, rotor_inertias))
     )
     return "".join(difflib.unified_diff(before, after, " + ".join(arm.sdf), "exported", n=4))
 

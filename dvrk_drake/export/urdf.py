@@ -71,7 +71,7 @@ def touching_shapes(arm: Arm) -> tuple[tuple[str, str], ...]:
     They exclude contact only between a moving link and the link that carries it. Pairs of enlarged shapes that touch at
     random poses within the limits of the arm are removed by omitting the shape with the most contacts first.
     """
-    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    root = compose_sdf(arm.sdf)
     (model,) = root.findall("model")
     for group in model.findall(f"{DRAKE}collision_filter_group"):
         model.remove(group)

@@ -53,7 +53,6 @@ class Arm:
         joint_names: Names of the n independent joints.
         tree_joint_names: Names of all joints of the SDF tree, including the linkage.
         sdf: Package URLs or paths of the SDF files: first the arm, then its instrument if there is one.
-        mirrored_links: Mapping from a URL in `sdf` to the links of that file that are mirrored for this arm.
         position_lower, position_upper: Position limits (n,) of this arm.
         effort_limits: Limits (n,) of the joint efforts, from the SDF.
         prismatic: Array (n,), True for prismatic joints [m, N], False for revolute joints [rad, N m].
@@ -95,7 +94,6 @@ class Arm:
     joint_names: tuple[str, ...]
     tree_joint_names: tuple[str, ...]
     sdf: tuple[str, ...]
-    mirrored_links: dict[str, tuple[str, ...]]
     position_lower: NDArray[np.float64] = field(metadata=POSITIONS)
     position_upper: NDArray[np.float64] = field(metadata=POSITIONS)
     effort_limits: NDArray[np.float64] = field(metadata={RANGE: EFFORTS})

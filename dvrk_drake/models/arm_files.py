@@ -180,13 +180,14 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
         description = ArmDescription(sdf=str(path))
     else:
         description = load_typed_yaml(ArmDescription, path, ArmError, "an arm file")
-    if description.mechanism and description.sdf:
-        raise ArmError(f"{path}: mechanism and sdf are both given; allowed: one of them")
+    _resolve_sdf(description, path)
     mechanism: Mechanism = description
     if description.mechanism:
         mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
-    else:
-        _resolve_sdf(description, path)
+        unstated = Mechanism()
+        stated = {key: getattr(description, key) for key in vars(unstated)}
+        stated = {key: value for key, value in stated.items() if value != getattr(unstated, key)}
+        mechanism = dataclasses.replace(mechanism, **stated)
     instrument = Instrument()
     if description.instrument:
         instrument = _load_part(Instrument, path, "instrument", description.instrument)
@@ -236,10 +237,9 @@ def _build_arm(
     source: str, path: Path, description: ArmDescription, mechanism: Mechanism, instrument: Instrument
 ) -> Arm:
     if not mechanism.sdf:
-        raise ArmError(f"{path}: {'the mechanism file has no sdf' if description.mechanism else 'sdf is missing'}")
+        raise ArmError(f"{path}: sdf is missing; state the path of the model in the arm file or in the mechanism file")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
-    mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
-    facts = read_sdf_facts(compose_sdf(sdf, mirrored))
+    facts = read_sdf_facts(compose_sdf(sdf))
     if not mechanism.joints:
         others = {*facts.mimics, *instrument.joints}
         mechanism.joints = [name for name in facts.joint_names if name not in others]
@@ -281,7 +281,6 @@ def _build_arm(
         joint_names=tuple(joints),
         tree_joint_names=facts.joint_names,
         sdf=sdf,
-        mirrored_links=mirrored,
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
         effort_limits=effort_limits,

@@ -223,14 +223,13 @@ class ArmDescription(Mechanism):
 
     `format` is the version of the file, see `FileFormat`. A file without this key has version 1.0.
     `mechanism` and `instrument` are names of files in the folders `mechanisms` and `instruments`, or paths of YAML
-    files relative to the folder of the arm file. A file without `mechanism` has the keys of a mechanism itself; of
-    these keys, only `sdf` is required. `sdf` is the path of a model file relative to the folder of the file that
-    states it. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `position_limits` and `effort_limits`
-    replace those of the model. `position_offsets` are the positions in the model at the recorded positions 0; limits
-    refer to recorded positions. `mirrored_links` maps an SDF file to its links that are mirrored for this arm (x to -x
-    in the link's frame). SDF files without an entry, such as a file exported from this arm, are used unchanged.
-    `coupled_limit_bounds` maps the name of a coupled limit to its [lower, upper] for this arm, e.g. after the
-    calibration of a joint stop. These values replace the values of the mechanism.
+    files relative to the folder of the arm file. Keys of a mechanism in this file replace those of the mechanism file.
+    Without `mechanism`, only `sdf` is required. `sdf` is the path of a model file relative to the folder of the file
+    that states it. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `position_limits` and
+    `effort_limits` replace those of the model. `position_offsets` are the positions in the model at the recorded
+    positions 0; limits refer to recorded positions. `coupled_limit_bounds` maps the name of a coupled limit to its
+    [lower, upper] for this arm, e.g. after the calibration of a joint stop. These values replace the values of the
+    mechanism.
     """
 
     format: str = field(default="", metadata=FileFormat("dvrk_drake arm", 1).metadata)
@@ -240,7 +239,6 @@ class ArmDescription(Mechanism):
     position_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     effort_limits: dict[str, float] = field(default_factory=dict, metadata={RANGE: EFFORTS})
     coupled_limit_bounds: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
-    mirrored_links: dict[str, list[str]] = field(default_factory=dict)
     position_offsets: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)
 

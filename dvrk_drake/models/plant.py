@@ -98,7 +98,7 @@ def add_arm(
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
     parser.package_map().AddMap(package_map())
-    model = compose_sdf(arm.sdf, arm.mirrored_links)
+    model = compose_sdf(arm.sdf)
     if closure == "ball":
         remove_loop_mimics(model, arm)
     if not collision_shapes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -96,7 +96,7 @@ def local_path(url: str) -> Path:
     return MODELS_FOLDER / url.removeprefix(PACKAGE_URL) if url.startswith(PACKAGE_URL) else Path(url)
 
 
-def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | None = None) -> ElementTree.Element:
+def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
     """Returns the model of the first file, extended by the links, joints and frames of the other files.
 
     Relative paths of meshes become absolute. If a file repeats a link of an earlier file, only the shapes of that link
@@ -105,15 +105,11 @@ def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | Non
 
     Args:
         urls: Package URLs or paths.
-        mirrored: Mapping from a URL to the links of that file that are mirrored (`mirror_links`).
 
     Raises:
-        ArmError: A file is not a model of an arm, repeats a link with inertia, or does not contain a link in
-            `mirrored`.
+        ArmError: A file is not a model of an arm, or repeats a link with inertia.
     """
     root, *others = (_read(local_path(url), may_convert=url == urls[0]) for url in urls)
-    for url, part in zip(urls, (root, *others), strict=True):
-        mirror_links(part, (mirrored or {}).get(url, ()), url)
     (model,) = root.findall("model")
     links = {link.get("name", ""): link for link in model.findall("link")}
     for other in others:
@@ -274,44 +270,3 @@ def _add_shapes(link: ElementTree.Element, repeated: ElementTree.Element) -> Non
         if shape.tag not in ("visual", "collision"):
             raise ArmError(f"link {link.get('name')} has <{shape.tag}> in two files; allowed: <visual>, <collision>")
         link.append(shape)
-
-
-def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -> None:
-    """Mirrors the inertia and the shapes of some links of an SDF model; joints and frames are unchanged.
-
-    With M = diag(-1, 1, 1), a pose (R, p) becomes (M R M, M p), and an inertia I becomes M I M.
-
-    Args:
-        root: Root element of the SDF.
-        links: Names of the links.
-        source: Source of the SDF, for messages.
-
-    Raises:
-        ArmError: A link does not exist, or one of its poses does not consist of six numbers.
-    """
-    by_name = {link.get("name", ""): link for link in root.iterfind("model/link")}
-    for name in links:
-        if name not in by_name:
-            raise ArmError(f'{source} has no link "{name}" of mirrored_links; allowed: {", ".join(by_name)}')
-        link = by_name[name]
-        for pose in link.iterfind("*/pose"):
-            _mirror_pose(f"{source}: link {name}", pose)
-        for product in ("ixy", "ixz"):
-            for element in link.iterfind(f"inertial/inertia/{product}"):
-                element.text = repr(-float(element.text or 0) + 0.0)
-        for mesh in link.iterfind("*/geometry/mesh"):
-            scale = mesh.find("scale")
-            if scale is None:
-                scale = ElementTree.SubElement(mesh, "scale")
-                scale.text = "1 1 1"
-            x, *yz = (scale.text or "").split()
-            scale.text = " ".join([f"{-float(x):g}", *yz])
-
-
-def _mirror_pose(where: str, pose: ElementTree.Element) -> None:
-    numbers = (pose.text or "").split()
-    if len(numbers) != 6 or pose.get("relative_to") or pose.get("rotation_format", "euler_rpy") != "euler_rpy":
-        raise ArmError(f"{where}: <pose> of a mirrored link must be x y z roll pitch yaw in the link frame")
-    x, y, z, roll, pitch, yaw = map(float, numbers)
-    # R = Rz(yaw) Ry(pitch) Rx(roll), and M Rx M = Rx, M Ry M = Ry', M Rz M = Rz'.
-    pose.text = " ".join(f"{value + 0.0:.10g}" for value in (-x, y, z, roll, -pitch, -yaw))

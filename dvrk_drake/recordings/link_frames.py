@@ -84,7 +84,7 @@ def drawable_urdf(arm: Arm) -> str:
     Returns:
         URDF, or "" if URDF does not support a part of the model.
     """
-    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    root = compose_sdf(arm.sdf)
     for link in root.iter("link"):
         shapes = {kind: link.findall(kind) for kind in ("visual", "collision")}
         drawn = [shape for shape in shapes["collision"] or shapes["visual"] if shape.find("geometry/mesh") is None]

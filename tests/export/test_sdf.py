@@ -148,7 +148,7 @@ def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
             (arm.position_lower[i], arm.position_upper[i]), abs=1e-12
         )
         assert urdf_plant.GetJointActuatorByName(joint_name).effort_limit() == arm.effort_limits[i]
-    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    root = compose_sdf(arm.sdf)
     names = [part.get("name") for tag in ("link", "frame") for part in root.iterfind(f"model/{tag}")]
     assert "dh_1" in names
     for frame in names:
@@ -209,12 +209,10 @@ def test_an_arm_file_can_refer_to_the_exported_sdf(name, tmp_path, capsys):
     links = nearest_links(arm, 1.1 * derive_gravity(arm).base_values)
     write_sdf(arm, links, tmp_path / "identified.sdf", "a test")
     text = (MODELS_FOLDER / "arms" / f"{name}.yaml").read_text()
-    for kind, part, sdf in (("mechanism", name[:3], "sdf: identified.sdf"), ("instrument", "large_needle_driver", "")):
-        if f"{kind}: {part}" in text:
-            copied = (MODELS_FOLDER / f"{kind}s" / f"{part}.yaml").read_text()
-            (tmp_path / f"{kind}.yaml").write_text(re.sub("^sdf: .*$", sdf, copied, flags=re.MULTILINE))
-            text = text.replace(f"{kind}: {part}", f"{kind}: {kind}.yaml")
-    (tmp_path / "arm.yaml").write_text(text)
+    instrument = (MODELS_FOLDER / "instruments" / "large_needle_driver.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(re.sub("^sdf: .*$", "", instrument, flags=re.MULTILINE))
+    text = re.sub("^sdf: .*$", "", text, flags=re.MULTILINE).replace("large_needle_driver", "own.yaml")
+    (tmp_path / "arm.yaml").write_text(text + "sdf: identified.sdf\n")
     own = load_arm(str(tmp_path / "arm.yaml"))
     assert main(["export", "--arm", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
     assert "The SDF has the same inertias as the SDF of the arm." in capsys.readouterr().out
@@ -321,7 +319,7 @@ def test_urdf_without_extensions_has_a_heavy_base_and_no_contact(name, tmp_path)
     robot = ElementTree.parse(path).getroot()
     masses = [link.find("inertial/mass") for link in robot.findall("link")]
     assert all(mass is not None and float(mass.get("value")) > 0 for mass in masses)
-    total = len(list(compose_sdf(arm.sdf, arm.mirrored_links).iter("collision")))
+    total = len(list(compose_sdf(arm.sdf).iter("collision")))
     assert len({(c.get("name")) for c in robot.iter("collision")}) > 0.4 * total > 0
     for element in robot.findall("{http://drake.mit.edu}collision_filter_group"):
         robot.remove(element)

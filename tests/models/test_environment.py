@@ -104,7 +104,7 @@ def test_shapes_collide_where_the_box_is(tmp_path):
             "outer_yaw is",
         ),
         ("directives:\n- add_frame: {name: f, X_PF: {base_frame: world}}\n", "has a collision shape"),
-        (OTHER_ARM.format(x=1).replace("name: other", "name: mtm").replace("other::", "mtm::"), "named 'mtm'"),
+        (OTHER_ARM.format(x=1).replace("name: other", "name: mtml").replace("other::", "mtml::"), "named 'mtml'"),
         (OTHER_ARM.format(x=1).replace("other::base_link", "base_link"), "A Frame named 'base_link' appears in"),
         ("PLANE", "a plane is not supported; use a box, or --table"),
         ("NO SHAPE", "has a collision shape"),

@@ -120,11 +120,10 @@ def test_aliases_of_aliases_are_refused():
 def own_arm(folder, change):
     """Writes the files of an MTM. `change` is a pattern and the text that replaces all its matches in the SDF."""
     mechanism = (MODELS_FOLDER / "mechanisms/mtm.yaml").read_text()
-    url = next(line.split()[1] for line in mechanism.splitlines() if line.startswith("sdf:"))
-    (folder / "mechanism.yaml").write_text(mechanism.replace(url, "own.sdf"))
+    (folder / "mechanism.yaml").write_text(mechanism)
     arm = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("mechanism: mtm", "mechanism: mechanism.yaml")
-    (folder / "own.yaml").write_text(arm)
-    sdf = (MODELS_FOLDER / "sdf/mtm.sdf").read_text()
+    (folder / "own.yaml").write_text(arm.replace("package://dvrk_drake/sdf/mtmr.sdf", "own.sdf"))
+    sdf = (MODELS_FOLDER / "sdf/mtmr.sdf").read_text()
     changed = re.sub(*change, sdf, flags=re.DOTALL)
     assert changed != sdf
     (folder / "own.sdf").write_text(changed)

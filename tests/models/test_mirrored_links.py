@@ -11,7 +11,7 @@ from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ArmError, ModelError
+from dvrk_drake.errors import ModelError
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.export.dvrk_mtm_controller import controller_torque
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
@@ -19,7 +19,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_c
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = pytest.mark.drake_api
@@ -134,42 +134,40 @@ def test_side_is_detected_from_the_parameters_of_a_real_file(shared_data, serial
         assert comparison.other_side == (name != side)
 
 
-def test_mirroring_twice_is_identity_and_mirrors_shapes():
-    def read():
-        return ElementTree.parse(MODELS_FOLDER / "sdf" / "mtm.sdf").getroot()
-
-    link = "wrist_pitch_link"
-    before, after = read(), read()
-    mirror_links(after, [link], "mtm.sdf")
-    poses, mirrored = (
-        [p.text.split() for p in root.iterfind(f"model/link[@name='{link}']/*/pose")] for root in (before, after)
+def test_wrists_of_both_files_are_mirror_images():
+    """Compares inertias and shapes. Reflection in x = 0 maps a pose (R, p) to (M R M, M p), M = diag(-1, 1, 1)."""
+    left, right = (
+        {link.get("name"): link for link in ElementTree.parse(MODELS_FOLDER / f"sdf/{name}.sdf").iter("link")}
+        for name in ("mtml", "mtmr")
     )
-    signs = np.array([-1, 1, 1, 1, -1, -1])
-    np.testing.assert_allclose(np.array(mirrored, float), signs * np.array(poses, float), atol=1e-12)
-    (mesh,) = after.iterfind(f"model/link[@name='{link}']/visual/geometry/mesh")
-    assert mesh.findtext("scale").split() == ["-1", "1", "1"]
-    mirror_links(after, [link], "mtm.sdf")
-    again = [p.text.split() for p in after.iterfind(f"model/link[@name='{link}']/*/pose")]
-    np.testing.assert_array_equal(np.array(again, float), np.array(poses, float))
-    assert mesh.findtext("scale").split() == ["1", "1", "1"]
-
-
-def test_links_that_cannot_be_mirrored_are_named():
-    root = ElementTree.fromstring('<sdf><model><link name="a"><visual><pose>1 2 3</pose></visual></link></model></sdf>')
-    with pytest.raises(ArmError, match=r'x\.sdf has no link "b" of mirrored_links; allowed: a'):
-        mirror_links(root, ["b"], "x.sdf")
-    with pytest.raises(ArmError, match=r"x\.sdf: link a: <pose> of a mirrored link must be x y z roll pitch yaw"):
-        mirror_links(root, ["a"], "x.sdf")
+    signs = {"pose": np.array([-1, 1, 1, 1, -1, -1]), "ixy": -1, "ixz": -1}
+    assert left.keys() == right.keys()
+    for name in left:
+        is_wrist = name in ("platform_link", "wrist_pitch_link", "wrist_yaw_link", "wrist_roll_link")
+        parts = [
+            [part for child in links[name] if child.tag != "pose" for part in child.iter()] for links in (left, right)
+        ]
+        parts[0] = [part for part in parts[0] if part.tag != "scale"]
+        for one, other in zip(*parts, strict=True):
+            assert one.tag == other.tag
+            if one.tag in ("pose", "mass", "size", "radius", "length") or (
+                one.tag.startswith("i") and len(one.tag) == 3
+            ):
+                numbers, expected = (np.array(part.text.split(), float) for part in (one, other))
+                sign = signs.get(one.tag, 1) if is_wrist else 1
+                np.testing.assert_allclose(numbers, sign * expected, atol=1e-12, err_msg=f"{name}: {one.tag}")
+            elif one.tag == "uri":
+                assert one.text == other.text
+        scales = [[scale.text.split() for scale in links[name].iter("scale")] for links in (left, right)]
+        assert scales == [[["-1", "1", "1"]] if is_wrist else [], []]
 
 
 @pytest.mark.slow
-def test_an_exported_left_arm_is_not_mirrored_again(tmp_path):
+def test_an_exported_left_arm_can_replace_that_of_the_package(tmp_path):
     assert main(["export", "--arm", "mtml", "--sdf", str(tmp_path / "left.sdf")]) == 0
-    for part, text in (("mechanisms/mtm", "sdf: package://dvrk_drake/sdf/mtm.sdf"), ("arms/mtml", "mechanism: mtm\n")):
-        new = {"mechanisms/mtm": "sdf: left.sdf", "arms/mtml": "mechanism: mtm.yaml\n"}[part]
-        content = (MODELS_FOLDER / f"{part}.yaml").read_text()
-        assert content.count(text) == 1
-        (tmp_path / f"{part.split('/')[1]}.yaml").write_text(content.replace(text, new))
+    content = (MODELS_FOLDER / "arms/mtml.yaml").read_text()
+    (tmp_path / "mtml.yaml").write_text(content.replace("package://dvrk_drake/sdf/mtml.sdf", "left.sdf"))
     left, exported = load_arm("mtml"), load_arm(str(tmp_path / "mtml.yaml"))
+    assert exported.sdf == (str(tmp_path / "left.sdf"),)
     for q in left.sample_poses(3, np.random.default_rng(0)):
         np.testing.assert_allclose(torque(exported, q), torque(left, q), atol=1e-12)

@@ -1,7 +1,6 @@
 """Compares models read by the parser of Drake with the arms of `load_arm`."""
 
 import re
-import runpy
 
 import numpy as np
 import pytest
@@ -105,12 +104,6 @@ def test_model_directives_can_be_processed():
     directives = LoadModelDirectives(str(MODELS_FOLDER / "directives" / "psm.dmd.yaml"))
     models = ProcessModelDirectives(directives, parser)
     assert [model.model_name for model in models] == ["psm", "large_needle_driver"]
-
-
-@pytest.mark.parametrize("name", ["mtml", "mtmr"])
-def test_mtm_files_equal_the_output_of_the_tool(name):
-    tool = runpy.run_path(str(ROOT / "tools/make_master_sdfs.py"))
-    assert (MODELS_FOLDER / "sdf" / f"{name}.sdf").read_text() == tool["master_sdf"](load_arm(name))
 
 
 def test_code_of_the_page_about_drake_runs(capsys):

@@ -214,31 +214,11 @@ def test_transmission_conserves_power(arm):
 def test_left_and_right_share_the_mechanism_and_differ_in_limits():
     left, right = load_arm("MTML"), load_arm("mtmr")
     assert known_arms() == ["mtml", "mtmr", "psm"]
-    assert left.sdf == right.sdf
     np.testing.assert_allclose([left.position_lower[0], left.position_upper[0]], [-0.698132, 1.13446], atol=1e-9)
     np.testing.assert_allclose([right.position_lower[3], right.position_upper[3]], [-1.6580, 3.5779], atol=1e-9)
     np.testing.assert_allclose(
         left.effort_limits, [1.86083, 3.21662, 1.95978, 0.309013, 0.0968438, 0.0968438, 0.0228759], atol=1e-9
     )
-
-
-@pytest.mark.parametrize("name", ["mtml", "mtmr"])
-def test_arm_limits_are_within_sdf_limits(name):
-    arm = load_arm(name)
-    plant = make_arm_plant(arm)
-    from pydrake.multibody.parsing import Parser
-    from pydrake.multibody.plant import MultibodyPlant
-
-    from dvrk_drake.models.sdf_model import MODELS_FOLDER
-
-    bare = MultibodyPlant(1e-3)
-    parser = Parser(bare)
-    parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
-    parser.AddModelsFromUrl(*arm.sdf)
-    for i, joint in enumerate(arm.joint_names):
-        mechanism, own = bare.GetJointByName(joint), plant.GetJointByName(joint)
-        assert mechanism.position_lower_limits()[0] <= arm.position_lower[i] == own.position_lower_limits()[0]
-        assert mechanism.position_upper_limits()[0] >= arm.position_upper[i] == own.position_upper_limits()[0]
 
 
 def test_sampled_poses_respect_all_limits(arm):
@@ -288,3 +268,13 @@ def test_arm_file_with_a_typo_is_refused(tmp_path):
     path.write_text("name: X\nmechanism: mtm\nposition_limit: {}\n")
     with pytest.raises(ArmError, match="position_limit"):
         load_arm(str(path))
+
+
+def test_keys_of_an_arm_file_replace_those_of_its_mechanism(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text("name: X\nmechanism: mtm\nsdf: package://dvrk_drake/sdf/mtmr.sdf\neffort_cut_off: 7.0\n")
+    arm, right = load_arm(path), load_arm("mtmr")
+    assert (arm.identification.effort_cut_off, arm.sdf, arm.gains.kp) == (7.0, right.sdf, right.gains.kp)
+    path.write_text("name: X\nmechanism: mtm\n")
+    with pytest.raises(ArmError, match=r"arm\.yaml: sdf is missing; state the path of the model"):
+        load_arm(path)

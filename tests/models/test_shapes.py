@@ -152,7 +152,7 @@ NEIGHBOURS = (
 def test_links_do_not_collide_within_the_joint_limits():
     """Checks collisions without the collision filters of the arm. Drake ignores pairs of links that share a joint."""
     arm = load_arm("psm")
-    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    root = compose_sdf(arm.sdf)
     (model,) = root.findall("model")
     for group in model.findall(f"{DRAKE}collision_filter_group"):
         model.remove(group)

@@ -69,7 +69,7 @@ def test_the_files_themselves_are_read(tmp_path):
         ("instrument", ("joints:", "joint:"), 'instrument.yaml: key "joint" is unknown; did you mean'),
         (
             "arm",
-            ("position_limits:", "position_limits: 3\nmirrored_links:"),
+            ("position_limits:", "position_limits: 3\ncoupled_limit_bounds:"),
             "position_limits is 3; allowed: a mapping from",
         ),
         ("instrument", ("sdf:", "sdf: [\n"), "instrument.yaml:"),

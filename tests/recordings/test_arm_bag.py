@@ -98,7 +98,7 @@ def test_linkage_is_closed(tmp_path, arm):
     """The points where the loops are cut coincide. Their frames are constant in the links of `loop_closures`."""
     write_recording(poses_of(arm), tmp_path / "a.mcap", arm)
     messages = decoded(tmp_path / "a.mcap")
-    frames = {frame.get("name"): frame for frame in compose_sdf(arm.sdf, arm.mirrored_links).iter("frame")}
+    frames = {frame.get("name"): frame for frame in compose_sdf(arm.sdf).iter("frame")}
 
     def p_WP(X_WF, name):
         offset = np.array(frames[name].findtext("pose").split()[:3], float)
@@ -185,11 +185,11 @@ def test_unknown_positions_have_no_transforms(tmp_path):
 
 def test_unsupported_urdf_is_omitted(tmp_path):
     arm = ARMS["mtml"]
-    model = compose_sdf(arm.sdf, arm.mirrored_links)
+    model = compose_sdf(arm.sdf)
     dynamics = ElementTree.SubElement(next(model.iter("axis")), "dynamics")
     ElementTree.SubElement(dynamics, "spring_stiffness").text = "0.1"
     (tmp_path / "arm.sdf").write_text(ElementTree.tostring(model, encoding="unicode"))
-    springy = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),), mirrored_links={})
+    springy = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),))
     write_recording(poses_of(arm), tmp_path / "a.mcap", springy)
     messages = decoded(tmp_path / "a.mcap")
     assert "/MTML/robot_description" not in messages

@@ -123,10 +123,7 @@ class Study:
             "scenarios": {name: dataclasses.asdict(scenario) for name, scenario in self.scenarios.items()},
             "models": [scenario.model.to_yaml() for scenario in self.scenarios.values()],
             "arms": [dataclasses.asdict(scenario.mounted_arm) for scenario in self.scenarios.values()],
-            "sdf": [
-                tostring(compose_sdf(scenario.mounted_arm.sdf, scenario.mounted_arm.mirrored_links), "unicode")
-                for scenario in self.scenarios.values()
-            ],
+            "sdf": [tostring(compose_sdf(scenario.mounted_arm.sdf), "unicode") for scenario in self.scenarios.values()],
             "cases": [dataclasses.astuple(case) for case in self.cases],
             "measures": [dataclasses.asdict(measure) for measure in self.measures],
         }

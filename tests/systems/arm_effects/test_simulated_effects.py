@@ -100,7 +100,7 @@ def test_unknown_coordinate_is_refused():
 def test_no_sdf_has_friction_tags():
     """Drake ignores them without a message. Friction is stated in the YAML files."""
     paths = {path.name: path for path in (MODELS_FOLDER / "sdf").glob("*.sdf")}
-    assert {"mtm.sdf", "psm.sdf"} <= set(paths)
+    assert {"mtmr.sdf", "psm.sdf"} <= set(paths)
     for name, path in paths.items():
         assert not list(ElementTree.parse(path).iter("friction")), name
 

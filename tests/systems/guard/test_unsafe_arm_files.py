@@ -13,9 +13,11 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.unsafe_arm import unsafe_difference
 
 PSM = load_arm("psm")
-ARM = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text()
+YAW = "wrist_yaw: [-0.785398, 0.785398]"
+ARM = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text() + f"position_limits: {{{YAW}}}\n"
 MECHANISM = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
-SDF = local_path("package://dvrk_drake/sdf/mtm.sdf")
+URL = "package://dvrk_drake/sdf/mtml.sdf"
+SDF = local_path(URL)
 
 
 def mtml(folder, *, arm=(), mechanism=(), sdf=(), name="MTML"):
@@ -27,16 +29,14 @@ def mtml(folder, *, arm=(), mechanism=(), sdf=(), name="MTML"):
             texts[key] = texts[key].replace(old, new, 1)
     arm_text = texts["arm"].replace("mechanism: mtm", "mechanism: mechanism.yaml")
     arm_text = arm_text.replace("name: MTML", f"name: {name}")
-    arm_text = arm_text.replace("package://dvrk_drake/sdf/mtm.sdf", str(folder / "mtm.sdf"))
-    (folder / "arm.yaml").write_text(arm_text)
-    (folder / "mechanism.yaml").write_text(texts["mechanism"].replace("package://dvrk_drake/sdf/mtm.sdf", "mtm.sdf"))
-    (folder / "mtm.sdf").write_text(texts["sdf"])
+    (folder / "arm.yaml").write_text(arm_text.replace(URL, "mtml.sdf"))
+    (folder / "mechanism.yaml").write_text(texts["mechanism"])
+    (folder / "mtml.sdf").write_text(texts["sdf"])
     return load_arm(folder / "arm.yaml")
 
 
 HINT = "as for the arm MTML of dvrk_drake; correct the file, or give the arm another name"
 KP, KD = "kp: [60.0, 90.0, 40.0,", "kd: [8.0, 12.0,"
-YAW = "wrist_yaw: [-0.785398, 0.785398]"
 PLATFORM = "the coefficient of joint elbow_pitch in the transmission of wrist_platform is {}; allowed: 0.6697 +- 0.25, "
 ELBOW = "  elbow_pitch: {{shoulder_pitch: {}, elbow_pitch: 1.0}}\n"
 PARALLELOGRAM = MECHANISM[MECHANISM.index("coupled_limits:") : MECHANISM.index("console_gravity")]
