@@ -103,7 +103,7 @@ def record(
         domain: With --ros: ROS domain. Default: $ROS_DOMAIN_ID, or else 0.
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.recorder import Recorder
     from dvrk_drake.processes.ros_recorder import RosRecorder

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm_schema import Gains
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.processes.arm_controller import ArmController
-    from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
 
@@ -161,10 +160,10 @@ def stop(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, power_off: bool = F
 def _operator_link(name: str, lcm_url: str, key: str | None) -> Iterator[ArmLink]:
     """Opens the channels of an arm for an operator, whatever its state is."""
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.control import ArmLink
-    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
-    with closing(ArmLink(load_arm(name), open_lcm(lcm_url).get_lcm_url(), key=load_key(key))) as link:
+    with closing(LcmArmLink(load_arm(name), open_lcm(lcm_url).get_lcm_url(), key=load_key(key))) as link:
         yield link
 
 
@@ -261,8 +260,9 @@ def ready_controller(
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.processes.arm_operator import reset_fault
-    from dvrk_drake.processes.control import ArmLink, first_status
-    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.control import first_status
+    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.processes.pace import make_realtime, settle_memory
 
     quiet_drake()
@@ -272,7 +272,7 @@ def ready_controller(
         print_warning(warning)
     url = open_lcm(controlled.lcm_url).get_lcm_url()
     print(f"waiting for {arm.name} on LCM {url}", flush=True)
-    with closing(ArmLink(arm, url, key=key)) as link:
+    with closing(LcmArmLink(arm, url, key=key)) as link:
         if controlled.reset:
             reset_fault(link, print_warning)
         status, period = first_status(link)
@@ -281,7 +281,7 @@ def ready_controller(
     if controlled.realtime:
         for warning in make_realtime():
             print_warning(warning)
-    return controller, lambda: ArmLink(arm, url, key=key, before=status), period
+    return controller, lambda: LcmArmLink(arm, url, key=key, before=status), period
 
 
 def checked_start(

@@ -105,8 +105,8 @@ def view(
         live: Show the measured pose and efforts from the LCM messages of the arm, and the commanded pose as a ghost.
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.control import ArmLink
-    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import show_status
     from dvrk_drake.systems.arm_view.arm_view import ArmView
     from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
@@ -121,7 +121,7 @@ def view(
     arm_view.add_view_buttons()
     ending = "press Stop, Escape or Ctrl-C to end"
     if live:
-        link = ArmLink(shown, url, replays=True)
+        link = LcmArmLink(shown, url, replays=True)
         print(f"{shown.name} live at {tracked_url(meshcat)}; {ending}", flush=True)
         until_stopped(meshcat, lambda: show_status(arm_view, link))
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -14,21 +14,52 @@ from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
-from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
-from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
+from dvrk_drake.systems.lcm.arm_link import ArmLink
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+
+
+class _Exchange(ArmLink):
+    """Link in which the caller of an `ArmController` places each status, and finds the command that answers it."""
+
+    def __init__(self, arm: Arm) -> None:
+        super().__init__(arm)
+        self.status: lcmt_dvrk_status | None = None
+        self.command = lcmt_dvrk_command()
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def close(self) -> None:
+        pass
+
+    def poll(self) -> lcmt_dvrk_status | None:
+        return self.status
+
+    def send(self, command: lcmt_dvrk_command) -> None:
+        self.command = command
+
+    def _handle(self, seconds: float) -> bool:
+        return False
+
+    def _publish(self, data: bytes) -> None:
+        pass
 
 
 class ArmController:
     """Controller of one arm. It computes a command message from each status message, in one of the modes of `Mode`.
 
-    The controller is a Diagram of DvrkStatusReceiver, GravityPidController, an optional FrictionCompensator, EffortRamp
-    and DvrkCommandSender. Each status causes a forced update of the Diagram, so the command is available immediately.
+    The controller is a Diagram of HardwareArmStation, GravityPidController, an optional FrictionCompensator and
+    EffortRamp. Each status advances the Diagram by one period, so the command is available immediately.
     While the arm does not apply the commanded efforts, the controller commands the measured efforts. When the arm
     begins to apply the commanded efforts, mode "hold" stores the measured pose as the pose to hold. In every mode, the
     commanded efforts then change linearly from the measured efforts to the efforts of the mode.
 
     Attributes:
         arm: Controlled arm.
+        sender_id: Identifier of this controller in its command messages.
+        acting: True if the last status shows that the arm applies the efforts of this controller.
     """
 
     def __init__(
@@ -52,47 +83,33 @@ class ArmController:
             gains: Gains for the modes "hold" and "damped". None: the gains of `arm` are used.
         """
         builder = DiagramBuilder()
-        self.arm, self._mode = arm, mode
-        receiver = builder.AddSystem(DvrkStatusReceiver(arm))
+        self.arm, self._mode, self._period = arm, mode, period
+        self._link = _Exchange(arm)
+        station = builder.AddSystem(HardwareArmStation(arm, driver=DvrkDriver(status_period=period), link=self._link))
         self._controller = builder.AddSystem(GravityPidController(model, period=period, gains=gains, mode="gravity"))
         self._ramp = builder.AddSystem(EffortRamp(arm.num_joints, period=period))
-        self._sender = builder.AddSystem(DvrkCommandSender(arm))
-        builder.Connect(receiver.GetOutputPort("state_estimated"), self._controller.GetInputPort("state_estimated"))
-        builder.Connect(receiver.GetOutputPort("effort_measured"), self._ramp.GetInputPort("effort_measured"))
-        desired_effort = self._controller.GetOutputPort("effort")
+        name, desired_effort = arm.name.lower(), self._controller.GetOutputPort("effort")
+        state = station.GetOutputPort(f"{name}.state_estimated")
+        builder.Connect(state, self._controller.GetInputPort("state_estimated"))
         if friction is not None:
             builder.AddSystem(friction)
-            builder.Connect(receiver.GetOutputPort("state_estimated"), friction.GetInputPort("state_estimated"))
+            builder.Connect(state, friction.GetInputPort("state_estimated"))
             builder.Connect(desired_effort, friction.GetInputPort("effort_wanted"))
             desired_effort = friction.GetOutputPort("effort")
         builder.Connect(desired_effort, self._ramp.GetInputPort("effort_wanted"))
-        builder.Connect(self._ramp.GetOutputPort("effort"), self._sender.GetInputPort("effort"))
-        status = builder.ExportInput(receiver.GetInputPort("lcmt_dvrk_status"), "lcmt_dvrk_status")
-        builder.ConnectInput(status, self._sender.GetInputPort("lcmt_dvrk_status"))
-        self._diagram = builder.Build()
-        self._context = self._diagram.CreateDefaultContext()
-        # The port is fixed only once. FixValue would deep-copy each message, which is slower than the rest of a step.
-        port = self._diagram.GetInputPort("lcmt_dvrk_status")
-        self._status = port.FixValue(self._context, AbstractValue.Make(lcmt_dvrk_status()))
-        self._ramp_context = self._ramp.GetMyMutableContextFromRoot(self._context)
-        self._sender_context = self._sender.GetMyContextFromRoot(self._context)
-        self._new_state = self._diagram.AllocateDiscreteVariables()
-        self._set_acting(False)
-
-    @property
-    def sender_id(self) -> int:
-        """Identifier of this controller in its command messages."""
-        return self._sender.sender_id
-
-    @property
-    def acting(self) -> bool:
-        """True if the last status shows that the arm applies the efforts of this controller."""
-        return self._acting
+        for port, measured in (("effort_measured", "effort_measured"), ("enabled", "in_control")):
+            builder.Connect(station.GetOutputPort(f"{name}.{measured}"), self._ramp.GetInputPort(port))
+        builder.Connect(self._ramp.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
+        self._simulator = Simulator(builder.Build())
+        context = self._simulator.get_mutable_context()
+        self._ramp_context = self._ramp.GetMyContextFromRoot(context)
+        self._controller_context = self._controller.GetMyMutableContextFromRoot(context)
+        self._num_answers, self.sender_id, self.acting = 0, station.sender_id, False
 
     @property
     def ramped(self) -> bool:
         """True if the ramp to the desired efforts is complete."""
-        return self._acting and self._ramp.GetShare(self._ramp_context) >= 1
+        return self.acting and self._ramp.GetShare(self._ramp_context) >= 1
 
     def answer(
         self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None
@@ -108,23 +125,15 @@ class ArmController:
         Returns:
             Command for the arm.
         """
-        context = self._context
-        context.SetTime(time)
-        self._status.GetMutableData().set_value(status)
         acts = status.guard_state == lcmt_dvrk_status.STATE_EFFORT and status.command_sender_id == self.sender_id
-        if acts != self._acting:
-            self._set_acting(acts)
+        if acts != self.acting:
+            self.acting = acts
+            # The change of the mode from "gravity" to "hold" stores the pose to hold and resets the integrator.
+            self._controller.SetMode(self._controller_context, self._mode if acts else "gravity")
         if desired_state is not None:
-            controller_context = self._controller.GetMyMutableContextFromRoot(context)
-            self._controller.GetInputPort("desired_state").FixValue(controller_context, desired_state)
-        self._diagram.CalcForcedDiscreteVariableUpdate(context, self._new_state)
-        context.SetDiscreteState(self._new_state)
-        return self._sender.get_output_port().Eval(self._sender_context)
-
-    def _set_acting(self, acting: bool) -> None:
-        """Stores whether the efforts act on the arm. If they act, restarts the ramp and stores the pose to hold."""
-        self._acting = acting
-        self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
-        # The change of the mode from "gravity" to "hold" stores the pose to hold and resets the integrator.
-        controller_context = self._controller.GetMyMutableContextFromRoot(self._context)
-        self._controller.SetMode(controller_context, self._mode if acting else "gravity")
+            self._controller.GetInputPort("desired_state").FixValue(self._controller_context, desired_state)
+        self._link.status, self._link.time = status, time
+        # At the start of this step, the station reads the status. At its end, the station sends the command.
+        self._num_answers += 1
+        self._simulator.AdvanceTo(self._num_answers * self._period)
+        return self._link.command

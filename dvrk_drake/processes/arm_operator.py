@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.common.value import AbstractValue
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.lcm_messages import describe_refusal, describe_state
-from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, ArmLink
-from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
+from dvrk_drake.processes.control import FIRST_WAIT, SILENCE
+from dvrk_drake.systems.lcm.arm_link import ArmLink
+from dvrk_drake.systems.lcm.dvrk_command import draw_id, make_command
 
 #: Longest time for which a guard ignores new senders after the last command of a sender, plus a margin [s].
 _SENDER_RESERVED = 1.1
@@ -169,20 +169,15 @@ class _Sender:
     """Sender of HOLD and OFF commands."""
 
     def __init__(self, link: ArmLink) -> None:
-        self._link, self._start = link, link.now()
-        self._system = DvrkCommandSender(link.arm)
-        self._context = self._system.CreateDefaultContext()
+        self._link, self._sender_id = link, draw_id()
         self._last: lcmt_dvrk_command | None = None
 
     def send(
         self, status: lcmt_dvrk_status, mode: int = lcmt_dvrk_command.HOLD, *, reset_fault: bool = False
     ) -> lcmt_dvrk_status:
         """Sends the command for a status, and returns the next status."""
-        values = {"control_mode": np.array([float(mode)]), "reset_fault": np.array([float(reset_fault)])}
-        self._context.SetTime(self._link.now() - self._start)
-        for port, value in {**values, "lcmt_dvrk_status": AbstractValue.Make(status)}.items():
-            self._system.GetInputPort(port).FixValue(self._context, value)
-        self._last = self._system.get_output_port().Eval(self._context)
+        utime = round(1e6 * self._link.now())
+        self._last = make_command(status, self._sender_id, utime, mode, reset_fault=reset_fault)
         self._link.send(self._last)
         return self._link.next_status(SILENCE)
 

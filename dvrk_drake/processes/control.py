@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable
 
-import lcm
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import (
-    MessageKey,
-    StatusFilter,
-    command_channel,
-    decode,
-    describe_state,
-    status_channel,
-)
+from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.lcm_network import handle_message
+from dvrk_drake.systems.lcm.arm_link import ArmLink
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
 
 #: Time without a status after which an arm is considered absent [s]. Longest time until the first status [s].
@@ -31,10 +21,6 @@ SILENCE, FIRST_WAIT = 1.0, 10.0
 #: Longest period of the measurements [us]. With the gains of the arm files, a PSM oscillates if this period is 7 ms,
 #: and an MTM oscillates if it is 10 ms.
 _MAX_PERIOD = 5000
-
-#: Length of the queue of statuses. If the queue is full, further statuses are dropped. Largest number of statuses that
-#: are processed at once. It limits the delay that a flood of messages can cause.
-_QUEUE, _MESSAGES_AT_ONCE = 100, 200
 
 #: Number of statuses that are inspected before an arm is controlled.
 _FIRST_STATUSES = 60
@@ -50,97 +36,6 @@ _RESET = "Look at the arm, then start again with --reset"
 
 #: Period in which `report` is called with the live status [s].
 _REPORT_PERIOD = 0.2
-
-
-class ArmLink:
-    """Status channel and command channel of one arm for a message-driven loop. Only the newest status is used."""
-
-    def __init__(
-        self,
-        arm: Arm,
-        url: str,
-        *,
-        key: MessageKey | None = None,
-        before: lcmt_dvrk_status | None = None,
-        replays: bool = False,
-    ) -> None:
-        """Opens the channels of `arm` on the LCM network `url`.
-
-        Args:
-            arm: Arm whose statuses are received.
-            url: URL of the LCM network.
-            key: Key that must have signed the statuses, and that signs the commands. None: statuses are not verified
-                and commands are not signed.
-            before: Status of the session that is used. A session is one run of the arm's process. None: the
-                session of the first received status is used.
-            replays: True to accept statuses of any session and time, for example from a replayed log. Must be False for
-                a controller, because old statuses would determine the commands.
-        """
-        self.arm, self.lost, self._replays, self._key = arm, 0, replays, key
-        self._session = 0 if before is None else before.session_id
-        self._filter = StatusFilter(arm.name, arm.num_joints, key, session_id=self._session)
-        self._lcm = lcm.LCM(url)
-        self._last: lcmt_dvrk_status | None = None
-        self._is_new = False
-        self._subscription = self._lcm.subscribe(status_channel(arm), self._receive)
-        self._subscription.set_queue_capacity(_QUEUE)
-
-    def close(self) -> None:
-        """Stops receiving and ends LCM's receive thread, which otherwise wakes up for every message."""
-        self._lcm.unsubscribe(self._subscription)
-        # The subscription refers to this link and to LCM, which the garbage collector does not detect.
-        del self._subscription, self._lcm
-
-    def now(self) -> float:
-        """Returns the time of the computer's monotonic clock [s]."""
-        return time.monotonic()
-
-    def next_status(self, seconds: float) -> lcmt_dvrk_status:
-        """Returns the newest status of the session that arrives within `seconds`.
-
-        Raises:
-            ControllerError: No status arrived. The error message lists ignored statuses.
-        """
-        end = time.monotonic() + seconds
-        self._is_new = False
-        while not self._is_new and (left := end - time.monotonic()) > 0:
-            handle_message(self._lcm, left)
-        for _ in range(_MESSAGES_AT_ONCE):
-            if not handle_message(self._lcm, 0.0):
-                break
-        self._filter.settle(self.now())
-        if not self._is_new or self._last is None:
-            raise ControllerError(
-                f"no status of {self.arm.name} for {seconds:g} s on {status_channel(self.arm)}{self._ignored_text()}"
-            )
-        return self._last
-
-    def send(self, command: lcmt_dvrk_command) -> None:
-        """Publishes a command."""
-        data = command.encode()
-        self._lcm.publish(command_channel(self.arm), data if self._key is None else self._key.sign(data))
-
-    def _receive(self, channel: str, data: bytes) -> None:
-        if self._replays:
-            status = decode(lcmt_dvrk_status, data)
-            if status is None or (status.arm_name, status.num_joints) != (self.arm.name, self.arm.num_joints):
-                return
-        elif (status := self._filter.accept(data, self.now(), settle=False)) is None:
-            return
-        elif self._last is not None:
-            self.lost += status.sequence - self._last.sequence - 1
-        self._last, self._is_new = status, True
-
-    def _ignored_text(self) -> str:
-        """Returns a description of the statuses that were ignored since the last accepted status, or ""."""
-        ignored = self._filter.ignored.most_common()
-        if not ignored:
-            return ""
-        advice = {
-            StatusFilter.OTHER_SESSION: f"; {self.arm.name} was restarted: look at it, then start again",
-            StatusFilter.NOT_AUTHENTIC: "; the arm and this process need the same key (--key)",
-        }
-        return f"; ignored: {', '.join(f'{n} {reason}' for reason, n in ignored)}{advice.get(ignored[0][0], '')}"
 
 
 def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:

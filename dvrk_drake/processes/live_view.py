@@ -13,8 +13,8 @@ import numpy as np
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.lcm_messages import describe_state
-from dvrk_drake.processes.control import ArmLink
 from dvrk_drake.systems.arm_view.arm_view import ArmView
+from dvrk_drake.systems.lcm.arm_link import ArmLink
 
 #: Longest time to wait for a status [s]. It is short, so that the view can be closed at any time.
 _TIMEOUT = 0.2

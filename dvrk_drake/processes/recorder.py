@@ -13,7 +13,7 @@ import numpy as np
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
-from dvrk_drake.processes.lcm_network import handle_message
+from dvrk_drake.systems.lcm.lcm_network import handle_message
 from dvrk_drake.recordings.reader_lcm import StatusStream
 from dvrk_drake.recordings.writer_stream import (
     RecordingFile,

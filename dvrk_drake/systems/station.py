@@ -23,7 +23,7 @@ from dvrk_drake.models.model_file import add_packages
 from dvrk_drake.models.plant import add_arm, package_map
 from dvrk_drake.systems.arm_drive import GRAVITY_TOLERANCE, ArmDrive, add_arm_drive, gravity_at_base
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
-from dvrk_drake.systems.arm_station import export_arm, export_scene, station_ports
+from dvrk_drake.systems.arm_station import export_arm, export_scene
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.station_config import StationArm, StationConfig
 
@@ -148,7 +148,7 @@ def _add_real_arm(builder: DiagramBuilder, name: str, station: HardwareArmStatio
     """Adds the station of a real arm and exports its ports with the prefix `name`."""
     station.set_name(name)
     builder.AddSystem(station)
-    for port in station_ports(station.arm).inputs:
-        builder.ExportInput(station.GetInputPort(port), f"{name}{port[len(station.arm.name) :]}")
-    for port in station_ports(station.arm).outputs:
-        builder.ExportOutput(station.GetOutputPort(port), f"{name}{port[len(station.arm.name) :]}")
+    for port in map(station.get_input_port, range(station.num_input_ports())):
+        builder.ExportInput(port, f"{name}{port.get_name()[len(station.arm.name) :]}")
+    for port in map(station.get_output_port, range(station.num_output_ports())):
+        builder.ExportOutput(port, f"{name}{port.get_name()[len(station.arm.name) :]}")

@@ -272,7 +272,7 @@ def test_run_warns_before_connecting_to_the_arm(files, monkeypatch, capsys):
     def stop(_):
         raise ModelError("no network here")
 
-    monkeypatch.setattr("dvrk_drake.processes.lcm_network.open_lcm", stop)
+    monkeypatch.setattr("dvrk_drake.systems.lcm.lcm_network.open_lcm", stop)
     model, _, bad = files
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     capsys.readouterr()

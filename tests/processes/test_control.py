@@ -18,9 +18,10 @@ from dvrk_drake.models import files
 from dvrk_drake.models.lcm_messages import MessageKey, describe_refusal, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_operator import reset_fault
-from dvrk_drake.processes.control import ArmLink, control, first_status
+from dvrk_drake.processes.control import control, first_status
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.processes.teacher import Teacher
+from dvrk_drake.systems.lcm.arm_link import LcmArmLink
 
 
 @pytest.fixture(scope="module")
@@ -260,10 +261,10 @@ def status_bytes(sequence, session=SESSION, **fields):
 
 
 class Linked:
-    """ArmLink on a network within this process, with a clock that the test sets."""
+    """LcmArmLink on a network within this process, with a clock that the test sets."""
 
     def __init__(self, **arguments):
-        self.time, self.link = 0.0, ArmLink(ARM, "memq://", **arguments)
+        self.time, self.link = 0.0, LcmArmLink(ARM, "memq://", **arguments)
         self.link.now = lambda: self.time
 
     def receive(self, *messages):
@@ -358,7 +359,7 @@ def test_control_ignores_spoofed_statuses_until_a_restart(controller, mode):
 
     def next_status(seconds):
         if len(accepted) >= 500 and mode == "restarted":
-            return ArmLink.next_status(linked.link, 0.05) if linked.link._filter.ignored else restart()
+            return LcmArmLink.next_status(linked.link, 0.05) if linked.link._filter.ignored else restart()
         status = arm.next_status(seconds)
         linked.time = 1e-6 * arm.utime
         messages = [status.encode()]
@@ -372,7 +373,7 @@ def test_control_ignores_spoofed_statuses_until_a_restart(controller, mode):
     def restart():
         message = changed_copy(arm.status, session_id=5, sequence=1)
         linked.link._lcm.publish(status_channel(ARM), message)
-        return ArmLink.next_status(linked.link, 0.05)
+        return LcmArmLink.next_status(linked.link, 0.05)
 
     runner = SimpleNamespace(arm=ARM, lost=0, now=arm.now, next_status=next_status, send=arm.send)
     if mode == "restarted":

@@ -16,7 +16,7 @@ from dvrk_drake.errors import DvrkDrakeError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import pace
-from dvrk_drake.processes.lcm_network import open_lcm
+from dvrk_drake.systems.lcm.lcm_network import open_lcm
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.simulated_arm import load_driver, start_pose, stop_on_signals
 
@@ -144,13 +144,13 @@ class LossyLcm(lcm.LCM):
 
 
 def test_network_with_lost_messages_is_usable(monkeypatch):
-    monkeypatch.setattr("dvrk_drake.processes.lcm_network.lcm.LCM", LossyLcm)
+    monkeypatch.setattr("dvrk_drake.systems.lcm.lcm_network.lcm.LCM", LossyLcm)
     assert open_lcm("memq://").get_lcm_url() == "memq://"
     assert LossyLcm.lost == 2
 
 
 def test_network_without_route_is_an_error():
-    code = "from dvrk_drake.processes.lcm_network import open_lcm; open_lcm()"
+    code = "from dvrk_drake.systems.lcm.lcm_network import open_lcm; open_lcm()"
     try:
         done = subprocess.run(
             ["unshare", "-rn", sys.executable, "-c", code],

@@ -8,12 +8,13 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.hand import Hand, HandPath
-from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_command import make_command
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import SimDvrkDriver
 
@@ -163,10 +164,6 @@ class FaultyArm:
         self.on_status = lambda status, time: self.desired(time) if use == "effort" else None
         if use in ("effort", "gravity", "damped"):
             self.controller = ArmController(arm, model, "hold" if use == "effort" else use, PERIOD)
-        elif use == "position":
-            self._sender = builder.AddSystem(DvrkCommandSender(arm))
-            connect(self.driver.GetOutputPort("lcmt_dvrk_status"), self._sender.GetInputPort("lcmt_dvrk_status"))
-            connect(self._sender.get_output_port(), self.driver.GetInputPort("lcmt_dvrk_command"))
         self._use = use
         if hand:
             hands, wanted = builder.AddSystem(Hand(arm)), builder.AddSystem(HandPath(arm, "dh_7", path))
@@ -186,12 +183,13 @@ class FaultyArm:
 
     def step(self):
         time = PERIOD * self.ticks
+        status = self.driver.GetOutputPort("lcmt_dvrk_status").Eval(self.driver.GetMyContextFromRoot(self.context))
         if self.controller is not None:
-            status = self.driver.GetOutputPort("lcmt_dvrk_status").Eval(self.driver.GetMyContextFromRoot(self.context))
             self.driver.Receive(self.controller.answer(status, time, self.on_status(status, time)).encode())
         elif self._use == "position":
-            context = self._sender.GetMyMutableContextFromRoot(self.context)
-            self._sender.GetInputPort("desired_state").FixValue(context, self.desired(time))
+            mode, desired = Command.POSITION, self.desired(time)
+            command = make_command(status, 1, round(1e6 * time), mode, desired_state=desired)
+            self.driver.Receive(command.encode())
         self.ticks += 1
         self.simulator.AdvanceTo(PERIOD * self.ticks)
 

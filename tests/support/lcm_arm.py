@@ -1,7 +1,6 @@
 """Simulated arm with LCM in the process of the test, and controllers for the arm."""
 
 import numpy as np
-from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -12,7 +11,6 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
-from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
@@ -85,32 +83,23 @@ def without_stops(plant):
 
 
 class CommandSender:
-    """DvrkCommandSender that answers each status, with fixed inputs."""
+    """Hardware station that answers each status, with fixed inputs."""
 
     def __init__(self, lcm, arm=ARM, **inputs):
-        self.arm, self.sender = arm, DvrkCommandSender(arm)
-        self.context = self.sender.CreateDefaultContext()
-        self.lcm, self.status, self.ticks = lcm, Status(), 0
-        # Fixing the value at each tick would copy it each time.
-        self.received = self.port("lcmt_dvrk_status").FixValue(self.context, AbstractValue.Make(self.status))
-        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.receive)
+        self.station = HardwareArmStation(arm, lcm=lcm)
+        self.simulator, self.ticks = Simulator(self.station), 0
         for name, value in inputs.items():
             self.fix(name, value)
 
-    def receive(self, data):
-        self.status = Status.decode(data)
-
-    def port(self, name):
-        return self.sender.GetInputPort(name)
-
     def fix(self, name, value):
-        self.port(name).FixValue(self.context, value)
+        port = self.station.GetInputPort(f"{self.station.arm.name.lower()}.{name}")
+        port.FixValue(self.simulator.get_mutable_context(), value)
 
-    def command(self):
-        self.received.GetMutableData().set_value(self.status)
-        return self.sender.get_output_port().Eval(self.context)
+    def value(self, name):
+        """Returns the value of an output port."""
+        port = self.station.GetOutputPort(f"{self.station.arm.name.lower()}.{name}")
+        return port.Eval(self.simulator.get_context())
 
     def step(self):
         self.ticks += 1
-        self.context.SetTime(1e-3 * self.ticks)
-        self.lcm.Publish(f"DVRK_COMMAND_{self.arm.name}", self.command().encode())
+        self.simulator.AdvanceTo(1e-3 * self.ticks)

@@ -1,10 +1,11 @@
-"""Systems for the command channel of an arm: sender for a controller, and receiver with a command guard for an arm."""
+"""Commands to an arm: command of a sender, and System that receives commands and checks them with a guard."""
 
 from __future__ import annotations
 
 import secrets
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
@@ -16,97 +17,55 @@ from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.lcm.dvrk_status import ArmClock
 
-_MODES = (lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD, lcmt_dvrk_command.POSITION, lcmt_dvrk_command.EFFORT)
-
 
 def draw_id() -> int:
     """Returns a random sender_id or session_id, which is not 0 and practically unique."""
     return 1 + secrets.randbelow(2**62)
 
 
-class DvrkCommandSender(LeafSystem):
-    """Computes the command for a received status. An LcmPublisherSystem can publish the command.
+def make_command(
+    status: lcmt_dvrk_status,
+    sender_id: int,
+    utime: int,
+    mode: int,
+    effort: NDArray[np.float64] | None = None,
+    desired_state: NDArray[np.float64] | None = None,
+    *,
+    reset_fault: bool = False,
+) -> lcmt_dvrk_command:
+    """Returns the command that answers a status.
 
-    .. pydrake_system::
+    The mode is HOLD if the values of the mode are missing or not finite, or with `reset_fault`. The command contains
+    the session, time and sequence of the status. The arm refuses a second command for the same status, so it holds if
+    the sender receives no new statuses.
 
-        name: DvrkCommandSender
-        input_ports:
-        - lcmt_dvrk_status
-        - effort (optional)
-        - desired_state (optional)
-        - control_mode (optional)
-        - reset_fault (optional)
-        output_ports:
-        - lcmt_dvrk_command
-
-    Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
-
-    - `lcmt_dvrk_status`: received status. The command contains the session, time and sequence of this status. The arm
-      refuses a second command for the same status. The arm therefore holds if the sender receives no new statuses.
-    - `effort` (n): commanded efforts. `desired_state` (2n): commanded q, then v.
-    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Other values mean HOLD. If the port is
-      unconnected, the mode is EFFORT if `effort` is connected, otherwise POSITION if `desired_state` is connected,
-      otherwise HOLD.
-    - `reset_fault` (1): a value other than zero requests the reset of a fault, or a resume after a watchdog hold. The
-      mode is then HOLD.
-    - `lcmt_dvrk_command`: command message. The mode is HOLD if the commanded values are unconnected or not finite.
+    Args:
+        status: Last received status.
+        sender_id: Identifier of the sender.
+        utime: Present time of the sender's clock [us].
+        mode: lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
+        effort: Commanded efforts (n,) [N m, N] for EFFORT.
+        desired_state: Commanded q, then v (2n,) [rad, m, rad/s, m/s] for POSITION.
+        reset_fault: Whether to request the reset of a fault, or the resume after a watchdog hold.
     """
-
-    def __init__(self, arm: Arm, sender_id: int | None = None) -> None:
-        """Creates the sender.
-
-        Args:
-            arm: Controlled arm.
-            sender_id: Identifier of the sender. None: a random identifier is used.
-        """
-        super().__init__()
-        arm.refuse_locked_joints("a sender of commands")
-        n = arm.num_joints
-        self._arm_name, self._num_joints = arm.name, n
-        self._sender_id = sender_id or draw_id()
-        self._status = self.DeclareAbstractInputPort("lcmt_dvrk_status", AbstractValue.Make(lcmt_dvrk_status()))
-        self._effort = self.DeclareVectorInputPort("effort", n)
-        self._desired = self.DeclareVectorInputPort("desired_state", 2 * n)
-        self._control_mode = self.DeclareVectorInputPort("control_mode", 1)
-        self._reset = self.DeclareVectorInputPort("reset_fault", 1)
-        self.DeclareAbstractOutputPort(
-            "lcmt_dvrk_command", lambda: AbstractValue.Make(lcmt_dvrk_command()), self._calc_command
-        )
-
-    @property
-    def sender_id(self) -> int:
-        """Identifier by which the arm distinguishes this sender from other senders."""
-        return self._sender_id
-
-    def _calc_command(self, context: Context, output: AbstractValue) -> None:
-        n = self._num_joints
-        status = self._status.Eval(context)
-        command = lcmt_dvrk_command()
-        command.utime, command.sequence = round(1e6 * context.get_time()), status.sequence
-        command.sender_id, command.session_id = self._sender_id, status.session_id
-        command.status_utime, command.arm_name = status.utime, self._arm_name
-        command.num_joints = n
-        effort = self._effort.Eval(context) if self._effort.HasValue(context) else np.full(n, np.nan)
-        desired = self._desired.Eval(context) if self._desired.HasValue(context) else np.full(2 * n, np.nan)
-        requested = {lcmt_dvrk_command.EFFORT: effort, lcmt_dvrk_command.POSITION: desired}
-        mode = self._mode(context)
-        command.reset_fault = self._reset.HasValue(context) and bool(self._reset.Eval(context)[0])
-        if command.reset_fault or (mode in requested and not is_finite(requested[mode].tolist())):
-            mode = lcmt_dvrk_command.HOLD
+    n, command = status.num_joints, lcmt_dvrk_command()
+    command.utime, command.sequence, command.sender_id = utime, status.sequence, sender_id
+    command.session_id, command.status_utime = status.session_id, status.utime
+    command.arm_name, command.num_joints = status.arm_name, n
+    efforts, q, v = [0.0] * n, [0.0] * n, [0.0] * n
+    command.control_mode, command.reset_fault = lcmt_dvrk_command.HOLD, reset_fault
+    values = {lcmt_dvrk_command.EFFORT: effort, lcmt_dvrk_command.POSITION: desired_state}.get(mode)
+    numbers = None if values is None else values.tolist()
+    if mode == lcmt_dvrk_command.OFF and not reset_fault:
         command.control_mode = mode
-        zero = np.zeros(n)
-        command.effort = (effort if mode == lcmt_dvrk_command.EFFORT else zero).tolist()
-        q_v = desired if mode == lcmt_dvrk_command.POSITION else np.zeros(2 * n)
-        command.position, command.velocity = q_v[:n].tolist(), q_v[n:].tolist()
-        output.set_value(command)
-
-    def _mode(self, context: Context) -> int:
-        if self._control_mode.HasValue(context):
-            mode = self._control_mode.Eval(context)[0]
-            return int(mode) if mode in _MODES else lcmt_dvrk_command.HOLD
-        if self._effort.HasValue(context):
-            return lcmt_dvrk_command.EFFORT
-        return lcmt_dvrk_command.POSITION if self._desired.HasValue(context) else lcmt_dvrk_command.HOLD
+    elif numbers is not None and is_finite(numbers) and not reset_fault:
+        command.control_mode = mode
+        if mode == lcmt_dvrk_command.EFFORT:
+            efforts = numbers
+        else:
+            q, v = numbers[:n], numbers[n:]
+    command.effort, command.position, command.velocity = efforts, q, v
+    return command
 
 
 #: Shortest time [s] in which an effort grows from zero to its limit, outside the state EFFORT. The gains of the

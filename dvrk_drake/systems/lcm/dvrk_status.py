@@ -1,14 +1,11 @@
-"""Systems for the status channel of an arm: sender and clock for an arm, and receiver for a controller."""
+"""Status messages of an arm: their sender, and the clock of the arm."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
@@ -115,50 +112,3 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
     status.num_ignored, status.ignored_code = counts.ignored, guard.ignored_code
     status.position_commanded = guard.output.position.tolist()
     status.joint_flags = guard.output.joint_flags.tolist()
-
-
-class DvrkStatusReceiver(LeafSystem):
-    """Outputs the measurements in the status messages of one arm, which an LcmSubscriberSystem receives.
-
-    .. pydrake_system::
-
-        name: DvrkStatusReceiver
-        input_ports:
-        - lcmt_dvrk_status
-        output_ports:
-        - position_measured
-        - velocity_estimated
-        - state_estimated
-        - effort_measured
-
-    `state_estimated` has 2n numbers: q, then v. All other outputs have n numbers, in the arm's order [rad, rad/s, N m;
-    m, m/s, N on a prismatic joint]. Before the first message of this arm, all outputs are NaN, because zero would be a
-    valid pose.
-    """
-
-    def __init__(self, arm: Arm) -> None:
-        """Creates the receiver of `arm`. For messages of another arm or size, the outputs are NaN."""
-        super().__init__()
-        arm.refuse_locked_joints("a receiver of statuses")
-        n = arm.num_joints
-        self._arm_name, self._num_joints = arm.name, n
-        self._status = self.DeclareAbstractInputPort("lcmt_dvrk_status", AbstractValue.Make(lcmt_dvrk_status()))
-        for name, fields in {
-            "position_measured": ("position",),
-            "velocity_estimated": ("velocity",),
-            "state_estimated": ("position", "velocity"),
-            "effort_measured": ("effort_measured",),
-        }.items():
-            self.DeclareVectorOutputPort(name, n * len(fields), self._make_calc(fields))
-
-    def _make_calc(self, fields: tuple[str, ...]) -> Callable[[Context, BasicVector], None]:
-        def calc(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(np.concatenate([self._vector(context, field) for field in fields]))
-
-        return calc
-
-    def _vector(self, context: Context, field: str) -> NDArray[np.float64]:
-        status = self._status.Eval(context)
-        if status.arm_name != self._arm_name or status.num_joints != self._num_joints:
-            return np.full(self._num_joints, np.nan)
-        return np.array(getattr(status, field))

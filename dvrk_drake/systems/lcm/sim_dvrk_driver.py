@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from pydrake.common.value import AbstractValue
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.lcm import LcmPublisherSystem
+from pydrake.systems.lcm import LcmPublisherSystem, PySerializer
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
@@ -15,7 +16,6 @@ from dvrk_drake.models.lcm_messages import MessageKey, command_channel, status_c
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
 from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver, draw_id
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status import ArmClock, DvrkStatusSender
@@ -126,6 +126,17 @@ class SimDvrkDriver(Diagram):
         return self._receiver.GetGuard(self.GetSubsystemContext(self._receiver, context))
 
 
+class _SigningSerializer(PySerializer):
+    """Serializer that signs messages."""
+
+    def __init__(self, message_type: type, key: MessageKey) -> None:
+        super().__init__(message_type)
+        self._key = key
+
+    def Serialize(self, abstract_value: AbstractValue) -> bytes:
+        return self._key.sign(super().Serialize(abstract_value))
+
+
 def apply_driver_config(
     driver: DvrkDriver,
     station: ArmStation,
@@ -171,7 +182,7 @@ def apply_driver_config(
         f"{name}_status_publisher",
         LcmPublisherSystem(
             status_channel(arm),
-            TolerantSerializer(lcmt_dvrk_status, key=key),
+            PySerializer(lcmt_dvrk_status) if key is None else _SigningSerializer(lcmt_dvrk_status, key),
             lcm,
             publish_period=driver.status_period,
         ),

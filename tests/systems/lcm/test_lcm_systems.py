@@ -6,20 +6,16 @@ from lcm_arm import ARM, POSES, START, CommandSender, Controller, SimulatedArm, 
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.lcm import LcmSubscriberSystem
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.lcm_messages import StatusFilter, create_key_file
+from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
 from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 pytestmark = pytest.mark.drake_api
 
@@ -139,7 +135,7 @@ def test_second_gravity_compensation_is_refused_at_start():
 def test_own_gravity_compensation_with_zero_command():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
-    sender = CommandSender(lcm, effort=np.zeros(7))
+    sender = CommandSender(lcm, effort_commanded=np.zeros(7))
     run(lcm, 1000, arm, sender)
     assert arm.statuses[-1].guard_state == Status.STATE_EFFORT
     assert arm.drift() < 1e-3
@@ -149,11 +145,11 @@ def test_own_gravity_compensation_with_zero_command():
 def test_position_commands_move_the_arm():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
-    sender = CommandSender(lcm, desired_state=np.concatenate([POSES["mtml"], np.zeros(7)]))
+    sender = CommandSender(lcm, state_desired=np.concatenate([POSES["mtml"], np.zeros(7)]))
     run(lcm, 300, arm, sender)
     assert arm.statuses[-1].guard_state == Status.STATE_POSITION
     goal = np.array(POSES["mtml"]) + 0.1
-    sender.fix("desired_state", np.concatenate([goal, np.zeros(7)]))
+    sender.fix("state_desired", np.concatenate([goal, np.zeros(7)]))
     run(lcm, 2500, arm, sender)
     assert np.abs(arm.statuses[-1].position - goal).max() < 5e-3
     assert np.abs(arm.statuses[-1].position_commanded - goal).max() < 1e-9
@@ -197,7 +193,7 @@ def test_efforts_after_off_are_refused_while_braking():
     shares = []
     while (status := arm.statuses[-1]).guard_state != Status.STATE_EFFORT and len(arm.statuses) < 1000:
         gravity = model.gravity_effort(np.array(status.position))
-        sender.fix("effort", gravity)
+        sender.fix("effort_commanded", gravity)
         shares.append(np.max(np.abs(status.effort_measured - gravity) / arm.arm.effort_limits))
         run(lcm, 1, arm, sender)
     assert (status.guard_state, status.refusal_code) == (Status.STATE_EFFORT, Status.REFUSAL_START_FAR)
@@ -209,24 +205,29 @@ def test_efforts_after_off_are_refused_while_braking():
 
 
 def test_sender_commands_hold_without_finite_numbers():
-    lcm = DrakeLcm("memq://")
+    lcm, sent = DrakeLcm("memq://"), []
+    lcm.Subscribe("DVRK_COMMAND_MTML", lambda data: sent.append(Command.decode(data)))
     effort, q_v = np.arange(7.0), np.arange(14.0)
     cases = [
         ({}, Command.HOLD),
-        ({"effort": effort}, Command.EFFORT),
-        ({"desired_state": q_v}, Command.POSITION),
-        ({"effort": effort, "desired_state": q_v}, Command.EFFORT),
-        ({"effort": effort, "desired_state": q_v, "control_mode": [2.0]}, Command.POSITION),
-        ({"effort": effort, "control_mode": [2.0]}, Command.HOLD),
-        ({"effort": effort, "control_mode": [np.nan]}, Command.HOLD),
-        ({"effort": effort, "control_mode": [0.0]}, Command.HOLD),
-        ({"effort": effort, "control_mode": [4.0]}, Command.OFF),
-        ({"effort": effort * np.nan}, Command.HOLD),
-        ({"effort": effort + 1e7}, Command.HOLD),
-        ({"effort": effort, "reset_fault": [1.0]}, Command.HOLD),
+        ({"effort_commanded": effort}, Command.EFFORT),
+        ({"state_desired": q_v}, Command.POSITION),
+        ({"effort_commanded": effort, "state_desired": q_v}, Command.EFFORT),
+        ({"effort_commanded": effort, "state_desired": q_v, "control_mode": [2.0]}, Command.POSITION),
+        ({"effort_commanded": effort, "control_mode": [2.0]}, Command.HOLD),
+        ({"effort_commanded": effort, "control_mode": [np.nan]}, Command.HOLD),
+        ({"effort_commanded": effort, "control_mode": [0.0]}, Command.HOLD),
+        ({"effort_commanded": effort, "control_mode": [4.0]}, Command.OFF),
+        ({"effort_commanded": effort * np.nan}, Command.HOLD),
+        ({"effort_commanded": effort + 1e7}, Command.HOLD),
+        ({"effort_commanded": effort, "reset_fault": [1.0]}, Command.HOLD),
     ]
     for inputs, mode in cases:
-        command = CommandSender(lcm, **inputs).command()
+        sender = CommandSender(lcm, **inputs)
+        lcm.Publish("DVRK_STATUS_MTML", full_status().encode())
+        run(lcm, 2, sender)
+        command = sent.pop()
+        assert not sent and command.sender_id == sender.station.sender_id
         assert command.control_mode == mode
         np.testing.assert_array_equal(command.effort, effort if mode == Command.EFFORT else np.zeros(7))
         expected = q_v if mode == Command.POSITION else np.zeros(14)
@@ -243,25 +244,19 @@ def full_status(arm_name="MTML", n=7, utime=1):
     return status
 
 
-def test_status_receiver_outputs_nan_without_valid_status():
+def test_outputs_are_nan_without_valid_status():
     lcm = DrakeLcm("memq://")
-    builder = DiagramBuilder()
-    statuses = StatusFilter("MTML", 7)
-    serializer = TolerantSerializer(Status, read=lambda data: statuses.accept(data, 0.0))
-    subscriber = builder.AddSystem(LcmSubscriberSystem("DVRK_STATUS_MTML", serializer, lcm))
-    receiver = builder.AddSystem(DvrkStatusReceiver(ARM))
-    builder.Connect(subscriber.get_output_port(), receiver.get_input_port())
-    simulator = Simulator(builder.Build())
-    context = receiver.GetMyContextFromRoot(simulator.get_context())
+    station = CommandSender(lcm)
+    names = ("position_measured", "velocity_estimated", "state_estimated", "effort_measured")
 
     def after(data):
         lcm.Publish("DVRK_STATUS_MTML", data)
         lcm.HandleSubscriptions(0)
-        simulator.AdvanceTo(simulator.get_context().get_time() + 1e-3)
-        return {name: receiver.GetOutputPort(name).Eval(context).tolist() for name in names}
+        station.step()
+        return {name: station.value(name).tolist() for name in names}
 
-    names = ("position_measured", "velocity_estimated", "state_estimated", "effort_measured")
-    assert all(np.all(np.isnan(receiver.GetOutputPort(name).Eval(context))) for name in names)
+    numbers = ("guard_state", "fault_code", "acting_mode", "in_control", "measurement_age", "sequence_gaps")
+    assert all(np.all(np.isnan(station.value(name))) for name in (*names, *numbers))
     good = after(full_status().encode())
     assert (
         good["state_estimated"] == [*range(7), *range(10, 17)] == good["position_measured"] + good["velocity_estimated"]
@@ -269,6 +264,41 @@ def test_status_receiver_outputs_nan_without_valid_status():
     assert good["effort_measured"] == list(range(20, 27))
     for bad in (b"", b"garbage", full_status("MTMR").encode(), full_status(n=6).encode(), full_status().encode()[:-30]):
         assert after(bad) == good
+    # The time advances by 1 ms per step. The first status was read at the begin of a step.
+    np.testing.assert_allclose(station.value("measurement_age"), 6e-3, atol=1e-9)
+    later = full_status(utime=4000)
+    later.sequence = 4
+    after(later.encode())
+    assert station.value("sequence_gaps") == [3.0]
+
+
+def test_ports_tell_the_state_and_a_reset_resumes():
+    lcm = DrakeLcm("memq://")
+    arm, station = SimulatedArm(lcm), CommandSender(lcm, effort_commanded=np.zeros(7))
+    model = ControlModel(IdentifiedModel.from_arm(ARM))
+    ports = ("guard_state", "fault_code", "acting_mode", "in_control", "sequence_gaps")
+
+    def state():
+        return [float(station.value(name)[0]) for name in ports]
+
+    station.fix("effort_commanded", model.gravity_effort(np.array(POSES["mtml"])))
+    run(lcm, 10, arm, station)
+    assert state() == [Status.STATE_STARTING, 0, Command.HOLD, 0, 0]
+    run(lcm, 300, arm, station)
+    assert state() == [Status.STATE_EFFORT, 0, Command.EFFORT, 1, 0]
+    run(lcm, 100, arm)  # this process is suspended, and the arm holds
+    run(lcm, 5, arm, station)
+    assert state() == [Status.STATE_HOLD, 0, Command.HOLD, 0, 0]
+    assert arm.statuses[-1].fault_text.startswith("the last command expired")
+    station.fix("reset_fault", [1.0])
+    run(lcm, 60, arm, station)
+    assert state()[0] == Status.STATE_HOLD and not arm.statuses[-1].fault_text
+    station.fix("reset_fault", [0.0])
+    run(lcm, 350, arm, station)
+    assert state()[:4] == [Status.STATE_EFFORT, 0, Command.EFFORT, 1]
+    arm.guard.report_fault("the amplifier is hot")
+    run(lcm, 5, arm, station)
+    assert state()[:4] == [Status.STATE_FAULT, Status.FAULT_DRIVER, Command.HOLD, 0]
 
 
 def test_hardware_station_ignores_old_statuses():

@@ -21,11 +21,11 @@ def test_feedforward_velocity_keeps_joints_inside_limits(name):
     A, lower, upper = arm.arm.limit_matrix()
     outward = np.where(np.arange(7) == 2, -1.0, 1.0)  # shoulder and elbow in opposite directions, for the coupled limit
     goal = np.where(outward > 0, arm.arm.position_upper - 1e-3, arm.arm.position_lower + 1e-3)
-    sender = CommandSender(lcm, arm.arm, desired_state=np.concatenate([POSES[name], np.zeros(7)]))
+    sender = CommandSender(lcm, arm.arm, state_desired=np.concatenate([POSES[name], np.zeros(7)]))
     run(lcm, 60, arm, sender)
-    sender.fix("desired_state", np.concatenate([goal, np.zeros(7)]))
+    sender.fix("state_desired", np.concatenate([goal, np.zeros(7)]))
     run(lcm, 1500, arm, sender)
-    sender.fix("desired_state", np.concatenate([goal, 100 * outward]))
+    sender.fix("state_desired", np.concatenate([goal, 100 * outward]))
     margin = np.minimum(0.05, 0.05 * (upper - lower))
     for _ in range(500):
         run(lcm, 1, arm, sender)
@@ -37,10 +37,10 @@ def test_feedforward_velocity_keeps_joints_inside_limits(name):
 def test_effort_plus_gravity_compensation_stays_limited():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
-    sender = CommandSender(lcm, effort=np.zeros(7))
+    sender = CommandSender(lcm, effort_commanded=np.zeros(7))
     run(lcm, 300, arm, sender)
     for sign in (1, -1):
-        sender.fix("effort", sign * ARM.effort_limits)
+        sender.fix("effort_commanded", sign * ARM.effort_limits)
         run(lcm, 30, arm, sender)
         commanded = [s.effort_commanded for s in arm.statuses[-30:]]
         assert np.all(np.abs(commanded) <= ARM.effort_limits)
@@ -53,11 +53,11 @@ def pushed(name, push, seconds):
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     A, lower, upper = arm.arm.limit_matrix()
     held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
-    sender = CommandSender(lcm, arm.arm, effort=held)
+    sender = CommandSender(lcm, arm.arm, effort_commanded=held)
     run(lcm, 60, arm, sender)
     worst = -np.inf
     for k in range(round(1e3 * seconds)):
-        sender.fix("effort", held + (push - held) * min(1.0, k / 200))
+        sender.fix("effort_commanded", held + (push - held) * min(1.0, k / 200))
         run(lcm, 1, arm, sender)
         c = A @ np.array(arm.statuses[-1].position)
         worst = max(worst, *(np.maximum(c - upper, lower - c) / np.minimum(0.05, 0.05 * (upper - lower))))
@@ -96,10 +96,10 @@ def test_wrist_on_soft_wall_comes_to_rest(name, joint):
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
     push = 0.6 * arm.arm.effort_limits * np.eye(7)[joint]
-    sender = CommandSender(lcm, arm.arm, effort=held)
+    sender = CommandSender(lcm, arm.arm, effort_commanded=held)
     run(lcm, 60, arm, sender)
     for k in range(1000):
-        sender.fix("effort", held + push * min(1.0, k / 200))
+        sender.fix("effort_commanded", held + push * min(1.0, k / 200))
         run(lcm, 1, arm, sender)
     last = arm.statuses[-100:]
     assert last[-1].joint_flags[joint] & Status.FLAG_POSITION_LIMIT

@@ -1,0 +1,187 @@
+"""Links to one arm: its statuses arrive, and commands are sent to it."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+
+import lcm
+from pydrake.lcm import DrakeLcmInterface
+
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.lcm_messages import MessageKey, StatusFilter, command_channel, decode, status_channel
+from dvrk_drake.systems.lcm.lcm_network import handle_message
+
+#: Length of the queue of statuses. If the queue is full, further statuses are dropped. Largest number of statuses that
+#: are processed at once. It limits the delay that a flood of messages can cause.
+_QUEUE, _MESSAGES_AT_ONCE = 100, 200
+
+
+class ArmLink(ABC):
+    """Statuses (lcmt_dvrk_status) from one arm and commands (lcmt_dvrk_command) to it. Only the newest status is used.
+
+    A subclass passes each received message to `_receive`.
+
+    Attributes:
+        arm: Arm whose statuses are received.
+        lost: Number of statuses that were sent, but not received.
+    """
+
+    #: Place where the statuses arrive, for messages.
+    where = ""
+
+    def __init__(
+        self,
+        arm: Arm,
+        *,
+        key: MessageKey | None = None,
+        before: lcmt_dvrk_status | None = None,
+        replays: bool = False,
+    ) -> None:
+        """Creates a link.
+
+        Args:
+            arm: Arm whose statuses are received.
+            key: Key that must have signed the statuses, and that signs the commands. None: statuses are not verified
+                and commands are not signed.
+            before: Status of the session that is used. A session is one run of the arm's process. None: the
+                session of the first received status is used.
+            replays: True to accept statuses of any session and time, for example from a replayed log. Must be False for
+                a controller, because old statuses would determine the commands.
+        """
+        self.arm, self.lost, self._replays, self._key = arm, 0, replays, key
+        session = 0 if before is None else before.session_id
+        self._filter = StatusFilter(arm.name, arm.num_joints, key, session_id=session)
+        self._last: lcmt_dvrk_status | None = None
+        self._is_new = False
+
+    @abstractmethod
+    def close(self) -> None:
+        """Ends the link."""
+
+    @abstractmethod
+    def _handle(self, seconds: float) -> bool:
+        """Handles one message that arrives within `seconds`. Returns whether one arrived."""
+
+    @abstractmethod
+    def _publish(self, data: bytes) -> None:
+        """Sends an encoded command."""
+
+    def now(self) -> float:
+        """Returns the time of the computer's monotonic clock [s]."""
+        return time.monotonic()
+
+    def utime(self, context_time: float) -> int:
+        """Returns the present time of the sender's clock [us]. `context_time` is the time of a Diagram [s]."""
+        return round(1e6 * self.now())
+
+    def poll(self) -> lcmt_dvrk_status | None:
+        """Returns the newest status that arrived since the last call, or None."""
+        for _ in range(_MESSAGES_AT_ONCE):
+            if not self._handle(0.0):
+                break
+        self._filter.settle(self.now())
+        is_new, self._is_new = self._is_new, False
+        return self._last if is_new else None
+
+    def next_status(self, seconds: float) -> lcmt_dvrk_status:
+        """Returns the newest status of the session that arrives within `seconds`.
+
+        Raises:
+            ControllerError: No status arrived. The error message lists ignored statuses.
+        """
+        end = time.monotonic() + seconds
+        while not self._is_new and (left := end - time.monotonic()) > 0:
+            self._handle(left)
+        if (status := self.poll()) is None:
+            raise ControllerError(
+                f"no status of {self.arm.name} for {seconds:g} s on {self.where}{self._ignored_text()}"
+            )
+        return status
+
+    def send(self, command: lcmt_dvrk_command) -> None:
+        """Sends a command."""
+        data = command.encode()
+        self._publish(data if self._key is None else self._key.sign(data))
+
+    def _receive(self, data: bytes) -> None:
+        if self._replays:
+            status = decode(lcmt_dvrk_status, data)
+            if status is None or (status.arm_name, status.num_joints) != (self.arm.name, self.arm.num_joints):
+                return
+        elif (status := self._filter.accept(data, self.now(), settle=False)) is None:
+            return
+        elif self._last is not None:
+            self.lost += status.sequence - self._last.sequence - 1
+        self._last, self._is_new = status, True
+
+    def _ignored_text(self) -> str:
+        """Returns a description of the statuses that were ignored since the last accepted status, or ""."""
+        ignored = self._filter.ignored.most_common()
+        if not ignored:
+            return ""
+        advice = {
+            StatusFilter.OTHER_SESSION: f"; {self.arm.name} was restarted: look at it, then start again",
+            StatusFilter.NOT_AUTHENTIC: "; the arm and this process need the same key (--key)",
+        }
+        return f"; ignored: {', '.join(f'{n} {reason}' for reason, n in ignored)}{advice.get(ignored[0][0], '')}"
+
+
+class LcmArmLink(ArmLink):
+    """Link to an arm over an LCM network."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        url: str,
+        *,
+        key: MessageKey | None = None,
+        before: lcmt_dvrk_status | None = None,
+        replays: bool = False,
+    ) -> None:
+        """Opens the channels of `arm` on the LCM network `url`; see `ArmLink` for the other arguments."""
+        super().__init__(arm, key=key, before=before, replays=replays)
+        self.where, self._channel = status_channel(arm), command_channel(arm)
+        self._lcm = lcm.LCM(url)
+        self._subscription = self._lcm.subscribe(self.where, lambda channel, data: self._receive(data))
+        self._subscription.set_queue_capacity(_QUEUE)
+
+    def close(self) -> None:
+        """Stops receiving and ends LCM's receive thread, which otherwise wakes up for every message."""
+        self._lcm.unsubscribe(self._subscription)
+        # The subscription refers to this link and to LCM, which the garbage collector does not detect.
+        del self._subscription, self._lcm
+
+    def _handle(self, seconds: float) -> bool:
+        return handle_message(self._lcm, seconds)
+
+    def _publish(self, data: bytes) -> None:
+        self._lcm.publish(self._channel, data)
+
+
+class DrakeLcmArmLink(ArmLink):
+    """Link to an arm over a Drake LCM interface, whose `HandleSubscriptions` the caller calls.
+
+    The sender's clock is the time of the Diagram, so a simulated network may be faster or slower than real time.
+    """
+
+    def __init__(self, arm: Arm, network: DrakeLcmInterface, *, key: MessageKey | None = None) -> None:
+        """Subscribes to the statuses of `arm`. See `ArmLink` for `key`."""
+        super().__init__(arm, key=key)
+        self.where, self._channel, self._network = status_channel(arm), command_channel(arm), network
+        network.Subscribe(self.where, self._receive)
+
+    def close(self) -> None:
+        """Does nothing. Drake ends a subscription together with its interface."""
+
+    def utime(self, context_time: float) -> int:
+        """Returns the time of the Diagram [us]."""
+        return round(1e6 * context_time)
+
+    def _handle(self, seconds: float) -> bool:
+        return False
+
+    def _publish(self, data: bytes) -> None:
+        self._network.Publish(self._channel, data)
