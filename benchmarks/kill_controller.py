@@ -41,10 +41,10 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.systems.lcm.lcm_network import open_lcm
 from dvrk_drake.processes.pace import make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, monotonic_utime, start_pose, stop_on_signals
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
 CONDITIONS = {"alone": 0, "two busy processes": 2}
 #: Minimum and maximum time for which efforts act before the kill [s].

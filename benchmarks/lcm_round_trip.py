@@ -44,10 +44,10 @@ import numpy as np
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.systems.lcm.lcm_network import handle_message, listen, open_lcm
 from dvrk_drake.processes.pace import Pace, make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.lcm_network import handle_message, listen, open_lcm
 
 ARM = load_arm("mtml")
 ARMS = ("standing", "simulated")

@@ -103,12 +103,12 @@ def record(
         domain: With --ros: ROS domain. Default: $ROS_DOMAIN_ID, or else 0.
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.recorder import Recorder
     from dvrk_drake.processes.ros_recorder import RosRecorder
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.recordings.writer_stream import check_stream_output
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
     check_ros_options(ros, {"topic": topic, "domain": domain}, {"lcm_url": lcm_url, "key": key})
     recorded, line = load_arm(arm), LiveLine(sys.stderr)

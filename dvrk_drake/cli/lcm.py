@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
+    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
 
 
 @Parameter(name="*")
@@ -157,7 +158,7 @@ def stop(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, power_off: bool = F
 
 
 @contextmanager
-def _operator_link(name: str, lcm_url: str, key: str | None) -> Iterator[ArmLink]:
+def _operator_link(name: str, lcm_url: str, key: str | None) -> Iterator[LcmArmLink]:
     """Opens the channels of an arm for an operator, whatever its state is."""
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
@@ -238,7 +239,7 @@ def ready_controller(
     mode: Mode,
     friction: FrictionCompensator | None = None,
     gains: Gains | None = None,
-) -> tuple[ArmController, Callable[[], ArmLink], float]:
+) -> tuple[ArmController, Callable[[], LcmArmLink], float]:
     """Returns a controller for the arm, a function that opens the link to the arm, and the status period [s].
 
     With --reset, the function prints and clears a latched fault of the arm. It also resumes control of an arm that the
@@ -261,9 +262,9 @@ def ready_controller(
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.processes.arm_operator import reset_fault
     from dvrk_drake.processes.control import first_status
+    from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
-    from dvrk_drake.processes.pace import make_realtime, settle_memory
 
     quiet_drake()
     arm, key = load_arm(controlled.arm), load_key(controlled.key)
@@ -286,7 +287,7 @@ def ready_controller(
 
 def checked_start(
     model: IdentifiedModel,
-    link: Callable[[], ArmLink],
+    link: Callable[[], LcmArmLink],
     q_end: NDArray[np.float64],
     environment: Environment,
 ) -> NDArray[np.float64]:

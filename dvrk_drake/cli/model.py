@@ -105,11 +105,11 @@ def view(
         live: Show the measured pose and efforts from the LCM messages of the arm, and the commanded pose as a ghost.
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import show_status
     from dvrk_drake.systems.arm_view.arm_view import ArmView
     from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
+    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
     quiet_drake()
     if lcm_url and not live:

@@ -41,11 +41,11 @@ def bridge(
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.bridge import run_bridge
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import load_driver, stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.systems.ros.open_domain import domain_number
 
     def ready() -> None:

@@ -82,12 +82,12 @@ def sim_arm(
         meshcat: Show the arm in a web browser.
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import live_view
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
     quiet_drake()
     lcm_only = {"driver": driver, "lcm_url": lcm_url, "key": key, "meshcat": meshcat}

@@ -9,8 +9,8 @@ import lcm
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.systems.lcm.lcm_network import handle_message
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.lcm_network import handle_message
 from dvrk_drake.systems.ros.open_domain import require_cyclonedds
 
 #: Length of the queue of commands. Largest number of commands that are handled between two steps; it limits the delay

@@ -12,8 +12,8 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.systems.lcm.arm_link import ArmLink
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
+from dvrk_drake.systems.lcm.arm_link import ArmLink
 
 #: Time without a status after which an arm is considered absent [s]. Longest time until the first status [s].
 SILENCE, FIRST_WAIT = 1.0, 10.0

@@ -13,13 +13,13 @@ import numpy as np
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
-from dvrk_drake.systems.lcm.lcm_network import handle_message
 from dvrk_drake.recordings.reader_lcm import StatusStream
 from dvrk_drake.recordings.writer_stream import (
     RecordingFile,
     check_stream_output,
     open_recording_file,
 )
+from dvrk_drake.systems.lcm.lcm_network import handle_message
 
 #: Longest time until the first status [s]. Time without a status after which the status line reports missing statuses
 #: [s].

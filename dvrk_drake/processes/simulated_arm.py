@@ -20,11 +20,11 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.lcm_messages import command_channel, describe_state, status_channel
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.systems.lcm.lcm_network import handle_message, listen
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.lcm_network import handle_message, listen
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
 #: Length of the queue of commands. If the queue is full, further commands are dropped. Largest number of commands that

@@ -16,9 +16,9 @@ from dvrk_drake.errors import DvrkDrakeError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import pace
-from dvrk_drake.systems.lcm.lcm_network import open_lcm
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.simulated_arm import load_driver, start_pose, stop_on_signals
+from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
 
 class Clock:

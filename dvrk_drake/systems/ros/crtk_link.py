@@ -52,7 +52,7 @@ class CrtkArmLink(ArmLink):
         arm: Arm,
         driver: CrtkDriver,
         *,
-        report: Callable[[str], None] = logging.getLogger(__name__).warning,
+        report: Callable[[str], None] | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """Connects to an arm.
@@ -60,7 +60,8 @@ class CrtkArmLink(ArmLink):
         Args:
             arm: Arm on ROS 2.
             driver: Configuration of the driver.
-            report: Function that is called with one line for each change of the guard's state.
+            report: Function that is called with one line for each change of the guard's state. None: the lines are
+                logged as warnings.
             stopped: Function that returns whether to end the connection, e.g. after Ctrl-C.
 
         Raises:
@@ -74,7 +75,7 @@ class CrtkArmLink(ArmLink):
             self._receive,
             topic=driver.namespace or None,
             domain=driver.domain,
-            report=report,
+            report=report or logging.getLogger(__name__).warning,
             stopped=stopped,
         )
         self.where = f"{self._bridge.client.namespace}/measured_js"
