@@ -4,10 +4,10 @@
 
 The links of each simulated arm differ from those of the SDF, with a standard deviation of 20 % of their mass. The
 torques of cables and springs are 0 to 100 % of those in the arm file, and the friction is 50 % to 150 %. Each pose is
-approached from below and from above, at the distances of `collect --ros`. Friction is elastic before it slides, so it
-does not cancel completely. The noise of the averaged efforts is 0.5 % of the effort limits. The random poses are those
-of `collect --random`. The models are tested at 200 random poses of the whole workspace. An error is relative to the RMS
-holding effort of the joint, or to 2 % of its effort limit if the RMS holding effort is smaller.
+approached from below and from above, at the distances of `collect poses --transport ros`. Friction is elastic before it
+slides, so it does not cancel completely. The noise of the averaged efforts is 0.5 % of the effort limits. The models
+are tested at 200 random poses of the whole workspace. An error is relative to the RMS holding effort of the joint, or
+to 2 % of its effort limit if the RMS holding effort is smaller.
 """
 
 from __future__ import annotations

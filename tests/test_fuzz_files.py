@@ -317,8 +317,7 @@ COMMANDS = {
     "transparency --arm psm --path motion.csv --model psm.yaml": ("motion.csv", "psm.yaml"),
     "sim-arm --arm arm.yaml --driver driver.yaml": ("driver.yaml",),
     "control --arm mtml --model mtml.yaml --mode hold --gains gains.yaml": ("mtml.yaml", "gains.yaml"),
-    "collect --arm psm --poses poses.yaml --output collection.csv": ("poses.yaml", "collection.csv"),
-    "collect --arm psm --poses poses.yaml --random 2": ("poses.yaml",),
+    "collect poses poses.yaml --arm psm --output collection.csv": ("poses.yaml", "collection.csv"),
     "record out.csv --arm arm.yaml": ("arm.yaml",),
     "reproduce fig4 --data . --folder out": ("mtm_2015_good72.csv",),
 }

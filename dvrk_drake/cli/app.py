@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -138,6 +138,15 @@ Key = Annotated[
         "The arm and the controller need the same key.",
     ),
 ]
+Set = Annotated[
+    list[str] | None,
+    Parameter(metavar="KEY=VALUE", help="Change a value of the scenario. Repeat the option to change several values."),
+]
+
+
+Recording = Annotated[
+    str, Parameter(help="CSV, ROS bag (.bag, sqlite3, MCAP), MATLAB file, NumPy archive, cisst collector or LCM log.")
+]
 RosTopic = Annotated[
     str | None,
     Parameter(metavar="TOPIC", help="ROS 2 topic measured_js of the arm, or its namespace. Default: /<ARM>."),
@@ -150,15 +159,83 @@ Realtime = Annotated[
     bool,
     Parameter(show_default=False, help="Request real-time scheduling. Print a warning if it is not permitted."),
 ]
-Set = Annotated[
-    list[str] | None,
-    Parameter(metavar="KEY=VALUE", help="Change a value of the scenario. Repeat the option to change several values."),
-]
 
 
-Recording = Annotated[
-    str, Parameter(help="CSV, ROS bag (.bag, sqlite3, MCAP), MATLAB file, NumPy archive, cisst collector or LCM log.")
-]
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class LcmArm:
+    """Options of all commands for an arm over LCM."""
+
+    arm: Arm
+    lcm_url: LcmUrl = ""
+    key: Key = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ControlledArm(LcmArm):
+    """Options of the commands that control an arm."""
+
+    model: Annotated[
+        Model | None, Parameter(help="Model file, written by identify. Default: the nominal model from the SDF.")
+    ] = None
+    realtime: Realtime = False
+    reset: Annotated[
+        bool,
+        Parameter(
+            show_default=False,
+            help="Print and clear a fault of the arm. If the watchdog of the guard holds the arm, resume control.",
+        ),
+    ] = False
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class AnyArm(LcmArm):
+    """Options of the commands for an arm over LCM or ROS 2."""
+
+    transport: Annotated[
+        Literal["lcm", "ros"], Parameter(help="lcm: messages of dvrk_drake. ros: topics of a dVRK on ROS 2.")
+    ] = "lcm"
+    topic: RosTopic = None
+    domain: RosDomain = None
+
+    @property
+    def is_ros(self) -> bool:
+        """Whether the arm is on ROS 2."""
+        return self.transport == "ros"
+
+    def check(self, *, lcm: Mapping[str, object] | None = None, ros: Mapping[str, object] | None = None) -> None:
+        """Rejects options of the other transport.
+
+        Args:
+            lcm: Values of more options for LCM, by name. None, "" or False: the option was not given.
+            ros: Values of more options for ROS 2.
+
+        Raises:
+            DvrkDrakeError: An option of the other transport was given.
+        """
+        if self.is_ros:
+            values, own = {"lcm_url": self.lcm_url, "key": self.key, **(lcm or {})}, "lcm"
+        else:
+            values, own = {"topic": self.topic, "domain": self.domain, **(ros or {})}, "ros"
+        given = [
+            f"--{name.replace('_', '-')}"
+            for name, value in values.items()
+            if value is not False and value not in (None, "")
+        ]
+        if given:
+            from dvrk_drake.errors import DvrkDrakeError
+
+            raise DvrkDrakeError(f"{' and '.join(given)}: only with --transport {own}")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class CollectedArm(AnyArm, ControlledArm):
+    """Options of the arm of `collect poses`."""
+
+
 _FILE = Group("Options for the file (docs/recordings.md)", sort_key=2)
 
 

@@ -97,7 +97,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
             measured = CollectionFile(folder / f"{name}.csv", arm, both_sides=True)
             return bool(measured.finished(load_poses(folder / f"{name}.yaml", arm)).all())
 
-        words = ("collect", *common, "--poses", f"{name}.yaml", "--output", f"{name}.csv", "--model", model)
+        words = ("collect", "poses", f"{name}.yaml", *common, "--output", f"{name}.csv", "--model", model)
         return Step(title, words, done, moves=True)
 
     def motion(title: str, output: str, seed: int, *options: str) -> Step:
@@ -109,7 +109,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
             path = folder / f"{name}.yaml"
             return motion_parts.is_rehearsed(path, arm, PeriodicMotion.load(path, arm))
 
-        words = ("collect", *common, "--motion", f"{name}.yaml", "--rehearse", "--model", STATIC)
+        words = ("collect", "motion", f"{name}.yaml", *common, "--rehearse", "--model", STATIC)
         return Step(title, words, done, moves=True)
 
     def record(title: str, name: str) -> Step:
@@ -118,7 +118,7 @@ def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> 
             parts = motion_parts.recorded_parts(folder / f"{name}.csv", arm, loaded)
             return motion_parts.begin_of_rest(parts, loaded.duration) is None
 
-        words = ("collect", *common, "--motion", f"{name}.yaml", "--output", f"{name}.csv", "--model", STATIC)
+        words = ("collect", "motion", f"{name}.yaml", *common, "--output", f"{name}.csv", "--model", STATIC)
         return Step(title, words, done, moves=True)
 
     def parts(name: str) -> list[str]:

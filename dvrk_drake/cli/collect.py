@@ -1,21 +1,19 @@
-"""Commands that record an arm: record and collect."""
+"""Commands that record an arm: record, and collect with its subcommands."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 
-from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of, whole_number
-from dvrk_drake.cli.collect_motion import collect_motion
-from dvrk_drake.cli.lcm import ControlledArm, checked_start, ready_controller
+from dvrk_drake.cli.app import HARDWARE, AnyArm, CollectedArm, ControlledArm, Seconds, app, one_of
+from dvrk_drake.cli.collect_motion import follow_motion
+from dvrk_drake.cli.lcm import checked_start, ready_controller
 from dvrk_drake.cli.support import (
     check_output,
-    check_ros_options,
     interrupt_ends_process,
     load_key,
     load_model,
@@ -34,48 +32,9 @@ if TYPE_CHECKING:
     from dvrk_drake.processes.crtk_collector import CrtkCollector
     from dvrk_drake.recordings.pose_file import CollectionFile
 
-_SOURCE = one_of("Poses or a motion (one is required)")
+collect = App(name="collect", group=HARDWARE, help="Measure an arm: teach poses, collect static poses or a motion.")
+app.command(collect)
 _TASK = one_of("Task (one is required)")
-#: Default time to move a joint over its full range [s].
-_TRAVERSE_TIME = 5.0
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class RosCollection:
-    """Options of `collect` for a dVRK arm on ROS 2."""
-
-    ros: Annotated[
-        bool,
-        Parameter(
-            show_default=False,
-            help="Use ROS 2 instead of LCM. The dVRK moves the arm (move_jp); needs --output.",
-        ),
-    ] = False
-    topic: Annotated[
-        str | None,
-        Parameter(metavar="TOPIC", help="With --ros: topic measured_js of the arm, or its namespace. Default: /<ARM>."),
-    ] = None
-    domain: Annotated[
-        int | None,
-        Parameter(
-            metavar="N", converter=whole_number, help="With --ros: ROS domain. Default: $ROS_DOMAIN_ID, or else 0."
-        ),
-    ] = None
-    max_effort: Annotated[
-        float | None,
-        Parameter(
-            metavar="SHARE",
-            help="With --ros: stop if an effort differs from the gravity effort of the model by this share of its "
-            "limit, 0.05 to 2. Default: 0.6.",
-        ),
-    ] = None
-    yes: Annotated[
-        bool, Parameter(show_default=False, help="With --ros: move the arm without a question on the terminal.")
-    ] = False
-
-
-_ROS = RosCollection()
 
 
 @app.command(group=HARDWARE)
@@ -83,24 +42,16 @@ def record(
     file: Annotated[str, Parameter(metavar="FILE")],
     /,
     *,
-    arm: Arm,
+    connected: AnyArm,
     duration: Annotated[Seconds | None, Parameter(metavar="S")] = None,
-    lcm_url: LcmUrl = "",
-    key: Key = None,
-    ros: Annotated[bool, Parameter(show_default=False)] = False,
-    topic: Annotated[str | None, Parameter(metavar="TOPIC")] = None,
-    domain: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
 ) -> None:
     """Record the measurements of an arm over LCM or ROS 2.
 
     The file contains only complete rows, even after Ctrl-C or an error.
 
     Args:
-        file: New file: .mcap for a bag for ROS 2 tools, Foxglove and Rerun, .csv for a CSV, .log for an LCM log.
+        file: New file: .mcap for a bag for ROS 2 tools, Foxglove and Rerun. With LCM also .csv, or .log for an LCM log.
         duration: Duration [s], counted from the first message. Default: until Ctrl-C.
-        ros: Record the JointState messages of a dVRK over ROS 2 instead of LCM, to an .mcap bag.
-        topic: With --ros: JointState topic or its namespace. Default: measured_js of the arm.
-        domain: With --ros: ROS domain. Default: $ROS_DOMAIN_ID, or else 0.
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.live_status import LiveLine
@@ -110,14 +61,15 @@ def record(
     from dvrk_drake.recordings.writer_stream import check_stream_output
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
-    check_ros_options(ros, {"topic": topic, "domain": domain}, {"lcm_url": lcm_url, "key": key})
-    recorded, line = load_arm(arm), LiveLine(sys.stderr)
+    connected.check()
+    recorded, line = load_arm(connected.arm), LiveLine(sys.stderr)
     recorder: Recorder | RosRecorder
-    if ros:
-        recorder = RosRecorder(recorded, file, topic, domain, line.report)
+    if connected.is_ros:
+        recorder = RosRecorder(recorded, file, connected.topic, connected.domain, line.report)
     else:
         check_stream_output(file)
-        recorder = Recorder(recorded, file, open_lcm(lcm_url).get_lcm_url(), load_key(key))
+        url, key = open_lcm(connected.lcm_url).get_lcm_url(), load_key(connected.key)
+        recorder = Recorder(recorded, file, url, key)
     stopped = stop_on_signals()
     print(f"recording {recorded.name} on {recorder.source}; Ctrl-C ends the recording", flush=True)
     try:
@@ -128,91 +80,23 @@ def record(
     print_notes(file, recorder.notes())
 
 
-@app.command(group=HARDWARE)
-def collect(
+@collect.command
+def teach(
+    poses: Annotated[str, Parameter(metavar="POSES.yaml")],
+    /,
     *,
     controlled: ControlledArm,
-    poses: Annotated[str | None, Parameter(metavar="POSES.yaml", group=_SOURCE)] = None,
-    motion: Annotated[str | None, Parameter(metavar="MOTION.yaml", group=_SOURCE)] = None,
-    output: Annotated[str | None, Parameter(metavar="FILE.csv", group=_TASK)] = None,
-    teach: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
-    random: Annotated[int | None, Parameter(metavar="N", group=_TASK, converter=whole_number)] = None,
-    rehearse: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
     at_rest: Annotated[bool, Parameter(show_default=False)] = False,
-    seed: Seed = 0,
-    both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
-    traverse_time: Seconds = _TRAVERSE_TIME,
-    ros: RosCollection = _ROS,
 ) -> None:
-    """Record static poses or a motion of an arm, with the efforts. A motion requires LCM.
+    """Add poses to a pose file while you move the arm by hand.
 
-    After an interruption, run the same command again to continue. Enter pauses a motion, or a collection with --ros.
-    Ctrl-C ends the command. In all cases, the arm holds its pose. With --ros, the messages of each run are also written
-    to a new bag beside the CSV: POSES_1.mcap, POSES_2.mcap, ...
+    The arm compensates gravity. The Enter key adds the current pose. Ctrl-C ends the command, and the arm holds its
+    pose.
 
     Args:
-        poses: Pose file. With --output, the arm moves to the poses in this file. --teach and --random add poses to it.
-        motion: Motion file written by dvrk-drake excite. The arm follows this motion.
-        output: Move the arm, and write one row per pose, or the measurements during the motion, to this CSV file.
-        teach: Compensate gravity so that you can move the arm by hand. The Enter key adds the current pose to the file.
-        random: Add N random poses to the pose file.
-        rehearse: Follow one period of the motion at a fifth of its speed. Required once before the first recording.
-        at_rest: With --teach: also add each pose at which the arm is at rest for one second.
-        both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
-        traverse_time: Time to move a joint over its full range, 1 to 60 s. This time defines the speed between poses.
+        poses: Pose file to write. The poses of an existing file are kept.
+        at_rest: Also add each pose at which the arm is at rest for one second.
     """
-    lcm_only = {name: getattr(controlled, name) for name in ("lcm_url", "key", "realtime", "reset")}
-    check_ros_options(ros.ros, vars(ros) | {"ros": None}, lcm_only | {"motion": motion})
-    if motion is not None:
-        given = {
-            "--teach": teach,
-            "--random": random is not None,
-            "--at-rest": at_rest,
-            "--no-both-sides": not both_sides,
-            "--traverse-time": traverse_time != _TRAVERSE_TIME,
-        }
-        if wrong := [name for name, is_given in given.items() if is_given]:
-            raise CollectionError(f"{', '.join(wrong)} cannot be used with --motion, only with --poses")
-        collect_motion(controlled, motion, None if rehearse else output)
-        return
-    assert poses is not None
-    if rehearse:
-        raise CollectionError("--rehearse requires --motion, but --poses was given")
-    if ros.ros and output is None:
-        raise CollectionError(
-            "--ros requires --output; --random needs no arm, and --teach needs LCM (dvrk-drake bridge)"
-        )
-    check_output(poses, overwrite=True)
-    if random is not None:
-        _add_random_poses(controlled.arm, poses, random, seed)
-    elif teach:
-        _teach(controlled, poses, at_rest)
-    else:
-        assert output is not None
-        visit = _visit_over_ros if ros.ros else _visit
-        visit(controlled, poses, output, both_sides, traverse_time, ros)
-
-
-def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
-    import numpy as np
-
-    from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.recordings.pose_file import load_poses_if_any, save_poses
-
-    if count < 1:
-        raise CollectionError(f"--random must be 1 or larger; got {count}")
-    arm = load_arm(name)
-    poses = load_poses_if_any(path, arm)
-    # Near a joint limit the guard adds a restoring effort, and there is no room to approach a pose from both sides.
-    added = arm.sample_poses(count, np.random.default_rng([seed, len(poses)]), margin=0.1)
-    save_poses(np.vstack([poses, added]), arm, path)
-    if len(poses):
-        print(f"added {count} poses; {path} has {len(poses) + count} poses of {arm.name}", flush=True)
-    else:
-        print_written(path, f"{count} poses of {arm.name}")
-
-
-def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
@@ -220,6 +104,7 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     from dvrk_drake.processes.teacher import EnterKey, Teacher
     from dvrk_drake.recordings.pose_file import load_poses_if_any
 
+    check_output(poses, overwrite=True)
     load_poses_if_any(poses, load_arm(controlled.arm))  # rejects an invalid file before the arm is connected
     with interrupt_ends_process():
         controller, link, _ = ready_controller(controlled, "gravity")
@@ -244,13 +129,70 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     print_written(poses, f"{len(teacher.poses)} poses; the guard of {controller.arm.name} regulates the pose")
 
 
+@collect.command(name="poses")
+def collect_poses(
+    poses: Annotated[str, Parameter(metavar="POSES.yaml")],
+    /,
+    *,
+    controlled: CollectedArm,
+    output: Annotated[str, Parameter(metavar="FILE.csv")],
+    both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
+    traverse_time: Seconds = 5.0,
+    max_effort: Annotated[float | None, Parameter(metavar="SHARE")] = None,
+    yes: Annotated[bool, Parameter(show_default=False)] = False,
+) -> None:
+    """Move an arm to the poses of a file, and record its efforts at rest.
+
+    After an interruption, run the same command again to continue. Ctrl-C ends the command, and the arm holds its pose.
+    With --transport ros, the dVRK moves the arm (move_jp), Enter pauses, and the messages of each run are also written
+    to a new bag beside the CSV: POSES_1.mcap, POSES_2.mcap, ...
+
+    Args:
+        poses: Pose file, written by dvrk-drake excite --static or dvrk-drake collect teach.
+        output: CSV file with one row per pose.
+        both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
+        traverse_time: Time to move a joint over its full range, 1 to 60 s. This time defines the speed between poses.
+        max_effort: ROS 2: stop if an effort differs from the gravity effort of the model by this share of its limit,
+            0.05 to 2. Default: 0.6.
+        yes: ROS 2: move the arm without a question on the terminal.
+    """
+    lcm_only = {"realtime": controlled.realtime, "reset": controlled.reset}
+    controlled.check(lcm=lcm_only, ros={"max_effort": max_effort, "yes": yes})
+    check_output(poses, overwrite=True)
+    if controlled.is_ros:
+        _visit_over_ros(controlled, poses, output, both_sides, traverse_time, max_effort, yes)
+    else:
+        _visit(controlled, poses, output, both_sides, traverse_time)
+
+
+@collect.command(name="motion")
+def collect_motion(
+    motion: Annotated[str, Parameter(metavar="MOTION.yaml")],
+    /,
+    *,
+    controlled: ControlledArm,
+    output: Annotated[str | None, Parameter(metavar="FILE.csv", group=_TASK)] = None,
+    rehearse: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
+) -> None:
+    """Move an arm along a motion and record its efforts. Requires LCM.
+
+    After an interruption, run the same command again to continue. Enter pauses the motion. Ctrl-C ends it, and the arm
+    holds its pose.
+
+    Args:
+        motion: Motion file, written by dvrk-drake excite.
+        output: CSV file for the measurements.
+        rehearse: Follow one period of the motion at a fifth of its speed. Required once before the first recording.
+    """
+    follow_motion(controlled, motion, None if rehearse else output)
+
+
 def _visit(
     controlled: ControlledArm,
     poses_file: str,
     output_file: str,
     both_sides: bool,
     traverse_time: float,
-    _: RosCollection,
 ) -> None:
     import numpy as np
 
@@ -293,12 +235,13 @@ def _visit(
 
 
 def _visit_over_ros(
-    controlled: ControlledArm,
+    controlled: CollectedArm,
     poses_file: str,
     output_file: str,
     both_sides: bool,
     traverse_time: float,
-    options: RosCollection,
+    max_effort: float | None,
+    yes: bool,
 ) -> None:
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.processes.crtk_collection import Dialog, bag_path, run_crtk_collection
@@ -309,10 +252,10 @@ def _visit_over_ros(
     from dvrk_drake.systems.ros.open_domain import domain_number
 
     quiet_drake()
-    domain_number(options.domain)  # rejects an invalid number before any other step
+    domain_number(controlled.domain)  # rejects an invalid number before any other step
     settings = CrtkCollectionSettings(traverse_time, both_sides)
-    if options.max_effort is not None:
-        settings = CrtkCollectionSettings(traverse_time, both_sides, options.max_effort)
+    if max_effort is not None:
+        settings = CrtkCollectionSettings(traverse_time, both_sides, max_effort)
     arm, poses, output = _files(controlled, poses_file, output_file, both_sides)
     remaining = len(poses) - output.finished(poses).sum()
     if not remaining:
@@ -326,7 +269,7 @@ def _visit_over_ros(
     enter = EnterKey(sys.stdin) if has_keys else lambda: False
 
     def confirm() -> None:
-        if has_keys and not options.yes:
+        if has_keys and not yes:
             print("Clear the workspace of the arm. Enter starts the motion, Ctrl-C ends the command.", flush=True)
             while not stopped() and not enter():
                 time.sleep(0.02)
@@ -336,7 +279,7 @@ def _visit_over_ros(
     collector = None
     try:
         collector = run_crtk_collection(
-            arm, poses, output, bag, settings, dialog, model=model, topic=options.topic, domain=options.domain
+            arm, poses, output, bag, settings, dialog, model=model, topic=controlled.topic, domain=controlled.domain
         )
     finally:
         line.clear()

@@ -1,11 +1,12 @@
-"""Option --motion of the command collect: moves an arm along a designed motion and records it."""
+"""Command collect motion: moves an arm along a designed motion and records it."""
 
 from __future__ import annotations
 
 import sys
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.lcm import ControlledArm, checked_start, ready_controller
+from dvrk_drake.cli.app import ControlledArm
+from dvrk_drake.cli.lcm import checked_start, ready_controller
 from dvrk_drake.cli.support import check_output, interrupt_ends_process, print_written, quiet_drake
 from dvrk_drake.errors import CollectionError
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 
-def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> None:
+def follow_motion(controlled: ControlledArm, path: str, output: str | None) -> None:
     """Moves the arm along the motion in a file, and records it, or rehearses it.
 
     Args:
@@ -56,8 +57,8 @@ def collect_motion(controlled: ControlledArm, path: str, output: str | None) -> 
             return
         if not motion_parts.is_rehearsed(path, arm, motion):
             raise CollectionError(
-                f"{path}: the motion was not rehearsed on {arm.name}. First run: dvrk-drake collect --arm "
-                f"{controlled.arm} --motion {path} --rehearse"
+                f"{path}: the motion was not rehearsed on {arm.name}. First run: dvrk-drake collect motion {path} "
+                f"--arm {controlled.arm} --rehearse"
             )
         begin, end = rest, motion.duration
         part_path = motion_parts.next_part(output, parts)

@@ -146,7 +146,7 @@ def excite(
         console,
         f"{moved.name}: motion of {motion.duration:g} s. Expected error of predicted efforts: "
         f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with the best random motion).",
-        f"dvrk-drake collect --arm {arm} --motion {output} --rehearse",
+        f"dvrk-drake collect motion {output} --arm {arm} --rehearse",
     )
     console.print(
         f"Base parameters known to 10 %: {design.known_parameters} of {design.num_parameters}. Condition number: "
@@ -185,7 +185,7 @@ def _select_poses(
         console,
         f"{arm.name}: {count} static poses. Expected error of predicted holding efforts: "
         f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with {count} random poses).",
-        f"dvrk-drake collect --arm {name} --poses {output} --output {Path(output).with_suffix('.csv')}",
+        f"dvrk-drake collect poses {output} --arm {name} --output {Path(output).with_suffix('.csv')}",
     )
     console.print(f"Gravity parameters known to 10 %: {design.known_parameters} of {design.num_parameters}.")
     print_written(output)

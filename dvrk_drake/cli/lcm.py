@@ -1,16 +1,22 @@
-"""Commands for an arm over LCM: key, run, status and stop."""
+"""Commands for an arm over LCM: keygen, control, status and stop."""
 
 from __future__ import annotations
 
 import sys
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Model, Realtime, app
-from dvrk_drake.cli.support import interrupt_ends_process, load_key, print_warning, print_written, quiet_drake
+from dvrk_drake.cli.app import HARDWARE, ControlledArm, LcmArm, app
+from dvrk_drake.cli.support import (
+    interrupt_ends_process,
+    load_key,
+    print_warning,
+    print_written,
+    quiet_drake,
+    request_realtime,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -25,27 +31,6 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class ControlledArm:
-    """Options shared by the commands that control an arm over LCM."""
-
-    arm: Arm
-    model: Annotated[
-        Model | None, Parameter(help="Model file, written by identify. Default: the nominal model from the SDF.")
-    ] = None
-    lcm_url: LcmUrl = ""
-    key: Key = None
-    realtime: Realtime = False
-    reset: Annotated[
-        bool,
-        Parameter(
-            show_default=False,
-            help="Print and clear a fault of the arm. If the watchdog of the guard holds the arm, resume control.",
-        ),
-    ] = False
 
 
 @app.command(group=HARDWARE)
@@ -117,7 +102,7 @@ def control(
 
 
 @app.command(group=HARDWARE)
-def status(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, watch: bool = False) -> None:
+def status(*, connected: LcmArm, watch: bool = False) -> None:
     """Print the state of an arm over LCM, its reason, and what to do next.
 
     Args:
@@ -128,8 +113,8 @@ def status(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, watch: bool = Fal
     from dvrk_drake.reports.arm_status import print_status
     from dvrk_drake.reports.terminal_tables import make_console
 
-    loaded, console = load_arm(arm), make_console()
-    with suppress(KeyboardInterrupt), _operator_link(arm, lcm_url, key) as link:
+    loaded, console = load_arm(connected.arm), make_console()
+    with suppress(KeyboardInterrupt), _operator_link(connected) as link:
         while True:
             observation = observe(link)
             if watch:
@@ -140,7 +125,7 @@ def status(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, watch: bool = Fal
 
 
 @app.command(group=HARDWARE)
-def stop(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, power_off: bool = False) -> None:
+def stop(*, connected: LcmArm, power_off: bool = False) -> None:
     """Stop an arm over LCM: its guard holds the pose until an operator resumes.
 
     The guard obeys every sender with the key, also while a controller acts. This does not replace the emergency stop
@@ -152,19 +137,20 @@ def stop(*, arm: Arm, lcm_url: LcmUrl = "", key: Key = None, power_off: bool = F
     from dvrk_drake.models.lcm_messages import describe_state
     from dvrk_drake.processes.arm_operator import stop_arm
 
-    with _operator_link(arm, lcm_url, key) as link:
+    with _operator_link(connected) as link:
         after = stop_arm(link, power_off=power_off)
         print(f"{after.arm_name} is stopped: {describe_state(after.guard_state, after.fault_text)}", flush=True)
 
 
 @contextmanager
-def _operator_link(name: str, lcm_url: str, key: str | None) -> Iterator[LcmArmLink]:
+def _operator_link(connected: LcmArm) -> Iterator[LcmArmLink]:
     """Opens the channels of an arm for an operator, whatever its state is."""
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
-    with closing(LcmArmLink(load_arm(name), open_lcm(lcm_url).get_lcm_url(), key=load_key(key))) as link:
+    url = open_lcm(connected.lcm_url).get_lcm_url()
+    with closing(LcmArmLink(load_arm(connected.arm), url, key=load_key(connected.key))) as link:
         yield link
 
 
@@ -262,7 +248,7 @@ def ready_controller(
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.processes.arm_operator import reset_fault
     from dvrk_drake.processes.control import first_status
-    from dvrk_drake.processes.pace import make_realtime, settle_memory
+    from dvrk_drake.processes.pace import settle_memory
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
@@ -279,9 +265,7 @@ def ready_controller(
         status, period = first_status(link)
     controller = ArmController(arm, model, mode, period, friction, gains)
     settle_memory()
-    if controlled.realtime:
-        for warning in make_realtime():
-            print_warning(warning)
+    request_realtime(controlled.realtime)
     return controller, lambda: LcmArmLink(arm, url, key=key, before=status), period
 
 

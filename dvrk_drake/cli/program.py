@@ -6,6 +6,7 @@ Commands import modules when they run, because Drake and numba take seconds to i
 from __future__ import annotations
 
 import gc
+import inspect
 import os
 import re
 import signal
@@ -54,6 +55,21 @@ REQUIRED = {
 }
 
 
+def reflow_help() -> None:
+    """Joins the lines of each paragraph and each option in the docstrings, so that help text fits to the terminal."""
+    apps = [app]
+    for each in apps:
+        apps += [each[name] for name in each if not name.startswith("-")]
+        if (function := each.default_command) and function.__doc__:
+            text = inspect.cleandoc(function.__doc__)
+            head, args, options = text.partition("\nArgs:\n")
+            head = re.sub(r"(?<=\S)\n(?=\S)", " ", head)
+            function.__doc__ = head + args + re.sub(r"\n {8,}", " ", options)
+
+
+reflow_help()
+
+
 def run(arguments: Sequence[str] | None) -> int:
     """Runs one command and returns the exit code. See `dvrk_drake.cli.main` for `arguments`."""
     words = sys.argv[1:] if arguments is None else list(arguments)
@@ -98,7 +114,7 @@ def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
     """Returns a usage error in one line."""
-    name = error.command_chain[0] if error.command_chain else ""
+    name = " ".join(error.command_chain or [])
     options = {word.partition("=")[0] for word in words if word.startswith("--")}
     message = " ".join(str(error).split()).rstrip(".")
     if isinstance(error, UnknownCommandError):

@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, app
-from dvrk_drake.cli.support import interrupt_ends_process, mounted, print_warning, quiet_drake, warn_of_driver
+from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, quiet_drake, request_realtime
 from dvrk_drake.errors import ControllerError
 
 
@@ -41,34 +41,31 @@ def bridge(
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.bridge import run_bridge
-    from dvrk_drake.processes.pace import make_realtime, settle_memory
-    from dvrk_drake.processes.simulated_arm import load_driver, stop_on_signals
+    from dvrk_drake.processes.pace import settle_memory
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey
-    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
     from dvrk_drake.systems.ros.open_domain import domain_number
 
     def ready() -> None:
         settle_memory()
-        if realtime:
-            for warning in make_realtime():
-                print_warning(warning)
+        request_realtime(realtime)
 
     quiet_drake()
     domain_number(domain)  # rejects an invalid number before any other step
-    configuration = DvrkDriver() if driver is None else load_driver(driver)
-    configuration.key_file = key or configuration.key_file
-    configuration.model = model or configuration.model
-    warn_of_driver(configuration)
     with interrupt_ends_process():
         connected = mounted(load_arm(arm), gravity)
-        url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
+        configuration = driver_configuration(driver, key, lcm_url)
+        configuration.model = model or configuration.model
         stopped = stop_on_signals()
-    print(f"connecting {connected.name} to LCM {url}; Ctrl-C ends the bridge, and the arm holds its pose", flush=True)
+    print(
+        f"connecting {connected.name} to LCM {configuration.lcm_url}; Ctrl-C ends the bridge, and the arm holds its "
+        "pose",
+        flush=True,
+    )
     is_confirmed = run_bridge(
         connected,
         configuration,
-        url,
+        configuration.lcm_url,
         topic=topic,
         domain=domain,
         polls=poll,

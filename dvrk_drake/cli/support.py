@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,29 +81,6 @@ def interrupt_ends_process() -> Iterator[None]:
 def quiet_drake() -> None:
     """Disables Drake's log messages. Importing Drake sets the log level, so call this function after the import."""
     logging.getLogger("drake").setLevel(logging.WARNING)
-
-
-def check_ros_options(ros: bool, ros_only: Mapping[str, object], lcm_only: Mapping[str, object]) -> None:
-    """Rejects options that do not apply with or without --ros. The message contains only options that were given.
-
-    Args:
-        ros: Whether --ros was given.
-        ros_only: Values of the options that require --ros, by name. None, "" or False: the option was not given.
-        lcm_only: Values of the options that cannot be used with --ros, by name.
-
-    Raises:
-        DvrkDrakeError: An option does not apply.
-    """
-    values = lcm_only if ros else ros_only
-    given = [
-        f"--{name.replace('_', '-')}"
-        for name, value in values.items()
-        if not (value is None or value is False or value == "")
-    ]
-    if given:
-        names = " and ".join(filter(None, [", ".join(given[:-1]), given[-1]]))
-        verb = "cannot be used with" if ros else "requires" if len(given) == 1 else "require"
-        raise DvrkDrakeError(f"{names} {verb} --ros")
 
 
 def load_key(path: str | None) -> MessageKey | None:
@@ -247,12 +224,37 @@ def print_warning(text: str) -> None:
     print(f"dvrk-drake: warning: {text}", file=sys.stderr, flush=True)
 
 
-def warn_of_driver(driver: DvrkDriver) -> None:
-    """Prints a line each on weaker guard settings than the defaults, and on an arm that compensates gravity itself."""
+def driver_configuration(path: str | None, key: str | None, lcm_url: str) -> DvrkDriver:
+    """Returns the configuration of a driver with the options of the command, and warns about a weaker guard.
+
+    Args:
+        path: File given with --driver. None: the default configuration.
+        key: File given with --key, which replaces that of the configuration.
+        lcm_url: URL given with --lcm-url, which replaces that of the configuration. "": LCM's default.
+
+    Raises:
+        DvrkDrakeError: The configuration is not valid, or the LCM network cannot be used.
+    """
+    from dvrk_drake.processes.simulated_arm import load_driver
+    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.lcm.lcm_network import open_lcm
+
+    driver = DvrkDriver() if path is None else load_driver(path)
+    driver.key_file = key or driver.key_file
     if weaker := driver.guard.weaker_than_default():
         print_warning(f"the guard protects the arm less than with its default settings: {weaker}")
     if driver.gravity_compensation:
         print_warning("the arm adds its own gravity compensation to commanded efforts (gravity_compensation: true)")
+    driver.lcm_url = open_lcm(lcm_url or driver.lcm_url).get_lcm_url()
+    return driver
+
+
+def request_realtime(requested: bool) -> None:
+    """Requests real-time scheduling because of --realtime, and prints what the system does not permit."""
+    from dvrk_drake.processes.pace import make_realtime
+
+    for warning in make_realtime() if requested else ():
+        print_warning(warning)
 
 
 def write_json(path: str, content: object) -> None:

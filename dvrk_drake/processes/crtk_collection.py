@@ -1,4 +1,4 @@
-"""Process that collects static poses of a dVRK arm on ROS 2, started by `dvrk-drake collect --ros`."""
+"""Process that collects static poses of a dVRK arm on ROS 2, started by `dvrk-drake collect poses --transport ros`."""
 
 from __future__ import annotations
 

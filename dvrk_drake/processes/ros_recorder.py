@@ -1,4 +1,4 @@
-"""Records the joint states of one arm from ROS 2 to a bag, for `dvrk-drake record --ros`."""
+"""Records the joint states of one arm from ROS 2 to a bag, for `dvrk-drake record --transport ros`."""
 
 from __future__ import annotations
 

@@ -141,6 +141,11 @@ class SimulatedArm:
         self._simulator.Initialize()
 
     @property
+    def source(self) -> str:
+        """LCM network, for messages."""
+        return f"LCM {self._url}"
+
+    @property
     def guard(self) -> CommandGuard:
         """Current guard, read-only."""
         return self._driver.GetGuard(self._driver.GetMyContextFromRoot(self._simulator.get_context()))

@@ -1,4 +1,4 @@
-"""Process that simulates one dVRK arm with CRTK topics over ROS 2, started by `dvrk-drake sim-arm --ros`."""
+"""Process that simulates one dVRK arm with CRTK topics over ROS 2, started by `dvrk-drake sim-arm --transport ros`."""
 
 from __future__ import annotations
 
@@ -76,12 +76,18 @@ class SimulatedRosArm:
         self._ticks += 1
         self._simulator.AdvanceTo(self._ticks * PERIOD)
 
-    def run(self, stopped: Callable[[], bool], report: Callable[[str], None] = lambda line: None) -> Pace:
+    def run(
+        self,
+        stopped: Callable[[], bool],
+        report: Callable[[str], None] = lambda line: None,
+        enter: Callable[[], bool] = lambda: False,
+    ) -> Pace:
         """Steps the simulation by the wall clock until `stopped` returns true.
 
         Args:
             stopped: Function that returns whether to stop. It is called once per tick.
             report: Function that is called with a line of text on each change of state or mode and on refused commands.
+            enter: Not used, because a dVRK has no guard. `SimulatedArm.run` has this argument.
 
         Returns:
             Pace with the number of late ticks.

@@ -1,4 +1,4 @@
-"""Files of `collect --motion`: the parts of a recorded motion (CSV), and the rehearsal of a motion (YAML)."""
+"""Files of `collect motion`: the parts of a recorded motion (CSV), and the rehearsal of a motion (YAML)."""
 
 from __future__ import annotations
 

@@ -47,9 +47,7 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
             `check_poses` refuses.
     """
     if not os.path.lexists(path):
-        raise CollectionError(
-            f"{path}: the pose file does not exist. Create it with excite --static, collect --random or --teach."
-        )
+        raise CollectionError(f"{path}: the pose file does not exist. Create it with excite --static or collect teach.")
     content = load_typed_yaml(PoseFile, path, CollectionError, "a pose file")
     if content.arm.lower() != arm.name.lower():
         raise CollectionError(f'{path}: arm is "{content.arm}", but the selected arm is {arm.name}')

@@ -53,13 +53,13 @@ def substitute(words, folder):
             replace(motion, center=(np.array(motion.center) + 0.01 * int(option(words, "--seed"))).tolist()).save(
                 folder / option(words, "--output")
             )
-        case "collect" if "--poses" in words:
+        case "collect" if "poses" in words:
             output = CollectionFile(folder / option(words, "--output"), ARM, both_sides=True)
-            for pose in load_poses(folder / option(words, "--poses"), ARM):
+            for pose in load_poses(folder / words[2], ARM):
                 output.append(pose, pose, 0 * pose, 0 * pose)
             output.close()
         case "collect":
-            path = folder / option(words, "--motion")
+            path = folder / words[2]
             motion = PeriodicMotion.load(path, ARM)
             if "--rehearse" in words:
                 Rehearsal(arm=ARM.name, motion=motion.digest(), speed=0.2, tracking_error=[0.0] * 7).save(path)

@@ -46,7 +46,7 @@ def simulated(monkeypatch):
 def test_collect_stops_and_continues(simulated, tmp_path, capsys):
     poses, output = tmp_path / "p.yaml", tmp_path / "o.csv"
     save_poses(near_poses(2), load_arm("mtml"), poses)
-    command = ["collect", "--arm", "mtml", "--poses", str(poses), "--output", str(output)]
+    command = ["collect", "poses", str(poses), "--arm", "mtml", "--output", str(output)]
     command += ["--traverse-time", "1", "--no-both-sides"]
     simulated.stopped = lambda sticky: sticky.ticks > 1000
     assert main(command) == 130
@@ -75,6 +75,6 @@ def test_collect_teaches_poses(simulated, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdin", os.fdopen(reading))
     os.close(writing)
     simulated.stopped = lambda sticky: sticky.ticks > 3000
-    assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--teach", "--at-rest"]) == 0
+    assert main(["collect", "teach", str(poses), "--arm", "mtml", "--at-rest"]) == 0
     np.testing.assert_allclose(load_poses(poses, arm), near_poses(1), atol=0.01)
     assert "pose 1 recorded\n" in capsys.readouterr().out

@@ -72,7 +72,7 @@ def test_poses_keep_their_distance_from_another_arm(arm, tmp_path):
     path = tmp_path / "poses.yaml"
     design.save(path)
     assert pose_environment(path) == environment
-    save_poses(load_poses(path, arm)[:4], arm, path)  # as collect --random, which adds poses
+    save_poses(load_poses(path, arm)[:4], arm, path)  # as collect teach, which adds poses
     assert pose_environment(path) == environment
 
 

@@ -1,4 +1,4 @@
-"""`dvrk-drake sim-arm --ros` beside a publisher of random and malformed messages over DDS.
+"""`dvrk-drake sim-arm --transport ros` beside a publisher of random and malformed messages over DDS.
 
 While the arm is not ready, no message changes its state, its set-point or its efforts. While it is ready, this holds
 for messages that are not valid.

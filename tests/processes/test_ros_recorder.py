@@ -1,4 +1,4 @@
-"""`dvrk-drake record --ros`: real processes over DDS on the loopback interface, and messages of a substitute domain."""
+"""`record --transport ros`: real processes over DDS on the loopback interface, and messages of a substitute domain."""
 
 import os
 import subprocess
@@ -50,7 +50,7 @@ def publisher(request, monkeypatch):
 
 def test_recording_has_the_published_numbers(publisher, tmp_path):
     path = tmp_path / "reach.mcap"
-    done = dvrk_drake("record", path, "--arm", "psm", "--ros", "--duration", "1", "--domain", publisher)
+    done = dvrk_drake("record", path, "--arm", "psm", "--transport", "ros", "--duration", "1", "--domain", publisher)
     assert done.wait() == 0, done.output()
     assert f"recording PSM on ROS domain {publisher}" in done.output()
     assert "messages with header stamp 0, which marks invalid data: " in done.output()

@@ -1,4 +1,4 @@
-"""`dvrk-drake sim-arm --ros`: a real process over DDS in a network namespace, and refused options."""
+"""`dvrk-drake sim-arm --transport ros`: a real process over DDS in a network namespace, and refused options."""
 
 import signal
 import sys
@@ -54,7 +54,7 @@ class Client:
 
     def __init__(self, arm, namespace, *options):
         self.arm = load_arm(arm)
-        self.process = dvrk_drake("sim-arm", "--arm", arm, "--ros", *options)
+        self.process = dvrk_drake("sim-arm", "--arm", arm, "--transport", "ros", *options)
         self.domain, self.namespace = ros.RosDomain(0), namespace
         jaw = self.arm.separate_joint
         self.num_main = self.arm.num_joints - bool(jaw)
@@ -209,7 +209,7 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
     client.send("servo_jp", 0.0, 0.0, 0.05, 0.0, 0.0, 0.0)
     client.until(lambda: abs(client.position()[2] - 0.05) < 2e-3, "insertion")
     # A second arm with the same topics is refused, and a client of the first arm would notice its measurements.
-    other = dvrk_drake("sim-arm", "--arm", "psm", "--ros", "--topic", "dvrk/PSM2")
+    other = dvrk_drake("sim-arm", "--arm", "psm", "--transport", "ros", "--topic", "dvrk/PSM2")
     assert other.wait() == 2
     assert "another arm publishes /dvrk/PSM2/measured_js in ROS domain 0. End it, or " in other.output()
     second = client.domain.advertise("/dvrk/PSM2/measured_js", JointState)
@@ -228,12 +228,12 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--ros", "--meshcat"], "error: --meshcat cannot be used with --ros"),
-        (["--rate", "500"], "error: --rate requires --ros"),
-        (["--ros", "--rate", "5000"], "rate is 5000; allowed: 10..1000 Hz"),
-        (["--ros", "--domain", "300"], "ROS domain 300: allowed: 0 to 232 (--domain, or ROS_DOMAIN_ID)"),
-        (["--ros", "--model", "missing.yaml"], "missing.yaml"),
-        (["--ros", "--effects", "magic"], "magic"),
+        (["--transport", "ros", "--meshcat"], "error: --meshcat: only with --transport lcm"),
+        (["--rate", "500"], "error: --rate: only with --transport ros"),
+        (["--transport", "ros", "--rate", "5000"], "rate is 5000; allowed: 10..1000 Hz"),
+        (["--transport", "ros", "--domain", "300"], "ROS domain 300: allowed: 0 to 232 (--domain, or ROS_DOMAIN_ID)"),
+        (["--transport", "ros", "--model", "missing.yaml"], "missing.yaml"),
+        (["--transport", "ros", "--effects", "magic"], "magic"),
     ],
 )
 def test_wrong_options_are_refused(options, message, capsys):
@@ -243,5 +243,5 @@ def test_wrong_options_are_refused(options, message, capsys):
 
 def test_package_is_required(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
-    assert main(["sim-arm", "--arm", "mtml", "--ros"]) == 2
+    assert main(["sim-arm", "--arm", "mtml", "--transport", "ros"]) == 2
     assert "ROS 2 needs the package cyclonedds: pip install cyclonedds" in refusal(capsys.readouterr().err)

@@ -58,16 +58,17 @@ def test_incomplete_last_row_is_measured_again(cut, tmp_path):
     assert rows == [line.rsplit(",", 8)[0] for line in whole.decode().splitlines()]
 
 
-@pytest.mark.parametrize("ros", [[], ["--ros"]])
+@pytest.mark.parametrize("transport", ["lcm", "ros"])
 @pytest.mark.parametrize("name", ["o.mcap", "o.yaml", "o"])
-def test_output_must_be_a_csv(name, ros, tmp_path, capsys):
+def test_output_must_be_a_csv(name, transport, tmp_path, capsys):
     arm, poses, output = load_arm("mtml"), tmp_path / "p.yaml", tmp_path / name
     save_poses(random_poses(arm, 2), arm, poses)
     for content in (None, b"\x89MCAP0\r\n"):
         if content is not None:
             output.write_bytes(content)
         # The command ends before it searches for the arm.
-        assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--output", str(output), *ros]) == 2
+        command = ["collect", "poses", str(poses), "--arm", "mtml", "--output", str(output), "--transport", transport]
+        assert main(command) == 2
         captured = capsys.readouterr()
         expected = f"dvrk-drake: error: {output}: a collection is a table; the file name must end in .csv\n"
         assert (captured.out, captured.err) == ("", expected)

@@ -50,9 +50,9 @@ def test_invalid_pose_files_are_refused_in_one_line(text, message, tmp_path, cap
     path.write_text(text)
     with pytest.raises(CollectionError, match=message):
         load_poses(path, load_arm("mtml"))
-    # With every option, the command refuses the file before it connects to an arm.
-    for task in (["--output", str(output)], ["--teach"], ["--random", "2"]):
-        assert main(["collect", "--arm", "mtml", "--poses", str(path), *task]) == 2
+    # The commands refuse the file before they connect to an arm.
+    for task in (["poses", str(path), "--output", str(output)], ["teach", str(path)]):
+        assert main(["collect", *task, "--arm", "mtml"]) == 2
         error = capsys.readouterr().err
         assert error.startswith("dvrk-drake: error: ") and error.count("\n") == 1
         assert str(path) in error
@@ -64,21 +64,3 @@ def test_poses_in_millimetres_are_refused(tmp_path):
     (tmp_path / "p.yaml").write_text("arm: PSM\nposes:\n- [0.1, 0.1, 120.0, 0, 0, 0, 0.2]")
     with pytest.raises(CollectionError, match=r"pose 1: .*millimetres"):
         load_poses(tmp_path / "p.yaml", load_arm("psm"))
-
-
-def test_random_poses_are_appended_and_depend_on_the_seed(tmp_path, capsys):
-    path, arm = tmp_path / "p.yaml", load_arm("psm")
-    command = ["collect", "--arm", "psm", "--poses", str(path), "--random"]
-    assert main([*command, "5", "--seed", "3"]) == 0
-    assert capsys.readouterr().out == f"wrote {path}: 5 poses of PSM\n"
-    first = load_poses(path, arm)
-    assert main([*command, "4", "--seed", "4"]) == 0
-    assert capsys.readouterr().out == f"added 4 poses; {path} has 9 poses of PSM\n"
-    both = load_poses(path, arm)
-    np.testing.assert_array_equal(both[:5], first)
-    np.testing.assert_array_equal(both[5:], random_poses(arm, 4, seed=[4, 5]))  # another seed than for an empty file
-    assert main([*command, "0"]) == 2
-    np.testing.assert_array_equal(load_poses(path, arm), both)
-    assert main([*command, "4", "--seed", "4"]) == 0
-    assert len(load_poses(path, arm)) == 13
-    assert [p.name for p in tmp_path.iterdir()] == ["p.yaml"]

@@ -40,7 +40,7 @@ def start_simulated_arm(arm, name, rate=RATE):
     """
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    process = dvrk_drake("sim-arm", "--arm", arm, "--ros", "--rate", rate)
+    process = dvrk_drake("sim-arm", "--arm", arm, "--transport", "ros", "--rate", rate)
     subject = Console(name, process, process.pid, Path(os.devnull), RosDomain(0))
     try:
         wait_until(subject.state, "operating state", process)

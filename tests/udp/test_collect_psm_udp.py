@@ -7,10 +7,9 @@ import pytest
 from arm_observer import Observer, is_holding
 from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
 
-from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import load_poses
+from dvrk_drake.recordings.pose_file import load_poses, save_poses
 from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
@@ -20,12 +19,12 @@ POSES = 3
 
 def test_psm_collection_from_both_sides_completes(tmp_path):
     arm, poses, output = load_arm("psm"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
-    assert main(["collect", "--arm", "psm", "--poses", str(poses), "--random", str(POSES), "--seed", "3"]) == 0
+    save_poses(arm.sample_poses(POSES, np.random.default_rng(3), margin=0.1), arm, poses)
     observer = Observer("psm")
     process = dvrk_drake("sim-arm", "--arm", "psm", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
     try:
         observer.until(lambda status: True, "first status", process=process)
-        command = ["collect", "--arm", "psm", "--poses", poses, "--output", output]
+        command = ["collect", "poses", poses, "--arm", "psm", "--output", output]
         command += ["--realtime", "--traverse-time", "2"]
         collecting = dvrk_drake(*command)
         assert collecting.wait() == 0, collecting.output()

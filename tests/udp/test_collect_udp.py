@@ -14,7 +14,7 @@ from waiting import wait_until
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import load_poses
+from dvrk_drake.recordings.pose_file import load_poses, save_poses
 from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
@@ -42,8 +42,8 @@ def moving(status):
 
 def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     arm, poses, output = load_arm("mtml"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
-    assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--random", str(POSES), "--seed", "5"]) == 0
-    command = ["collect", "--arm", "mtml", "--poses", poses, "--output", output, "--realtime", "--traverse-time", "1"]
+    save_poses(arm.sample_poses(POSES, np.random.default_rng(5), margin=0.1), arm, poses)
+    command = ["collect", "poses", poses, "--arm", "mtml", "--output", output, "--realtime", "--traverse-time", "1"]
     command.append("--no-both-sides")  # quicker, and a simulated arm has no dry friction
 
     def rows():

@@ -1,4 +1,4 @@
-"""`dvrk-drake collect --ros` over DDS, with the simulated arm and with the dVRK console, in a network namespace."""
+"""`collect poses --transport ros` over DDS, with the simulated arm and with the dVRK console."""
 
 import contextlib
 import os
@@ -31,6 +31,7 @@ pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
 MTML = load_arm("mtml")
 #: Domains of ended tests. Cyclone DDS may crash if a subscription is deleted while its listener is called.
 KEPT = []
+COLLECT = ["collect", "poses", "--arm", "mtml", "--transport", "ros"]
 #: `dvrk-drake` in a process of its own, because its publishers exist until the process ends. On a busy computer, the
 #: simulated arm may be slow, or silent for a while.
 COMMAND = [
@@ -63,7 +64,7 @@ def loopback(monkeypatch):
 @contextlib.contextmanager
 def simulated_arm(*options):
     """Context in which a simulated MTML runs, enabled and homed."""
-    process = dvrk_drake("sim-arm", "--arm", "mtml", "--ros", "--rate", "100", "--enabled", *options)
+    process = dvrk_drake("sim-arm", "--arm", "mtml", "--transport", "ros", "--rate", "100", "--enabled", *options)
     try:
         domain = ros.RosDomain(0)
         state = domain.subscribe("/MTML/operating_state", OperatingState, depth=100, latched=True)
@@ -84,18 +85,18 @@ def simulated_arm(*options):
 def files(folder, poses=POSES[:2]):
     """Writes a pose file and returns the options with its path and the path of the output."""
     save_poses(poses, MTML, folder / "p.yaml")
-    return ["--poses", str(folder / "p.yaml"), "--output", str(folder / "p.csv")]
+    return [str(folder / "p.yaml"), "--output", str(folder / "p.csv")]
 
 
 def refused(capfd, *options):
     """Returns the error line of a command that ends with the exit code 2."""
     capfd.readouterr()
-    assert main(["collect", "--arm", "mtml", *options]) == 2
+    assert main(["collect", "poses", "--arm", "mtml", *options]) == 2
     return refusal(capfd.readouterr().err)
 
 
 def start_collection(folder, *options, poses=POSES):
-    return start(*COMMAND, "collect", "--ros", "--arm", "mtml", *files(folder, poses), "--traverse-time", "2", *options)
+    return start(*COMMAND, *COLLECT, *files(folder, poses), "--traverse-time", "2", *options)
 
 
 def collect(folder, *options, poses=POSES, code=0):
@@ -147,8 +148,9 @@ def test_interrupted_collection_continues_in_a_second_bag(tmp_path):
 
 @pytest.mark.parametrize("command", ["bridge", "collect", "record"])
 def test_interruption_ends_the_search_for_the_arm(command, tmp_path):
-    options = {"bridge": [], "collect": ["--ros", *files(tmp_path)], "record": [str(tmp_path / "a.mcap"), "--ros"]}
-    process = start(*COMMAND, command, *options[command], "--arm", "mtml", "--domain", "8")
+    record = ["record", str(tmp_path / "a.mcap"), "--arm", "mtml", "--transport", "ros"]
+    words = {"bridge": ["bridge", "--arm", "mtml"], "collect": [*COLLECT, *files(tmp_path)], "record": record}
+    process = start(*COMMAND, *words[command], "--domain", "8")
     lines = []
     while not lines or lines[-1] != "searching for /MTML/measured_js in ROS domain 8\n":
         lines.append(within_time_limit(process.stdout.readline, "a line"))
@@ -165,7 +167,7 @@ def test_closed_terminal_holds_the_arm(tmp_path, action):
         goals, hold = domain.subscribe("/MTML/move_jp", JointState), domain.subscribe("/MTML/hold", Empty, depth=10)
         KEPT.extend((goals, hold))
         terminal, child = pty.openpty()
-        command = [*COMMAND, "collect", "--ros", "--yes", "--arm", "mtml", *files(tmp_path), "--traverse-time", "5"]
+        command = [*COMMAND, *COLLECT, *files(tmp_path), "--yes", "--traverse-time", "5"]
         shell = (
             "import os, signal, sys\n"
             f"os.login_tty({child})\n"
@@ -209,14 +211,10 @@ def test_dvrk_console_moves_to_the_poses(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--yes"], "error: --yes requires --ros"),
-        (["--ros", "--reset"], "error: --reset cannot be used with --ros"),
-        (["--ros", "--max-effort", "3"], "max_effort is 3; allowed: 0.05..2"),
+        (["--yes"], "error: --yes: only with --transport ros"),
+        (["--transport", "ros", "--reset"], "error: --reset: only with --transport lcm"),
+        (["--transport", "ros", "--max-effort", "3"], "max_effort is 3; allowed: 0.05..2"),
     ],
 )
 def test_options_are_checked(tmp_path, capfd, options, message):
     assert message in refused(capfd, *files(tmp_path), *options)
-
-
-def test_ros_needs_an_output(tmp_path, capfd):
-    assert "--ros requires --output" in refused(capfd, *files(tmp_path)[:2], "--ros", "--teach")

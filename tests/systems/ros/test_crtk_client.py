@@ -62,7 +62,7 @@ def test_ctrl_c_ends_the_connection(stop, others):
 
 @pytest.mark.parametrize("stop", [0.0, 1.5])
 def test_ctrl_c_ends_the_wait_for_an_arm_that_is_not_ready(stop, monkeypatch):
-    """`collect --ros` waits 2 s for an arm that is enabled and homed."""
+    """`collect poses --transport ros` waits 2 s for an arm that is enabled and homed."""
     domain = SubstituteDomain()
     client = SimpleNamespace(namespace="/MTML", not_ready_reason="operating_state is DISABLED", receive=lambda: None)
     monkeypatch.setattr("dvrk_drake.systems.ros.crtk_client.connect_client", lambda *arguments, **options: client)

@@ -124,9 +124,9 @@ def test_names_are_checked_before_the_search():
     [
         ["bridge"],
         ["deadman"],
-        ["sim-arm", "--ros"],
-        ["record", "a.mcap", "--ros"],
-        ["collect", "--ros", "--poses", "p.yaml", "--output", "p.csv"],
+        ["sim-arm", "--transport", "ros"],
+        ["record", "a.mcap", "--transport", "ros"],
+        ["collect", "poses", "p.yaml", "--transport", "ros", "--output", "p.csv"],
     ],
 )
 def test_domain_number_is_checked_first(command, capsys, tmp_path, monkeypatch):
