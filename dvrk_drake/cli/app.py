@@ -202,7 +202,7 @@ class AnyArm(LcmArm):
 
     @property
     def is_ros(self) -> bool:
-        """Whether the arm is on ROS 2."""
+        """True if the arm is on ROS 2."""
         return self.transport == "ros"
 
     def check(self, *, lcm: Mapping[str, object] | None = None, ros: Mapping[str, object] | None = None) -> None:
