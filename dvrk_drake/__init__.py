@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.locked_joints import lock_joints
     from dvrk_drake.models.plant import add_arm, set_arm_positions
+    from dvrk_drake.processes.calibration import calibrate
     from dvrk_drake.recordings.periodic_motion import PeriodicMotion
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording
@@ -62,6 +63,7 @@ _MODULES = {
     "add_arm": "models.plant",
     "add_arm_drive": "systems.arm_drive",
     "add_closed_loop": "systems.closed_loop",
+    "calibrate": "processes.calibration",
     "check": "analysis.check.recording_check",
     "design_excitation": "analysis.excitation.design",
     "design_poses": "analysis.excitation.static_poses",
@@ -101,6 +103,7 @@ __all__ = [
     "add_arm",
     "add_arm_drive",
     "add_closed_loop",
+    "calibrate",
     "check",
     "design_excitation",
     "design_poses",

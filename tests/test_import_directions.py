@@ -14,7 +14,7 @@ ALLOWED = {
     "export": {"models", "recordings", "dynamics"},
     "systems": {"models", "recordings", "dynamics"},
     "analysis": {"models", "recordings", "dynamics"},
-    "processes": {"models", "recordings", "dynamics", "systems"},
+    "processes": {"models", "recordings", "dynamics", "export", "systems", "analysis"},
     "experiments": {"models", "recordings", "dynamics", "export", "systems", "analysis"},
 }
 ALLOWED["reports"] = ALLOWED.keys() - {"reports"}

@@ -13,10 +13,11 @@ from command_output import refusal
 from models_in_directives import OTHER_ARM
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli import calibrate, main
-from dvrk_drake.cli.calibration_steps import CalibrationSettings, calibration_steps
+from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import ValidationSummary
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.processes import calibration
+from dvrk_drake.processes.calibration import CalibrationSettings, calibration_steps
 from dvrk_drake.recordings.motion_parts import MotionPartFile, Rehearsal
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, save_poses
@@ -99,7 +100,7 @@ def ran(monkeypatch):
         commands.append(words)
         return 130 if len(commands) - 1 == commands.interrupt_at else substitute(words, folder)
 
-    monkeypatch.setattr(calibrate, "_run", run)
+    monkeypatch.setattr(calibration, "_run", run)
     return commands
 
 
@@ -196,7 +197,7 @@ def test_without_terminal_an_arm_moves_only_with_yes(tmp_path, ran, capsys):
 
 
 def test_failed_step_ends_the_calibration(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(calibrate, "_run", lambda words, folder: 2)
+    monkeypatch.setattr(calibration, "_run", lambda words, folder: 2)
     line = refused(capsys, "calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--yes")
     assert "Choose static poses failed" in line
 
@@ -211,7 +212,7 @@ def test_failed_step_ends_the_calibration(tmp_path, monkeypatch, capsys):
     ],
 )
 def test_invalid_settings_give_one_line(tmp_path, capsys, options, message):
-    assert message in refused(capsys, "calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), *options)
+    assert message in refused(capsys, "calibrate", "--arm", "psm", "--yes", "--output", str(tmp_path / "c"), *options)
     assert not (tmp_path / "c").exists()
 
 
@@ -229,8 +230,9 @@ def test_folder_of_another_calibration_is_refused(tmp_path, ran, capsys):
 def test_signal_ends_the_running_command(tmp_path):
     """The command ends first, and then the calibration. A killed calibration ends its command."""
     script = (
-        "import sys; from pathlib import Path; from dvrk_drake.cli import calibrate; sys.executable = sys.argv[1];"
-        "print(calibrate._run([sys.argv[2]], Path('.')), flush=True)"
+        "import sys; from pathlib import Path; from dvrk_drake.processes import calibration;"
+        "sys.executable = sys.argv[1];"
+        "print(calibration._run([sys.argv[2]], Path('.')), flush=True)"
     )
     child = tmp_path / "child"
     child.write_text(

@@ -1,19 +1,24 @@
-"""Settings, folder and steps of the command calibrate."""
+"""Calibrates a connected arm: a sequence of commands, each with named files in one folder."""
 
 # This file has no postponed annotations, because load_typed_yaml reads the types at run time.
-from collections.abc import Callable
+import ctypes
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import yaml
 
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector
-from dvrk_drake.cli.support import mounted
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.export.model_export import controller_format
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write, read_text_input
 from dvrk_drake.models.schema_fault import number_fault, within
@@ -29,6 +34,9 @@ ENVIRONMENT = "environment.dmd.yaml"
 TEST_POSES = 10
 #: Options of the motion with which the full dynamics is validated. It has other frequencies than the first motion.
 TEST_MOTION = ("--duration", "20", "--period", "20", "--harmonics", "10", "--starts", "1")
+#: Time after which a signal is sent to the running command, which may have received it from the terminal [s].
+_FORWARD = 0.5
+_SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 
 
 @dataclass
@@ -75,6 +83,130 @@ class Step:
     done: Callable[[], bool]
     moves: bool = False
     is_required: bool = True
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Result of a calibration. Its files are in the folder.
+
+    Attributes:
+        folder: Folder with the files.
+        static: Model from static poses, with the verdicts of its validation at other poses.
+        model: Model of the full dynamics, with the verdicts of its validation on another motion.
+        duration: Duration of the call [s].
+        moving: Time in which the arm was controlled [s].
+    """
+
+    folder: Path
+    static: IdentifiedModel
+    model: IdentifiedModel
+    duration: float
+    moving: float
+
+    @property
+    def is_usable(self) -> bool:
+        """True if no joint of both models has the verdict "do not use"."""
+        return not any("do not use" in _verdicts(model) for model in (self.static, self.model))
+
+    def summary(self) -> list[str]:
+        """Returns the joints of each verdict, in one line per model."""
+        lines = []
+        for file, model, what in (
+            (STATIC, self.static, "holding torques of other poses"),
+            (DYNAMIC, self.model, "efforts of another motion"),
+        ):
+            verdicts = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in _verdicts(model).items())
+            lines.append(f"Verdicts on {file} for {what}: {verdicts}")
+        return lines
+
+
+def calibrate(
+    arm: str,
+    folder: str | Path,
+    *,
+    poses: int = 40,
+    duration: float = 30.0,
+    seed: int = 0,
+    gravity: Sequence[float] | None = None,
+    environment: Environment | None = None,
+    lcm_url: str = "",
+    key: str | None = None,
+    realtime: bool = False,
+    reset: bool = False,
+    confirm: Callable[[str], None],
+    report: Callable[[str], None] = print,
+) -> Calibration:
+    """Calibrates an arm over LCM: designs, collects, identifies, validates and exports, and continues earlier work.
+
+    Each step is a command of dvrk-drake in a process of its own, in the folder. Complete steps are not repeated. A
+    signal ends the running command first, and the arm holds its pose.
+
+    Args:
+        arm: Name of the arm, or path of an arm file.
+        folder: Folder for all files. An existing calibration in this folder is continued.
+        poses: Number of static poses, 8 to 300.
+        duration: Duration of the motion, 15 to 3600 s.
+        seed: Seed of the designs, 0 or larger.
+        gravity: Gravity vector in the base frame [m/s^2]. None: the vector in the arm file.
+        environment: Fixed objects around the arm. None: there are none.
+        lcm_url: URL of the LCM network. "": LCM's default.
+        key: File with the key that signs messages. None: messages are not signed.
+        realtime: Whether to request real-time scheduling.
+        reset: Whether to clear a fault of the arm before its first motion, and to resume after a watchdog hold.
+        confirm: Function that is called with the name of the arm before each motion. It returns if the arm may move.
+        report: Function that is called with each line of text.
+
+    Raises:
+        DvrkDrakeError: A setting is not valid, the folder cannot be used, or a step failed.
+        KeyboardInterrupt: A signal ended the calibration.
+
+    Examples:
+        >>> import dvrk_drake as dvrk
+        >>> ask = lambda name: input(f"Clear the workspace of {name}, then press Enter. ")
+        >>> result = dvrk.calibrate("mtml", "calibration", confirm=ask)  # doctest: +SKIP
+        >>> result.is_usable  # doctest: +SKIP
+        True
+    """
+    began, moving, folder = time.monotonic(), 0.0, Path(folder)
+    settings = CalibrationSettings(
+        arm=arm.lower() if arm.lower() in known_arms() else _absolute(arm),
+        poses=poses,
+        duration=duration,
+        seed=seed,
+        gravity=list(gravity or ()),
+        environment=environment or Environment(),
+    )
+    loaded = prepare_folder(folder, settings)
+    connection = [f"--lcm-url={lcm_url}"] if lcm_url else []
+    connection += ["--key", _absolute(key)] if key else []
+    connection += ["--realtime"] if realtime else []
+    count = len(calibration_steps(folder, settings, loaded))
+    for number in range(count):
+        # The commands depend on the files of the earlier steps.
+        step = calibration_steps(folder, settings, loaded)[number]
+        header = f"[{number + 1}/{count}] {step.title}"
+        if step.done():
+            report(f"{header}: done")
+            continue
+        words = list(step.words)
+        if step.moves:
+            words += connection + (["--reset"] if reset else [])
+            reset = False
+        report(f"{header}: dvrk-drake {shlex.join(words)}")
+        if step.moves:
+            confirm(loaded.name)
+        started = time.monotonic()
+        code = _run(words, folder)
+        moving += step.moves * (time.monotonic() - started)
+        if code == 130:
+            raise KeyboardInterrupt
+        failure = f"{step.title} failed; the line above states the reason"
+        if code and step.is_required:
+            raise CollectionError(f"{failure}. The same command continues the calibration")
+        if code:
+            report(f"{failure}. The calibration continues")
+    static, model = (IdentifiedModel.load(folder / file) for file in (STATIC, DYNAMIC))
+    return Calibration(folder, static, model, time.monotonic() - began, moving)
 
 
 def calibration_steps(folder: Path, settings: CalibrationSettings, arm: Arm) -> list[Step]:
@@ -181,7 +313,8 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
         DvrkDrakeError: The folder cannot be used, or contains a calibration with other settings.
     """
     gravity = settings.gravity
-    arm = mounted(load_arm(settings.arm), (gravity[0], gravity[1], gravity[2]) if gravity else None)
+    arm = load_arm(settings.arm)
+    arm = arm.with_gravity(gravity) if gravity else arm
     CollisionDetector(arm, settings.environment)  # rejects objects that cannot be added to the arm
     path = folder / SETTINGS
     if path.exists():
@@ -213,3 +346,45 @@ def prepare_folder(folder: Path, settings: CalibrationSettings) -> Arm:
     if not (folder / NOMINAL).exists():
         IdentifiedModel.from_arm(arm, arm.effects.position_dependent).save(folder / NOMINAL)
     return arm
+
+
+def _absolute(path: str) -> str:
+    """Returns the absolute path of a file, because the commands run in another folder. Other names are unchanged."""
+    return str(Path(path).resolve()) if Path(path).is_file() else path
+
+
+def _run(words: Sequence[str], folder: Path) -> int:
+    """Runs a command in the folder and returns its exit code. Signals to this process end the command first."""
+    command = [sys.executable, "-m", "dvrk_drake.cli", *words]
+    process = subprocess.Popen(command, cwd=folder, preexec_fn=_end_with_parent)  # noqa: PLW1509  no other thread runs
+    received: list[int] = []
+    num_sent = 0
+    handlers = {number: signal.signal(number, lambda n, _: received.append(n)) for number in _SIGNALS}
+    try:
+        while True:
+            try:
+                code = process.wait(_FORWARD)
+                break
+            except subprocess.TimeoutExpired:
+                # A terminal sends Ctrl-C to both processes. Other senders may have sent it only to this one.
+                for number in received[num_sent:]:
+                    process.send_signal(number)
+                num_sent = len(received)
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return 130 if received or code in (130, *(-number for number in _SIGNALS)) else code
+
+
+def _end_with_parent() -> None:
+    """Requests SIGTERM for this process when its parent ends, so that no motion continues without the calibration."""
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+
+def _verdicts(model: IdentifiedModel) -> dict[str, list[str]]:
+    """Returns the joints of each verdict of the stored validation."""
+    assert model.validation is not None
+    joints: dict[str, list[str]] = {}
+    for joint in model.joints:
+        joints.setdefault(model.validation.verdicts[joint.name], []).append(joint.name)
+    return joints
