@@ -64,8 +64,7 @@ def test_arm_that_does_not_resume_is_an_error():
     link = GuardedArm()
 
     def take_over():
-        link.guard._acted = True
-        link.guard._take_over("its period is 20 ms")
+        link.guard.hold_reason = "its period is 20 ms"
 
     link.before_step = take_over
     with pytest.raises(ControllerError, match="MTML does not resume: its period is 20 ms"):
@@ -81,8 +80,7 @@ def power_off(link):
 
 
 def watchdog_hold(link):
-    link.guard._acted = True
-    link.guard._take_over("its period is 20 ms")
+    link.guard.hold_reason = "its period is 20 ms"
 
 
 def own_gravity(link):

@@ -25,8 +25,10 @@ from dvrk_drake.systems.guard.follower import Follower, GuardOutput
 from dvrk_drake.systems.guard.limits import ArmModel, GuardLimits, Vector
 from dvrk_drake.systems.guard.measurement import Measurement
 from dvrk_drake.systems.guard.monitors import AgeMonitor, OscillationMonitor, PeriodMonitor
+from dvrk_drake.systems.guard.part import Part
 from dvrk_drake.systems.guard.plausibility import Plausibility
 from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.guard.states import TRANSITIONS, Event, State
 from dvrk_drake.systems.guard.unsafe_arm import unsafe_difference
 
 if TYPE_CHECKING:
@@ -48,9 +50,6 @@ _PERSON = (
     "process, or restart this process"
 )
 
-#: States in which a position controller regulates the arm to a target.
-_REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
-
 #: Faults after which the guard regulates the arm with the reduced gains of the safe state. The loop of the arm's own
 #: position controller may be the cause of these faults, e.g. if the measurements are late.
 _SAFE_STATE_FAULTS = (
@@ -60,14 +59,14 @@ _SAFE_STATE_FAULTS = (
     lcmt_dvrk_status.FAULT_OSCILLATION,
 )
 
-#: State in which the commands of each mode act.
+#: State in which the commands of each mode act, and event that begins it.
 _ACTIVE = {
-    lcmt_dvrk_command.POSITION: lcmt_dvrk_status.STATE_POSITION,
-    lcmt_dvrk_command.EFFORT: lcmt_dvrk_status.STATE_EFFORT,
+    lcmt_dvrk_command.POSITION: (State.POSITION, Event.ACT_POSITION),
+    lcmt_dvrk_command.EFFORT: (State.EFFORT, Event.ACT_EFFORT),
 }
 
 
-class CommandGuard:
+class CommandGuard(Part):
     """Guard between the sender of commands and the motors of an arm.
 
     Call `receive` with every command and `step` once per period (1 ms). Both methods require the time of the arm's
@@ -86,7 +85,7 @@ class CommandGuard:
       cause. All other joints get the gravity effort at their last valid position. After other faults, the arm behaves
       as in HOLD. If the motors had no power before the fault, the arm behaves as in OFF.
 
-    Transitions are written as "state --command or event--> next state"::
+    Transitions are written as "state --command or event--> next state". `states.TRANSITIONS` is the complete table::
 
         HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, except from FAULT
         HOLD --POSITION, EFFORT--> STARTING --accepted for start_time--> POSITION, EFFORT
@@ -215,7 +214,7 @@ class CommandGuard:
         self.limits = GuardLimits(arm, self.settings)
         arm.refuse_locked_joints("a command guard")
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
-        self.state = lcmt_dvrk_status.STATE_HOLD
+        self._state = State.HOLD
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
         #: Reason of the watchdog hold until an operator resumes. Empty if there is no watchdog hold.
         self.hold_reason = ""
@@ -229,7 +228,6 @@ class CommandGuard:
             self._expiry.expiry, round(1e6 * self.settings.clock_tolerance), self.settings.sequence_jump
         )
         self._in_force = CommandInForce()
-        self._powered = True
         #: Times of the last faults [us], except those that the driver reported.
         self._fault_times: tuple[int, ...] = ()
         #: Reason why the last measurement is invalid. Empty if it is valid.
@@ -248,49 +246,29 @@ class CommandGuard:
         )
         self._ages = AgeMonitor(self.settings)
         self._follower = Follower(self.limits, self.limits.safe_gains(arm, model))
-        self._acted = self._is_in_safe_state = False
         self.output = self._output(0.0)
         self._commanded = self.output.effort
+        self._find_parts()
 
-    def __deepcopy__(self, memo: object) -> CommandGuard:
-        # Drake copies the state of a context before every update, so copying must be fast. The copies share arrays,
-        # because no array is changed in place.
-        other = object.__new__(CommandGuard)
-        other.__dict__.update(self.__dict__)
-        for name in (
-            "counts",
-            "_stream",
-            "_in_force",
-            "_follower",
-            "_measured",
-            "_plausibility",
-            "_period",
-            "_oscillation",
-            "_regulation",
-            "_ages",
-        ):
-            part = getattr(self, name)
-            duplicate = object.__new__(type(part))
-            duplicate.__dict__.update(part.__dict__)
-            setattr(other, name, duplicate)
-        return other
+    @property
+    def state(self) -> int:
+        """State of the guard, lcmt_dvrk_status.STATE_*."""
+        return self._state.code
 
     @property
     def accepted_modes(self) -> int:
         """Bit mask of the modes that are accepted in the present state, with bit 1 << mode for each mode."""
-        if self.state == lcmt_dvrk_status.STATE_FAULT:
-            return 1 << lcmt_dvrk_command.HOLD
-        modes = {lcmt_dvrk_command.HOLD, *self._modes}
-        if self.state == lcmt_dvrk_status.STATE_OFF or self.blocked_reason:
-            modes -= set(_ACTIVE)
-        if self.state not in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
-            modes -= {lcmt_dvrk_command.OFF}
-        return sum(1 << mode for mode in modes)
+        modes = {lcmt_dvrk_command.HOLD}
+        if self._state in TRANSITIONS[Event.OFF]:
+            modes.add(lcmt_dvrk_command.OFF)
+        if self._state in TRANSITIONS[Event.START] and not self.blocked_reason:
+            modes.update(_ACTIVE)
+        return sum(1 << mode for mode in modes if mode in (lcmt_dvrk_command.HOLD, *self._modes))
 
     @property
     def sender_id(self) -> int:
         """Identifier of the sender whose commands act or are monitored, or 0 if there is no such sender."""
-        return self._stream.sender_id if self._is_starting_or_in_force() else 0
+        return self._stream.sender_id if self._state.has_stream else 0
 
     @property
     def last_sender_id(self) -> int:
@@ -329,11 +307,6 @@ class CommandGuard:
         self._expire(utime)
         code = foreign_refusal(command, self.arm_name, self.num_joints, self.session_id)
         if command is not None and code == lcmt_dvrk_status.REFUSAL_NONE:
-            if self._is_hold_of_other_sender(command, utime):
-                self.counts.accepted += 1
-                self._acted = True  # also a start check needs a resume, so that it does not begin again
-                self._take_over(f"sender {command.sender_id} commanded HOLD")
-                return code
             code = self._refusal_now(command, utime)
             if code == lcmt_dvrk_status.REFUSAL_NONE:
                 self._accept(command, utime)
@@ -379,17 +352,16 @@ class CommandGuard:
         self._measure(measured_utime, q, v, effort)
         self._expire(utime)
         self._watch_period(dt)
-        if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.position_limit_fault(self._q())):
+        if self._state is State.EFFORT and (excess := self.limits.position_limit_fault(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
-        if self._is_regulated_by_arm():
-            self._watch_regulation()
+        self._watch_regulation()
         self.output = self._output(min(max(dt, 0.0), _MAX_STEP))
         if not self.output.is_finite():
             self.report_fault("the guard's output is not finite", lcmt_dvrk_status.FAULT_NOT_FINITE)
+            self._change(Event.BAD_OUTPUT)
             self._follower.latch(self._q(), np.zeros(self.num_joints))
-            self._is_in_safe_state = False
             self.output = self._follower.hold(0.0)
-        elif self.state == lcmt_dvrk_status.STATE_EFFORT:
+        elif self._state is State.EFFORT:
             self._commanded = self.output.effort.copy()
             text = self._oscillation.add(min(max(dt, 0.0), _MAX_STEP), self._follower.effort, self._commanded)
             if text:
@@ -408,18 +380,17 @@ class CommandGuard:
             has_power: False if the motors cannot hold the arm. The output is then the same as in OFF. After a reset,
                 the arm holds the measured pose, not the pose before the fault.
         """
-        if code in _SAFE_STATE_FAULTS:
-            self._begin_safe_state()
         if self.state != lcmt_dvrk_status.STATE_FAULT:
-            powered = self._powered
-            self._hold()
-            self.state, self._powered = lcmt_dvrk_status.STATE_FAULT, powered
+            self._change(Event.FAULT)
             # The driver reports a fault before each step until its cause has ended, so a reset cannot end it.
             if code != lcmt_dvrk_status.FAULT_DRIVER:
                 now = self._measured.utime or 0
                 self._fault_times = (*(time for time in self._fault_times if now - time <= _FAULT_TIME), now)
             self.fault_code, self.fault_text = code, text + (_PERSON if self.needs_person else "")
-        self._powered &= has_power
+        if code in _SAFE_STATE_FAULTS:
+            self._change(Event.UNSAFE_LOOP)
+        if not has_power:
+            self._change(Event.POWER_LOSS)
 
     @property
     def needs_person(self) -> bool:
@@ -439,7 +410,7 @@ class CommandGuard:
             reason: Reason why the driver cannot execute commands safely, or "" if it can.
         """
         self._driver_reason = reason
-        if reason and self._is_starting_or_in_force():
+        if reason:
             self._take_over(reason)
 
     def _measure(self, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> None:
@@ -455,97 +426,91 @@ class CommandGuard:
                 # Without any measurement there is no pose to hold.
                 self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not no_pose)
                 if not measured.is_pose_valid:
-                    self._begin_safe_state()
+                    self._change(Event.UNSAFE_LOOP)
                     plausibility.reject(measured.invalid_pose)
-            elif self._is_starting_or_in_force():
+            else:
                 self._take_over(problem)
             if not measured.is_pose_valid:
                 return
+        q = self._q()
         if first:
-            self._follower.latch(self._q(), np.zeros(self.num_joints))  # the arm is assumed to be at rest
+            self._follower.latch(q, np.zeros(self.num_joints))  # the arm is assumed to be at rest
         elif measured.dt == 0:
             return  # repeated measurement
         if is_first_in_series:
             plausibility.forget()
-        commanded = self._commanded if self.state == lcmt_dvrk_status.STATE_EFFORT else None
-        fault = plausibility.check(
-            measured.dt, self._q(), measured.v, measured.effort, commanded, measured.invalid_effort
-        )
-        if fault:
+        commanded = self._commanded if self._state is State.EFFORT else None
+        if fault := plausibility.check(measured.dt, q, measured.v, measured.effort, commanded, measured.invalid_effort):
             self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
-        if not self._powered:
+        if not self._state.is_powered:
             plausibility.forget()  # the arm may be moved by hand
 
     def _watch_period(self, dt: float) -> None:
         if self._expiry.wall is not None:
             now = self._expiry.wall.now()
             dt, self._last_wall_step = 1e-6 * (now - self._last_wall_step) if self._last_wall_step else 0.0, now
-        if self._period.add(dt) and self._is_starting_or_in_force():
+        if self._period.add(dt):
             self._take_over(self._period.fault)
 
     def _watch_regulation(self) -> None:
         """Checks that the arm's own position controller regulates the arm. Late measurements let it oscillate."""
+        # After a fault of the driver, another process may move the arm.
+        if not self._state.is_regulated or self.fault_code == lcmt_dvrk_status.FAULT_DRIVER:
+            return
         if deviation := self._follower.following_fault(self._q()):
             self.report_fault(deviation, lcmt_dvrk_status.FAULT_FOLLOWING)
         if text := self._regulation.add(min(self._measured.dt, _MAX_STEP), self._measured.effort):
             self.report_fault(text, lcmt_dvrk_status.FAULT_OSCILLATION)
 
-    def _begin_safe_state(self) -> None:
-        """Starts the regulation with reduced gains in FAULT, from the present effort."""
-        if not self._is_in_safe_state:
-            self._is_in_safe_state = True
+    def _change(self, event: Event) -> None:
+        """Changes to the next state of the table of transitions, and prepares the output in this state."""
+        before, after = self._state, TRANSITIONS[event].get(self._state)
+        if after is None:
+            return
+        follower, q = self._follower, self._q()
+        if not (before.keeps_target or (before is State.POSITION and follower.is_near(q))):
+            follower.latch(q, self._measured.v)
+        self._state = after
+        if after is State.POSITION:
+            follower.begin_position()
+        elif after is State.EFFORT:
+            self._oscillation.restart()
+            self._regulation.restart()
+            follower.begin_effort(self._measured.effort, q)
+        elif after is State.SAFE_FAULT:
             acts = self.output.control_mode == lcmt_dvrk_command.EFFORT
-            self._follower.begin_safe_state(self._commanded if acts else self._measured.effort)
-
-    def _is_regulated_by_arm(self) -> bool:
-        """Returns whether the arm's own position controller regulates the arm to the follower's target."""
-        if self.state == lcmt_dvrk_status.STATE_FAULT:
-            # After a fault of the driver, another process may move the arm.
-            is_held = self._powered and not self._is_in_safe_state
-            return is_held and self.fault_code != lcmt_dvrk_status.FAULT_DRIVER
-        return self.state in _REGULATED
-
-    def _is_starting_or_in_force(self) -> bool:
-        return self.state in (lcmt_dvrk_status.STATE_STARTING, *_ACTIVE.values())
+            follower.begin_safe_state(self._commanded if acts else self._measured.effort)
 
     def _q(self) -> Vector:
         """Returns the measured pose (n,), or the target if there is no measurement yet."""
         return self._follower.target if self._measured.q is None else self._measured.q
 
     def _expire(self, utime: int) -> None:
-        if not self._is_starting_or_in_force():
-            return
-        if reason := self._expiry.fault(utime - self._in_force.status_utime, self._in_force.wall_utime):
-            self.counts.expired += self.state != lcmt_dvrk_status.STATE_STARTING
+        in_force = self._in_force
+        age = utime - in_force.status_utime
+        if self._state.has_stream and (reason := self._expiry.fault(age, in_force.wall_utime)):
+            self.counts.expired += self._state in (State.POSITION, State.EFFORT)
             self._take_over(reason)
 
-    def _take_over(self, reason: str) -> None:
-        """Changes to HOLD, unless the state is OFF or FAULT. If commands acted, an operator must resume.
+    def _take_over(self, reason: str, needs_resume: bool = False) -> None:
+        """Changes to HOLD if commands are monitored or act. If commands acted, an operator must resume.
 
         Args:
             reason: Reason of the change. The first reason is kept until the resume.
+            needs_resume: True if an operator must also resume if no command has acted.
         """
-        if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
-            return
-        acted, self._acted = self._acted, False
-        self._hold()
-        if acted and not self.settings.resume_automatically:
+        needs_resume |= self._state.has_acted
+        if needs_resume and not self.settings.resume_automatically:
             self.hold_reason = self.hold_reason or reason
-
-    def _is_hold_of_other_sender(self, command: lcmt_dvrk_command, utime: int) -> bool:
-        """Returns whether a sender that is not in control commands HOLD, and this command is not old."""
-        return (
-            command.control_mode == lcmt_dvrk_command.HOLD
-            and self._is_starting_or_in_force()
-            and self._stream.is_other_sender(command, utime)
-            and 0 <= utime - command.status_utime <= self._expiry.expiry
-        )
+        self._change(Event.WATCHDOG)
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
         """Returns REFUSAL_* for a command of this session, given the earlier commands and the present state."""
+        is_stale = self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry.expiry
         if self._stream.is_other_sender(command, utime):
-            return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-        if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry.expiry:
+            holds = command.control_mode == lcmt_dvrk_command.HOLD and self._state.has_stream and not is_stale
+            return lcmt_dvrk_status.REFUSAL_NONE if holds else lcmt_dvrk_status.REFUSAL_OTHER_SENDER
+        if is_stale:
             return lcmt_dvrk_status.REFUSAL_STALE
         # The stream is checked before the content. A command that does not continue the stream must not end STARTING.
         if (code := self._stream.refusal(command, utime)) != lcmt_dvrk_status.REFUSAL_NONE:
@@ -558,11 +523,11 @@ class CommandGuard:
             return lcmt_dvrk_status.REFUSAL_FAULT
         if self.hold_reason and command.control_mode in _ACTIVE:
             return lcmt_dvrk_status.REFUSAL_RESUME
-        if self.state == _ACTIVE.get(command.control_mode):
+        if command.control_mode in _ACTIVE and self._state is _ACTIVE[command.control_mode][0]:
             return lcmt_dvrk_status.REFUSAL_NONE
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
-        if command.control_mode == lcmt_dvrk_command.HOLD and self._measured.num_invalid and not self._powered:
+        if command.control_mode == lcmt_dvrk_command.HOLD and self._measured.num_invalid and not self._state.is_powered:
             return lcmt_dvrk_status.REFUSAL_STALE  # the pose to hold is unknown
         if command.control_mode in _ACTIVE:
             return self.limits.refusal_to_start(command, self._q(), self._measured.effort, self._plausibility.gravity)
@@ -570,74 +535,55 @@ class CommandGuard:
 
     def _accept(self, command: lcmt_dvrk_command, utime: int) -> None:
         self.counts.accepted += 1
+        if self._stream.is_other_sender(command, utime):
+            # A start check also requires a resume, so that it does not begin again.
+            self._take_over(f"sender {command.sender_id} commanded HOLD", needs_resume=True)
+            return
         resets = self._stream.accept(command, utime)
         self.counts.lost = self._stream.lost
         mode, in_force = command.control_mode, self._in_force
         continues = self.state == lcmt_dvrk_status.STATE_STARTING and mode == in_force.command.control_mode
         in_force.replace(command)
         in_force.wall_utime = self._expiry.wall_time(command.status_utime, utime - command.status_utime)
-        self._acted &= mode in _ACTIVE
         if mode == lcmt_dvrk_command.OFF:
-            self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
+            self._change(Event.OFF)
         elif mode == lcmt_dvrk_command.HOLD:
-            # The pose that is held after a reset must be a valid and plausible measurement.
-            problem = self._problem or self.limits.implausible_pose(self._q())
-            if self.needs_person:
-                pass
-            elif resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
-                self.fault_text = problem
-            elif resets and not problem:
-                self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
-                self.hold_reason, self._is_in_safe_state = "", False
-                if self._plausibility.invalid.any() or not self._follower.is_near(self._q()):
-                    self._follower.latch(self._q(), self._measured.v)
-                self._plausibility.restart()
-            if self.fault_code == lcmt_dvrk_status.FAULT_NONE:
-                self._hold()
+            if resets and not self.needs_person:
+                self._reset()
+            self._change(Event.HOLD)
         elif reason := self._ages.add(self._expiry.age(utime - command.status_utime, in_force.wall_utime)):
             self._take_over(reason)
-        elif self.state == _ACTIVE[mode]:
-            return
-        elif not continues:
-            self._hold()
+        elif not continues and self._state is not _ACTIVE[mode][0]:
+            self._change(Event.START)
             self._ages.restart()
-            self.state, in_force.accepted_since = lcmt_dvrk_status.STATE_STARTING, utime
-        elif utime - in_force.accepted_since >= 1e6 * self.settings.start_time:
-            self._act(mode)
+            in_force.accepted_since = utime
+        elif continues and utime - in_force.accepted_since >= 1e6 * self.settings.start_time:
+            self._change(_ACTIVE[mode][1])
 
-    def _act(self, mode: int) -> None:
-        self.state, self._acted = _ACTIVE[mode], True
-        if mode == lcmt_dvrk_command.POSITION:
-            self._follower.begin_position()
-        else:
-            self._oscillation.restart()
-            self._regulation.restart()
-            self._follower.begin_effort(self._measured.effort, self._q())
-
-    def _hold(self) -> None:
-        """Changes to HOLD. Keeps a target to which the arm is regulated, otherwise latches the measured pose."""
-        q = self._q()
-        regulated = (
-            self.state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_FAULT)
-            and self._powered
-        )
-        if not (regulated or (self.state == lcmt_dvrk_status.STATE_POSITION and self._follower.is_near(q))):
-            self._follower.latch(q, self._measured.v)
-        self.state, self._powered = lcmt_dvrk_status.STATE_HOLD, True
+    def _reset(self) -> None:
+        """Resets a fault or ends a watchdog hold, unless there is no valid and plausible pose to hold."""
+        if problem := self._problem or self.limits.implausible_pose(self._q()):
+            if self.state == lcmt_dvrk_status.STATE_FAULT:
+                self.fault_text = problem
+            return
+        self.fault_code, self.fault_text, self.hold_reason = lcmt_dvrk_status.FAULT_NONE, "", ""
+        if self._plausibility.invalid.any() or not self._follower.is_near(self._q()):
+            self._follower.latch(self._q(), self._measured.v)
+        self._plausibility.restart()
+        self._change(Event.RESET)
 
     def _output(self, dt: float) -> GuardOutput:
-        follower, in_force = self._follower, self._in_force
-        q = self._q()
-        if not self._powered:
+        follower, in_force, q = self._follower, self._in_force, self._q()
+        if not self._state.is_powered:
             return follower.off(q)
-        if self.state == lcmt_dvrk_status.STATE_FAULT and self._is_in_safe_state:
+        if self._state is State.SAFE_FAULT:
             valid = ~self._plausibility.invalid
             gravity = self._plausibility.model.gravity_effort(np.where(valid, q, self._plausibility.last_valid))
             v = np.where(self._measured.invalid_pose, 0.0, self._measured.v)
             return follower.hold_valid_joints(q, v, valid, gravity, dt)
-        if self.state == lcmt_dvrk_status.STATE_POSITION:
+        if self._state is State.POSITION:
             return follower.follow_position(in_force.position, in_force.velocity, dt)
-        if self.state == lcmt_dvrk_status.STATE_EFFORT and self._measured.utime is not None:
+        if self._state is State.EFFORT and self._measured.utime is not None:
             share = 1e-6 * (self._measured.utime - in_force.accepted_since) / self.settings.start_time - 1.0
             return follower.follow_effort(in_force.effort, q, self._measured.v, dt, min(max(share, 0.0), 1.0))
         return follower.hold(dt)

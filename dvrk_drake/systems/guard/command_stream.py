@@ -9,6 +9,7 @@ import numpy as np
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.limits import Vector
+from dvrk_drake.systems.guard.part import Part
 
 #: Refusal reasons for messages that do not belong to the session or to the sender in control. The guard counts these
 #: messages as ignored, not as refused.
@@ -81,7 +82,7 @@ def content_refusal(command: lcmt_dvrk_command) -> int:
 
 
 @dataclass
-class GuardCounts:
+class GuardCounts(Part):
     """Counts of commands since the guard was created.
 
     Attributes:
@@ -100,7 +101,7 @@ class GuardCounts:
 
 
 @dataclass
-class CommandInForce:
+class CommandInForce(Part):
     """Command that is in force or is monitored during the start check.
 
     The numbers are copied, so that later changes of the message have no effect.
@@ -132,7 +133,7 @@ class CommandInForce:
 
 
 @dataclass
-class CommandStream:
+class CommandStream(Part):
     """Stream of the commands of one sender. All times are in us. Times of arrival refer to the arm's clock.
 
     A sender is in control while its commands are accepted. Commands of a second sender are ignored until `expiry` has
@@ -179,7 +180,8 @@ class CommandStream:
                 return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
             if step > self.sequence_jump:
                 return lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP
-            if self._is_clock_jump(command.utime - self._last.utime, utime - self._arrival):
+            advance = command.utime - self._last.utime
+            if advance <= 0 or abs(advance - (utime - self._arrival)) > self.clock_tolerance:
                 return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
         same_sender = command.sender_id == self.sender_id
         if command.control_mode == lcmt_dvrk_command.OFF and not (same_sender and self._can_turn_off):
@@ -203,6 +205,3 @@ class CommandStream:
         """Discards the sender and its last command, because the arm's clock went back or there is a new sender."""
         self.sender_id, self._last = 0, None
         self._can_reset = self._can_turn_off = False
-
-    def _is_clock_jump(self, advance: int, elapsed: int) -> bool:
-        return advance <= 0 or abs(advance - elapsed) > self.clock_tolerance

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.guard.limits import Flags, GuardLimits, Mask, Vector, clip
+from dvrk_drake.systems.guard.part import Part
 
 
 @dataclass
@@ -36,7 +39,7 @@ class GuardOutput:
         return is_finite([*self.position.tolist(), *self.velocity.tolist(), *self.effort.tolist()])
 
 
-class Follower:
+class Follower(Part):
     """Computes outputs that follow the commands inside the limits. Each mode starts from the present state of the arm.
 
     Attributes:
@@ -45,7 +48,7 @@ class Follower:
     """
 
     def __init__(self, limits: GuardLimits, safe_gains: tuple[Vector, Vector]) -> None:
-        """Creates a follower at rest. No array is changed in place, so copies of the follower may share arrays.
+        """Creates a follower at rest.
 
         Args:
             limits: Limits of the arm.
@@ -100,7 +103,7 @@ class Follower:
         effort = clip(gravity + np.where(valid, feedback, 0.0), lower, upper)
         self.effort = limits.limit_effort_rate(effort, self.effort, dt)
         flags = np.where(valid, 0, lcmt_dvrk_status.FLAG_IMPLAUSIBLE).astype(np.int8)
-        return self._output(lcmt_dvrk_command.EFFORT, q, effort=self.effort.copy(), flags=flags)
+        return self._output(lcmt_dvrk_command.EFFORT, q, effort=self.effort.copy(), joint_flags=flags)
 
     def is_near(self, q: Vector) -> bool:
         """Returns whether q is near the target. The tolerance is that of the start check for position commands."""
@@ -122,7 +125,7 @@ class Follower:
         self._filter_target(dt)
         self._velocity = self._limits.follow_velocity(velocity, self._velocity, flags, dt)
         velocity = self._limits.limit_velocity(self._velocity, self.target)
-        return self._output(lcmt_dvrk_command.POSITION, self.target, velocity=velocity, flags=flags)
+        return self._output(lcmt_dvrk_command.POSITION, self.target, velocity=velocity, joint_flags=flags)
 
     def _filter_target(self, dt: float) -> None:
         self._filtered_target = self._filtered_target + min(dt / self._limits.following_time, 1.0) * (
@@ -169,22 +172,10 @@ class Follower:
         self.effort, flags = self._limits.follow_effort(effort, self.effort, dt)
         withheld = None if start_share == 1.0 else (1.0 - start_share) * self._start_wall_effort
         applied, walls = self._limits.restrain_effort(self.effort, q, v, withheld)
-        return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, flags=flags | walls)
+        return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, joint_flags=flags | walls)
 
-    def _output(
-        self,
-        mode: int,
-        position: Vector,
-        *,
-        velocity: Vector | None = None,
-        effort: Vector | None = None,
-        flags: Flags | None = None,
-    ) -> GuardOutput:
-        """Returns an output whose arrays the caller may change."""
-        return GuardOutput(
-            mode,
-            position.copy(),
-            self._zero.copy() if velocity is None else velocity,
-            self._zero.copy() if effort is None else effort,
-            np.zeros(len(position), np.int8) if flags is None else flags,
-        )
+    def _output(self, mode: int, position: Vector, **arrays: NDArray[Any]) -> GuardOutput:
+        """Returns an output with `arrays`, whose arrays the caller may change. Arrays that are not given are zero."""
+        zero, no_flags = self._zero, np.zeros(len(position), np.int8)
+        zeros: dict[str, NDArray[Any]] = {"velocity": zero.copy(), "effort": zero.copy(), "joint_flags": no_flags}
+        return GuardOutput(mode, position.copy(), **(zeros | arrays))

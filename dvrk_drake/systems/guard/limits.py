@@ -102,12 +102,11 @@ class GuardLimits:
         self.following_error = settings.following_error * width[:n]
         self.following_time = settings.following_time
         self._effort_rate = self.effort_limits / settings.effort_rise_time
-        kd = np.array(arm.gains.kd)
-        self._acceleration = np.divide(self._effort_rate, kd, out=np.full(n, np.inf), where=kd > 0)
+        self.kp, self.kd = np.array(arm.gains.kp), np.array(arm.gains.kd)
+        self._acceleration = np.divide(self._effort_rate, self.kd, out=np.full(n, np.inf), where=self.kd > 0)
         walls = SoftWalls.of(arm)
         self._wall_effort, self._wall_look_ahead = walls.effort, walls.look_ahead
         self.wall_width = np.maximum(self.margin, walls.width)
-        self.kp, self.kd = np.array(arm.gains.kp), np.array(arm.gains.kd)
         self.fault_effort = settings.fault_effort * self.effort_limits
         checks = settings.plausibility
         self.start_gravity = checks.start_gravity * self.effort_limits + arm.dry_friction()

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.guard.limits import Mask, Vector
+from dvrk_drake.systems.guard.part import Part
 
 #: Largest number of steps without an advance of the arm's clock. While this clock stands still, commands do not expire
 #: by it. Several steps are allowed, because Drake updates the guard twice at time zero.
@@ -19,7 +20,7 @@ _MAX_STEPS_AT_ONE_TIME = 10
 
 
 @dataclass
-class Measurement:
+class Measurement(Part):
     """Last measurement of an arm with n joints. All times in us are on the arm's clock.
 
     Attributes:

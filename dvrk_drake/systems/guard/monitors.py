@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvrk_drake.systems.guard.limits import Vector, is_any
+from dvrk_drake.systems.guard.part import Part
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
@@ -24,7 +25,7 @@ _AGES = 20
 _MEAN_TIME = 0.2
 
 
-class _MedianMonitor:
+class _MedianMonitor(Part):
     """Monitor of the median of the last values."""
 
     def __init__(self, limit: float, count: int) -> None:
@@ -90,7 +91,7 @@ class AgeMonitor(_MedianMonitor):
         )
 
 
-class OscillationMonitor:
+class OscillationMonitor(Part):
     """Monitor that counts reversals of the efforts of the joints. The count decays exponentially.
 
     The alternating part of an effort is x = tau - filter(tau), with a first-order low-pass filter. A reversal is a

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dvrk_drake.systems.guard.limits import ArmModel, Mask, Vector, is_any
+from dvrk_drake.systems.guard.part import Part
 from dvrk_drake.systems.guard.settings import PlausibilitySettings
 
 if TYPE_CHECKING:
@@ -51,10 +51,8 @@ class Sample:
     commanded: Vector | None
 
 
-class Check(Protocol):
-    """Protocol of a plausibility check. The caller stores the state of the check.
-
-    The state is separate from the check, because Drake copies the guard at every update.
+class Check(Part):
+    """Plausibility check of successive samples.
 
     Attributes:
         text: Description of the error that this check detects.
@@ -62,36 +60,34 @@ class Check(Protocol):
         uses_effort: True if the check requires the measured effort.
     """
 
-    text: str
-    about_position: bool
-    uses_effort: bool
+    text: ClassVar[str]
+    about_position: ClassVar[bool] = True
+    uses_effort: ClassVar[bool] = True
 
-    def begin(self, sample: Sample) -> Any:
-        """Returns the initial state, given the first sample."""
+    def begin(self, sample: Sample) -> None:
+        """Starts with the first sample, which is not checked. By default, a check has no state."""
 
-    def check(self, sample: Sample, state: Any) -> tuple[Any, Mask]:
-        """Returns the next state and a mask (n,) of the joints whose measurement is implausible."""
+    def check(self, sample: Sample) -> Mask:
+        """Returns a mask (n,) of the joints whose measurement is implausible in the next sample."""
+        raise NotImplementedError
 
 
-class PositionJump:
+class PositionJump(Check):
     """Check for impossible position steps: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
 
-    text, about_position, uses_effort = "the position jumps", True, False
+    text, uses_effort = "the position jumps", False
 
     def __init__(self, settings: PlausibilitySettings, tolerance: Vector, speed_limit: Vector) -> None:
         """Creates the check with tolerances (n,) [rad, m] and speed limits (n,) [rad/s, m/s] of the joints."""
         self._tolerance, self._fastest, self._jitter = tolerance, 1.5 * speed_limit, settings.jitter
 
-    def begin(self, sample: Sample) -> None:
-        """Returns None as the initial state, because this check has no state."""
-
-    def check(self, sample: Sample, state: None) -> tuple[None, Mask]:
+    def check(self, sample: Sample) -> Mask:
         """See `Check.check`."""
         allowed = (sample.dt + self._jitter) * np.minimum(sample.speed, self._fastest)
-        return None, np.abs(sample.step) > self._tolerance + allowed
+        return np.abs(sample.step) > self._tolerance + allowed
 
 
-class VelocityConsistency:
+class VelocityConsistency(Check):
     """Check that the measured velocity agrees with the change of the measured position.
 
     The difference e between the change of position and the integrated velocity decays with the time constant T:
@@ -103,57 +99,54 @@ class VelocityConsistency:
     - r is the allowed error of a velocity that is estimated from the time between two encoder counts.
     """
 
-    text, about_position, uses_effort = "position and velocity disagree", True, False
+    text, uses_effort = "position and velocity disagree", False
 
     def __init__(self, settings: PlausibilitySettings, tolerance: Vector, counts: Vector) -> None:
         """Creates the check with tolerances (n,) and encoder counts (n,) of the joints [rad, m]."""
         self._delay, self._memory = settings.velocity_delay, settings.velocity_memory
         self._tolerance = tolerance + self._memory * settings.velocity_counts * counts
 
-    def begin(self, sample: Sample) -> tuple[Vector, Vector]:
-        """Returns the initial difference e (n,) and speed s (n,)."""
-        return np.zeros_like(sample.q), sample.speed
+    def begin(self, sample: Sample) -> None:
+        """See `Check.begin`."""
+        self._error, self._speed = np.zeros_like(sample.q), sample.speed
 
-    def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
+    def check(self, sample: Sample) -> Mask:
         """See `Check.check`."""
         decay = max(1.0 - sample.dt / self._memory, 0.0)
-        error = decay * state[0] + sample.step - sample.dt * sample.v
-        speed = np.maximum(decay * state[1], sample.speed)
-        return (error, speed), np.abs(error) > self._tolerance + self._delay * speed
+        self._error = decay * self._error + sample.step - sample.dt * sample.v
+        self._speed = np.maximum(decay * self._speed, sample.speed)
+        return np.abs(self._error) > self._tolerance + self._delay * self._speed
 
 
-class FrozenPosition:
+class FrozenPosition(Check):
     """Check for positions that stay constant while the effort on the joint changes.
 
     Cables and structure between the motor encoders and the links are elastic. A large change of the effort therefore
     turns the encoder by at least one count, even if the joint presses against a stop or is held by a hand.
     """
 
-    text, about_position, uses_effort = "the position does not change although the effort does", True, True
+    text = "the position does not change although the effort does"
 
     def __init__(self, settings: PlausibilitySettings, effort_limits: Vector, counts: Vector) -> None:
         """Creates the check with effort limits (n,) [N m, N] and encoder counts (n,) [rad, m] of the joints."""
         self._allowed = settings.frozen_effort * effort_limits
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
-    def begin(self, sample: Sample) -> tuple[Vector, Vector, float]:
-        """Returns the initial state.
+    def begin(self, sample: Sample) -> None:
+        """See `Check.begin`."""
+        self._age, self._effort = 0.0, sample.net_effort  # effort at the last change of the position
+        self._time = np.zeros_like(sample.q)  # since the change of effort became too large [s]
 
-        The state is the net effort (n,) at the last change of position, the time (n,) [s] since the change of effort
-        became too large, and the time since the first sample [s].
-        """
-        return sample.net_effort, np.zeros_like(sample.q), 0.0
-
-    def check(self, sample: Sample, state: tuple[Vector, Vector, float]) -> tuple[tuple[Vector, Vector, float], Mask]:
+    def check(self, sample: Sample) -> Mask:
         """See `Check.check`."""
-        effort, time, age = state
-        moved = (sample.step != 0) | (age < _POWER_ON)
-        effort = np.where(moved, sample.net_effort, effort)
-        time = (np.abs(sample.net_effort - effort) > self._allowed) * (time + sample.dt)
-        return (effort, time, age + sample.dt), time > self._least_time
+        moved = (sample.step != 0) | (self._age < _POWER_ON)
+        self._effort = np.where(moved, sample.net_effort, self._effort)
+        self._time = (np.abs(sample.net_effort - self._effort) > self._allowed) * (self._time + sample.dt)
+        self._age += sample.dt
+        return self._time > self._least_time
 
 
-class Response:
+class Response(Check):
     """Check that accelerations agree with the efforts.
 
     The unexplained effort r = filter(tau - G(q)) - M(q) filter(vd) contains friction, external forces, model errors,
@@ -163,69 +156,67 @@ class Response:
     omitted, because they are small at the allowed speeds.
     """
 
-    text, about_position, uses_effort = "the motion does not follow from the effort", True, True
+    text = "the motion does not follow from the effort"
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm, model: ArmModel) -> None:
         """Creates the check for the joints of `arm` with the model of that arm."""
         self._allowed = settings.response * arm.effort_limits + settings.hand_efforts(arm)
-        self._time = settings.response_time
-        self._memory, self._model = settings.response_memory, model
+        self._filter_time, self._memory, self._model = settings.response_time, settings.response_memory, model
 
-    def begin(self, sample: Sample) -> tuple[Vector, Vector, Vector, NDArray[np.float64], float]:
-        """Returns the filtered effort, filtered velocity, model error (n,), M / T (n, n), and the age of M / T [s]."""
-        M = self._model.mass_matrix(sample.q) / self._time
-        return sample.net_effort, sample.v, sample.net_effort, M, 0.0
+    def begin(self, sample: Sample) -> None:
+        """See `Check.begin`."""
+        self._effort, self._velocity, self._lasting = sample.net_effort, sample.v, sample.net_effort
+        self._age = np.inf  # of M(q) / T [s]
 
-    def check(self, sample: Sample, state: tuple) -> tuple[tuple, Mask]:
+    def check(self, sample: Sample) -> Mask:
         """See `Check.check`."""
-        effort, velocity, lasting, M, age = state
-        age += sample.dt
-        if age > _MASS_MATRIX_PERIOD:
-            M, age = self._model.mass_matrix(sample.q) / self._time, 0.0
-        gain = min(sample.dt / self._time, 1.0)
-        effort = effort + gain * (sample.net_effort - effort)
-        velocity = velocity + gain * (sample.v - velocity)
-        unexplained = effort - M.dot(sample.v - velocity) - lasting
-        lasting = lasting + min(sample.dt / self._memory, 1.0) * unexplained
+        self._age += sample.dt
+        if self._age > _MASS_MATRIX_PERIOD:
+            self._M, self._age = self._model.mass_matrix(sample.q) / self._filter_time, 0.0
+        gain = min(sample.dt / self._filter_time, 1.0)
+        self._effort = self._effort + gain * (sample.net_effort - self._effort)
+        self._velocity = self._velocity + gain * (sample.v - self._velocity)
+        unexplained = self._effort - self._M.dot(sample.v - self._velocity) - self._lasting
+        self._lasting = self._lasting + min(sample.dt / self._memory, 1.0) * unexplained
         # Negated comparison, so that NaN counts as implausible.
-        return (effort, velocity, lasting, M, age), ~(np.abs(unexplained) <= self._allowed)
+        return ~(np.abs(unexplained) <= self._allowed)
 
 
-class SilentEffort:
+class SilentEffort(Check):
     """Check that measured efforts follow commanded efforts. It detects sensors that read zero, and unpowered motors."""
 
-    text, about_position, uses_effort = "the measured effort does not follow the commanded effort", False, True
+    text, about_position = "the measured effort does not follow the commanded effort", False
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm) -> None:
         """Creates the check for the joints of `arm`."""
-        self._commanded, self._time = settings.silent_effort * arm.effort_limits, settings.silent_time
+        self._commanded, self._allowed = settings.silent_effort * arm.effort_limits, settings.silent_time
         self._least = 0.1 * self._commanded
         self._J, self._J_inverse = arm.transmission.matrix, arm.transmission.inverse.matrix
         self._largest = np.array([arm.effects.saturation.get(name, np.inf) for name in arm.joint_names])
 
-    def begin(self, sample: Sample) -> Vector:
-        """Returns the time (n,) [s] for which the measured effort has not followed the commanded effort."""
-        return np.zeros_like(sample.q)
+    def begin(self, sample: Sample) -> None:
+        """See `Check.begin`."""
+        self._time = np.zeros_like(sample.q)  # for which the measured effort has not followed the commanded one [s]
 
-    def check(self, sample: Sample, state: Vector) -> tuple[Vector, Mask]:
+    def check(self, sample: Sample) -> Mask:
         """See `Check.check`."""
         if sample.commanded is None:
-            state = 0.0 * state
+            self._time = 0.0 * self._time
         else:
             missing = self._is_missing(sample.commanded, sample.effort)
             if is_any(missing):
                 # Coupled actuators may saturate although each joint effort is inside its limit.
                 actuators = np.clip(sample.commanded @ self._J_inverse, -self._largest, self._largest)
                 missing &= self._is_missing(actuators @ self._J, sample.effort)
-            state = missing * (state + sample.dt)
-        return state, state > self._time
+            self._time = missing * (self._time + sample.dt)
+        return self._time > self._allowed
 
     def _is_missing(self, commanded: Vector, effort: Vector) -> Mask:
         size = np.abs(commanded)
         return (size > self._commanded) & (commanded * effort < self._least * size)
 
 
-class Plausibility:
+class Plausibility(Part):
     """All plausibility checks of an arm's measurements, applied sample by sample.
 
     Attributes:
@@ -259,6 +250,12 @@ class Plausibility:
         self.gravity = self.last_valid = np.zeros(arm.num_joints)
         self._poses, self._pose_age = (self.last_valid, self.last_valid), 0.0
         self.restart()
+
+    def __deepcopy__(self, memo: object) -> Self:
+        """Returns a copy whose checks change independently as well."""
+        other = super().__deepcopy__(memo)
+        other._checks = tuple(check.__deepcopy__(memo) for check in self._checks)
+        return other
 
     def restart(self) -> None:
         """Marks all positions as valid. The checks restart with the next sample."""
@@ -302,16 +299,16 @@ class Plausibility:
         speed = np.abs(v)
         if self._before is None:
             sample = Sample(dt, q, v, 0.0 * q, speed, effort, effort - self.gravity, commanded)
-            self._states = [check.begin(sample) for check in self._checks]
+            for check in self._checks:
+                check.begin(sample)
             self._poses, self._pose_age = (q, q), 0.0
         else:
             q_before, speed_before = self._before
             fastest = np.maximum(speed, speed_before)
             sample = Sample(dt, q, v, q - q_before, fastest, effort, effort - self.gravity, commanded)
-            results = [check.check(sample, state) for check, state in zip(self._checks, self._states, strict=True)]
-            self._states = [state for state, _ in results]
-            if any(is_any(joints) for _, joints in results):
-                for check, (_, joints) in zip(self._checks, results, strict=True):
+            results = [check.check(sample) for check in self._checks]
+            if any(is_any(joints) for joints in results):
+                for check, joints in zip(self._checks, results, strict=True):
                     ignored = invalid_effort if check.uses_effort else None
                     self._report(check, joints if ignored is None else joints & ~ignored)
             self._pose_age += dt

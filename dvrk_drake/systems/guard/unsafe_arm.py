@@ -63,15 +63,9 @@ def _unsafe_differences(arm: Arm, known: Arm) -> Iterator[str]:
             if not least * reference <= value <= _MAX_GAIN_RATIO * reference:
                 allowed = f"{least * reference:.4g}..{_MAX_GAIN_RATIO * reference:.4g}"
                 yield f"gain {gain} of {name} is {value:g}; allowed: {allowed}, as for {hint}"
-        row = known.transmission.matrix[k, other]
-        difference = arm.transmission.matrix[i, own] - row
-        if np.abs(difference).max() > _MAX_COUPLING_DIFFERENCE * np.abs(row).max():
-            worst = int(np.abs(difference).argmax())
-            value = arm.transmission.matrix[i, own[worst]]
-            yield (
-                f"the coefficient of joint {common[worst]} in the transmission of {name} is {value:.4g}; allowed: "
-                f"{row[worst]:.4g} +- {_MAX_COUPLING_DIFFERENCE * np.abs(row).max():.2g}, as for {hint}"
-            )
+        row = dict(zip(common, arm.transmission.matrix[i, own].tolist(), strict=True))
+        known_row = dict(zip(common, known.transmission.matrix[k, other].tolist(), strict=True))
+        yield from _wrong_coefficients(row, known_row, f"the transmission of {name}", hint)
     limits = {name: (arm.position_lower[i], arm.position_upper[i]) for name, i in zip(common, own, strict=True)}
     limits |= {limit.name: (limit.lower, limit.upper) for limit in arm.coupled_limits}
     references = {n: (known.position_lower[k], known.position_upper[k]) for n, k in zip(common, other, strict=True)}
@@ -83,22 +77,21 @@ def _unsafe_differences(arm: Arm, known: Arm) -> Iterator[str]:
             yield f"the coupled limit {name} is missing; {allowed}"
         elif limits[name][0] < lower - extension or limits[name][1] > upper + extension:
             yield f"the position limits of {name} are {limits[name][0]:.4g}..{limits[name][1]:.4g}; {allowed}"
-    yield from _wrong_coupled_limits(arm, known, hint)
+    coefficients = {limit.name: limit.coefficients for limit in arm.coupled_limits}
+    for limit in known.coupled_limits:
+        own_coefficients = coefficients.get(limit.name, {})
+        yield from _wrong_coefficients(own_coefficients, limit.coefficients, f"the coupled limit {limit.name}", hint)
     yield from _different_mechanics(arm, known, hint)
 
 
-def _wrong_coupled_limits(arm: Arm, known: Arm, hint: str) -> Iterator[str]:
-    coefficients = {limit.name: limit.coefficients for limit in arm.coupled_limits}
-    for limit in known.coupled_limits:
-        tolerance = _MAX_COUPLING_DIFFERENCE * max(map(abs, limit.coefficients.values()))
-        own = coefficients.get(limit.name, {})
-        for name in sorted(own.keys() | limit.coefficients.keys()):
-            value, reference = own.get(name, 0.0), limit.coefficients.get(name, 0.0)
-            if abs(value - reference) > tolerance:
-                yield (
-                    f"the coefficient of joint {name} in the coupled limit {limit.name} is {value:.4g}; allowed: "
-                    f"{reference:.4g} +- {tolerance:.2g}, as for {hint}"
-                )
+def _wrong_coefficients(own: dict[str, float], known: dict[str, float], where: str, hint: str) -> Iterator[str]:
+    """Yields messages on the coefficients of joints that differ dangerously, the largest difference first."""
+    tolerance = _MAX_COUPLING_DIFFERENCE * max(map(abs, known.values()))
+    pairs = {name: (own.get(name, 0.0), known.get(name, 0.0)) for name in sorted(own.keys() | known.keys())}
+    for name, (value, reference) in sorted(pairs.items(), key=lambda item: -abs(item[1][0] - item[1][1])):
+        if abs(value - reference) > tolerance:
+            allowed = f"allowed: {reference:.4g} +- {tolerance:.2g}, as for {hint}"
+            yield f"the coefficient of joint {name} in {where} is {value:.4g}; {allowed}"
 
 
 def _different_mechanics(arm: Arm, known: Arm, hint: str) -> Iterator[str]:

@@ -15,6 +15,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.schema_fault import RANGE
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
+from dvrk_drake.systems.guard.states import Event
 
 ARMS = [
     dataclasses.replace(
@@ -132,7 +133,8 @@ def check(data, modes):
         # Commands act immediately, without the periods of the start check.
         guard._in_force.replace(script.command())
         guard._stream.accept(guard.last_command, script.utime)
-        guard._act(script.mode)
+        guard._change(Event.START)
+        guard._change({Command.POSITION: Event.ACT_POSITION, Command.EFFORT: Event.ACT_EFFORT}[script.mode])
     for _ in range(10):
         output = script.step()
         modes[output.control_mode, guard.state] += 1

@@ -14,6 +14,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.guard.states import State
 from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
@@ -381,7 +382,7 @@ def test_person_at_the_process_of_the_arm_allows_a_reset():
     arm = SimulatedArm(DrakeLcm("memq://"))
     for _ in range(3):
         arm.guard.report_fault("oscillates", Status.FAULT_OSCILLATION)
-        arm.guard.state = Status.STATE_FAULT if arm.guard.needs_person else Status.STATE_HOLD
+        arm.guard._state = State.FAULT if arm.guard.needs_person else State.HOLD
     arm.step()
     assert arm.guard.needs_person
     arm.driver.AllowReset()
