@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
@@ -33,18 +33,17 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect, half_width
-from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.model_file import MODEL_SUFFIXES
-from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
+from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 
 #: Format of the files that `IdentifiedModel.save` writes.
-FORMAT = FileFormat("dvrk_drake identified model", 1)
+FORMAT = "dvrk_drake identified model 1.0"
 #: Text between the method of an identification and the recording of the last recalibration.
 _RECALIBRATED = ", recalibrated on "
 #: Allowed range of measured positions, which may be beyond the limits of a joint.
@@ -175,7 +174,7 @@ class _Header:
         position_offsets: Positions in the model at the recorded positions 0 [rad, m], see `Arm.position_offsets`.
     """
 
-    format: str = field(default="", metadata=FORMAT.metadata)
+    format: str = FORMAT
     arm: str = ""
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
     locked_joints: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
@@ -261,16 +260,7 @@ class IdentifiedModel(_Identified):
                 model of `arm`.
         """
         content = load_yaml(path, ModelError)
-        # Reject an unknown version before its keys are checked.
-        if isinstance(content, dict) and content.get("format"):
-            try:
-                FORMAT.check(content["format"])
-            except ValueError as error:
-                raise ModelError(f"{path}: {error}") from error
-        file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
-        # A missing number would otherwise silently become 0.
-        if key := missing_key(ModelFile, content):
-            raise ModelError(f"{path}: {key} is missing")
+        file = typed_content(ModelFile, content, str(path), ModelError, "a model file", complete=True)
         try:
             own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
             own_arm = lock_joints(own_arm.with_position_offsets(file.position_offsets), file.locked_joints)
@@ -307,11 +297,11 @@ class IdentifiedModel(_Identified):
             "locked_joints": dict(self.arm.locked_joints),
             "position_offsets": dict(self.arm.position_offsets),
         }
-        return ModelFile(format=str(FORMAT), arm=arm, **header, **parts)
+        return ModelFile(arm=arm, **header, **parts)
 
     def check(self) -> None:
         """Raises ModelError unless the parameters match the arm."""
-        if fault := schema_fault(ModelFile, asdict(self._file(self.arm.source)), "a model"):
+        if fault := number_fault(self._file(self.arm.source)):
             raise ModelError(fault)
         names = gravity_parameters(self.arm).base.names
         if tuple(p.name for p in self.base_parameters) != names:

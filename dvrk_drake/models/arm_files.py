@@ -185,7 +185,7 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     if description.mechanism:
         mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
         unstated = Mechanism()
-        stated = {key: getattr(description, key) for key in vars(unstated)}
+        stated = {key: getattr(description, key) for key in vars(unstated) if key != "format"}
         stated = {key: value for key, value in stated.items() if value != getattr(unstated, key)}
         mechanism = dataclasses.replace(mechanism, **stated)
     instrument = Instrument()

@@ -8,7 +8,6 @@ from pydrake.common.yaml import yaml_dump
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.effects_schema import ArmEffects
-from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.immutable import Shared
 from dvrk_drake.models.schema_fault import RANGE, Range, within
@@ -174,7 +173,7 @@ class Mechanism:
     `published_gains` are gains of a publication, with which `dvrk-drake tune` compares its gains.
     """
 
-    format: str = field(default="", metadata=FileFormat("dvrk_drake mechanism", 1).metadata)
+    format: str = "dvrk_drake mechanism 1.0"
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
     gains: Gains = field(default_factory=Gains)
@@ -202,7 +201,7 @@ class Instrument:
     replaces entries of the mechanism, and `view` adds to those of the mechanism.
     """
 
-    format: str = field(default="", metadata=FileFormat("dvrk_drake instrument", 1).metadata)
+    format: str = "dvrk_drake instrument 1.0"
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
     separate_joint: str = ""
@@ -221,7 +220,7 @@ class Instrument:
 class ArmDescription(Mechanism):
     """Schema of `arms/*.yaml`.
 
-    `format` is the version of the file, see `FileFormat`. A file without this key has version 1.0.
+    `format` is the version of the file and may be omitted.
     `mechanism` and `instrument` are names of files in the folders `mechanisms` and `instruments`, or paths of YAML
     files relative to the folder of the arm file. Keys of a mechanism in this file replace those of the mechanism file.
     Without `mechanism`, only `sdf` is required. `sdf` is the path of a model file relative to the folder of the file
@@ -232,7 +231,7 @@ class ArmDescription(Mechanism):
     mechanism.
     """
 
-    format: str = field(default="", metadata=FileFormat("dvrk_drake arm", 1).metadata)
+    format: str = "dvrk_drake arm 1.0"
     name: str = ""
     mechanism: str = ""
     instrument: str = ""

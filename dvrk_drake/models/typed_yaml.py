@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import types
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -9,11 +11,15 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.file_format import FileFormat
 from dvrk_drake.models.files import read_text_input
-from dvrk_drake.models.schema_fault import schema_fault
+from dvrk_drake.models.schema_fault import RANGE, Range, quoted, suggest_name
 
 Schema = TypeVar("Schema")
+
+_ONE = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
+_MANY = {bool: "true or false", int: "integers", float: "numbers", str: "strings"}
+#: Upper bound of the absolute value of integers.
+_MAX_INT = 2**63
 
 #: Maximum nesting and maximum number of values of a file, with expanded aliases. The files of a PSM have a nesting of 6
 #: and 6000 values.
@@ -44,8 +50,9 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
     """Returns the content of the file at `path` as an object of the schema.
 
     Args:
-        schema: Dataclass, see `schema_fault`. A `FileFormat` in its metadata, or the default of its field `format`, is
-            checked first.
+        schema: Dataclass whose fields are dataclasses, configurations of Drake such as `MultibodyPlantConfig`, lists,
+            mappings with text keys, bool, int, float, str, or optional values of these types. Numbers must be finite
+            and within the range of their field, see `within`. The key `format` must equal its default, if there is one.
         path: Path of the file.
         error: Type of error to raise.
         what: Kind of file that is expected, for messages, e.g. "a gains file".
@@ -57,21 +64,34 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
     return typed_content(schema, load_yaml(path, error), str(path), error, what)
 
 
-def typed_content(schema: type[Schema], content: Any, where: str, error: type[DvrkDrakeError], what: str) -> Schema:
-    """Converts parsed content as `load_typed_yaml` does; `where` names the source of the content."""
-    if (expected := FileFormat.of(schema)) is not None and isinstance(content, dict) and "format" in content:
-        try:
-            expected.check(content["format"])
-        except ValueError as cause:
-            raise error(f"{where}: {cause}") from cause
-    fixed = getattr(schema, "format", None)
-    if fixed and isinstance(content, dict) and content.get("format", fixed) != fixed:
-        raise error(f'{where}: format is "{content["format"]}"; allowed: "{fixed}"')
-    if fault := schema_fault(schema, content, what):
-        raise error(f"{where}: {fault}")
+def typed_content(
+    schema: type[Schema],
+    content: Any,
+    where: str,
+    error: type[DvrkDrakeError],
+    what: str,
+    *,
+    complete: bool = False,
+) -> Schema:
+    """Converts parsed content as `load_typed_yaml` does.
+
+    Args:
+        schema, error, what: Arguments of `load_typed_yaml`.
+        content: Parsed content.
+        where: Name of the source of the content.
+        complete: Whether all keys must be stated whose default is not None, e.g. because a missing number must not
+            become 0.
+    """
+    if not isinstance(content, dict):
+        given = "is empty" if content is None else f"must have keys and values, not {quoted(content)}"
+        raise error(f"{where}: {given}; allowed in {what}: {', '.join(_types_of_keys(schema))}")
+    # The keys of another version are unknown, so the version is checked first.
+    version = getattr(schema, "format", None)
+    if version and content.get("format", version) != version:
+        raise error(f'{where}: format is {quoted(content["format"])}; allowed: "{version}"')
     try:
-        return _converted(schema, content)
-    except DvrkDrakeError as cause:  # raised by the schema's own check
+        return _read(schema, content, "", what, None, complete)
+    except _SchemaError as cause:
         raise error(f"{where}: {cause}") from cause
 
 
@@ -142,19 +162,122 @@ def _excess(text: str) -> str:
     return ""
 
 
-def _converted(schema: Any, value: Any) -> Any:
-    """Converts a value to the type of the schema. `schema_fault` must accept the value."""
+class _SchemaError(Exception):
+    """Message on the first part of a content that does not match a schema."""
+
+
+def _read(schema: Any, value: Any, key: str, what: str, allowed: Range | None, complete: bool) -> Any:
+    """Returns the value of `key`, converted to the type of the schema.
+
+    Args:
+        schema: Type of the value, see `load_typed_yaml`.
+        value: Parsed content.
+        key: Key of the value, e.g. "gains.kp[0]", or "" for the whole content.
+        what: Name of the mapping in messages on an unknown key.
+        allowed: Range of the numbers in the value.
+        complete: See `typed_content`.
+
+    Raises:
+        _SchemaError: The value does not match the schema.
+    """
+    schema = schema if value is None else _without_none(schema)
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
-        (inner,) = (argument for argument in arguments if argument is not types.NoneType)
-        return None if value is None else _converted(inner, value)
-    if origin is list:
-        return [_converted(arguments[0], entry) for entry in value]
-    if origin is dict:
-        return {name: _converted(arguments[1], entry) for name, entry in value.items()}
-    if schema is bool and isinstance(value, str):
-        return value == "true"
-    if schema in (bool, int, float, str):
-        return schema(value)
-    hints = get_type_hints(schema)
-    return schema(**{name: _converted(hints[name], entry) for name, entry in value.items()})
+        return None
+    if origin is list and isinstance(value, list):
+        return [_read(arguments[0], x, f"{key}[{i}]", key, allowed, complete) for i, x in enumerate(value)]
+    if origin is dict and isinstance(value, dict) and all(isinstance(name, str) for name in value):
+        return {name: _read(arguments[1], x, f"{key}.{name}", key, allowed, complete) for name, x in value.items()}
+    if origin is None and isinstance(value, dict) and (types_of := _types_of_keys(schema)):
+        return _read_object(schema, types_of, value, key, what, complete)
+    if schema not in _ONE:
+        raise _SchemaError(_wrong(schema, value, key))
+    if allowed is not None and isinstance(value, float) and math.isinf(value) and value in allowed:
+        return value
+    if not _fits(schema, value):
+        raise _SchemaError(_wrong(schema, value, key))
+    converted = value == "true" if schema is bool and isinstance(value, str) else schema(value)
+    if allowed is not None and (fault := allowed.fault(key, converted)):
+        raise _SchemaError(fault)
+    return converted
+
+
+def _read_object(schema: Any, types_of: dict[str, Any], content: dict, key: str, what: str, complete: bool) -> Any:
+    """Returns an object of the schema, whose keys have the types `types_of`. The other arguments are as for `_read`."""
+    fields = {entry.name: entry for entry in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else {}
+    values = {}
+    for name, value in content.items():
+        if name not in types_of:
+            where, known = f"{key}: " if key else "", ", ".join(types_of)
+            advice = suggest_name(name, types_of)
+            raise _SchemaError(f"{where}key {quoted(name)} is unknown; {advice}allowed in {what}: {known}")
+        inside = f"{key}.{name}".lstrip(".")
+        allowed = fields[name].metadata.get(RANGE) if name in fields else None
+        values[name] = _read(types_of[name], value, inside, inside, allowed, complete)
+    for name, entry in fields.items() if complete else ():
+        if name not in content and entry.default is not None:
+            raise _SchemaError(f"{key}.{name} is missing".lstrip("."))
+    try:
+        return schema(**values)
+    except DvrkDrakeError as cause:  # raised by the schema's own check
+        raise _SchemaError(f"{key}: {cause}".removeprefix(": ")) from cause
+
+
+def _types_of_keys(schema: Any) -> dict[str, Any]:
+    """Returns the types of the fields of a dataclass or of a configuration of Drake, or {} for other types."""
+    if dataclasses.is_dataclass(schema):
+        return get_type_hints(schema)
+    return {field.name: field.type for field in getattr(schema, "__fields__", ())}
+
+
+def _without_none(schema: Any) -> Any:
+    """Returns the type T for the schema `T | None`."""
+    if get_origin(schema) not in (Union, types.UnionType):
+        return schema
+    (inner,) = (argument for argument in get_args(schema) if argument is not types.NoneType)
+    return inner
+
+
+def _fits(schema: type, value: Any) -> bool:
+    """Returns whether yaml_load_typed would convert the value to the type `schema`. Numbers must be finite."""
+    if schema is bool:
+        return isinstance(value, bool) or value in ("true", "false")
+    if schema is str:
+        return isinstance(value, str)
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return False
+    try:
+        number = schema(value)
+    except (ValueError, OverflowError):
+        return False
+    if schema is int:
+        return abs(number) < _MAX_INT and (not isinstance(value, float) or value.is_integer())
+    return math.isfinite(number)
+
+
+def _wrong(schema: Any, value: Any, key: str) -> str:
+    allowed = _described(schema, _ONE)
+    if get_origin(schema) is list and not isinstance(value, dict | None):
+        (inner,) = get_args(schema)
+        if inner in _ONE and _fits(inner, value):
+            allowed += f", e.g. [{value}]"
+    elif schema is float and isinstance(value, float):
+        allowed = "a finite number"
+    if isinstance(value, bool) and schema in (str, list[str]):
+        word, words, meaning = ("on", "on and yes", "true") if value else ("off", "off and no", "false")
+        example = f'"{word}"' if schema is str else f'["{word}"]'
+        allowed += f"; quote a word, e.g. {example}: YAML reads {words} without quotes as {meaning}"
+    return f"{key} is {quoted(value)}; allowed: {allowed}"
+
+
+def _described(schema: Any, number: dict[type, str]) -> str:
+    """Returns a description of the accepted values: "a number", or "numbers" for a list."""
+    schema = _without_none(schema)
+    one, arguments = number is _ONE, get_args(schema)
+    if get_origin(schema) is list:
+        return f"{'a list' if one else 'lists'} of {_described(arguments[0], _MANY)}"
+    if get_origin(schema) is dict:
+        return f"{'a mapping' if one else 'mappings'} from names to {_described(arguments[1], _MANY)}"
+    if types_of := _types_of_keys(schema):
+        return f"{'a mapping' if one else 'mappings'} with the keys {', '.join(types_of)}"
+    return number[schema]

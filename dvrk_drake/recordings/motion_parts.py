@@ -225,5 +225,5 @@ def is_rehearsed(motion_path: str | Path, arm: Arm, motion: PeriodicMotion) -> b
     if not os.path.lexists(path):
         return False
     rehearsal = load_typed_yaml(Rehearsal, path, CollectionError, "a rehearsal")
-    is_complete = rehearsal.format == Rehearsal.format and len(rehearsal.tracking_error) == arm.num_joints
+    is_complete = len(rehearsal.tracking_error) == arm.num_joints
     return is_complete and rehearsal.speed > 0 and (rehearsal.arm, rehearsal.motion) == (arm.name, motion.digest())

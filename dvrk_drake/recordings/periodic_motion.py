@@ -15,7 +15,7 @@ from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write, refuse_existing
-from dvrk_drake.models.schema_fault import missing_key, within
+from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 #: Largest velocity and acceleration at both ends of a motion in a file, as a share of the largest values in the motion.
@@ -138,9 +138,7 @@ class PeriodicMotion:
             ExcitationError: The file is not a motion of this arm, or the motion does not begin at rest.
         """
         content = load_yaml(path, ExcitationError)
-        motion = typed_content(cls, content, str(path), ExcitationError, "a motion file")
-        if key := missing_key(cls, content):
-            raise ExcitationError(f"{path}: {key} is missing")
+        motion = typed_content(cls, content, str(path), ExcitationError, "a motion file", complete=True)
         if motion.arm.lower() != arm.name.lower():
             raise ExcitationError(f'{path}: arm is "{motion.arm}", but the selected arm is {arm.name}')
         n, sizes = arm.num_joints, {len(row) for row in (*motion.sine, *motion.cosine)}

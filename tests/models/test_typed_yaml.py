@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 import pytest
 from pydrake.common.yaml import yaml_load_typed
+from schema_faults import schema_fault
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.schema_fault import schema_fault
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_typed_yaml, parse_yaml, typed_content
 
@@ -122,14 +122,14 @@ def test_accepts_the_same_content_as_drake(line):
         expected = None
     content = parse_yaml(line, "here", ArmError)
     if expected is None or ".nan" in line:
-        assert schema_fault(Outer, content, "a test")
+        assert schema_fault(Outer, content)
     else:
         assert typed_content(Outer, content, "here", ArmError, "a test") == expected
 
 
 def test_text_in_place_of_a_list_is_refused():
     assert yaml_load_typed(schema=Outer, data="sizes: '12'").sizes == [1.0, 2.0]
-    assert schema_fault(Outer, {"sizes": "12"}, "a test") == 'sizes is "12"; allowed: a list of numbers, e.g. [12]'
+    assert schema_fault(Outer, {"sizes": "12"}) == 'sizes is "12"; allowed: a list of numbers, e.g. [12]'
 
 
 def test_duplicate_key_is_refused():
@@ -149,3 +149,21 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     ):
         with pytest.raises(ArmError, match=f"{where}:? {message}"):
             load_typed_yaml(Outer, where, ArmError, "a test")
+
+
+@pytest.mark.parametrize("version", ["dvrk_drake arm 2.0", "dvrk_drake model 1.0", 1.0, None, ["dvrk_drake arm 1.0"]])
+def test_arm_of_another_format_is_refused_before_its_keys(version, tmp_path):
+    text = (MODELS_FOLDER / "arms" / "psm.yaml").read_text()
+    path = tmp_path / "arm.yaml"
+    # The format may be omitted.
+    path.write_text("\n".join(line for line in text.splitlines() if not line.startswith("format:")))
+    assert load_arm(path).name == "PSM"
+    path.write_text(text.replace("format: dvrk_drake arm 1.0", f"format: {version}\nnew_key: 1"))
+    with pytest.raises(ArmError, match=r'arm\.yaml: format is .*; allowed: "dvrk_drake arm 1\.0"$'):
+        load_arm(path)
+
+
+def test_files_of_this_package_state_their_format():
+    paths = [path for folder in ("arms", "mechanisms", "instruments") for path in (MODELS_FOLDER / folder).iterdir()]
+    for path in paths:
+        assert f"\nformat: dvrk_drake {path.parent.name.removesuffix('s')} 1.0\n" in path.read_text(), path

@@ -243,8 +243,8 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
         (
-            text.replace(str(FORMAT), "dvrk_drake identified model 0").replace("\neffects:", "\njoint_effects:"),
-            f'model 0"; allowed: "{FORMAT}". Older files cannot be',
+            text.replace(FORMAT, "dvrk_drake identified model 0").replace("\neffects:", "\njoint_effects:"),
+            f'model 0"; allowed: "{FORMAT}"$',
         ),
         (
             text.replace("feedforward_scale: 1.0", "feedforward_scale: 2.0"),
