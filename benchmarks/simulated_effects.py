@@ -8,8 +8,7 @@ cubic trajectory, so that friction sticks and slips. Rows:
     ideal               arm without effects
     none                arm with an empty set of effects, but with the system that computes effects
     friction, ...       one effect of the arm's file
-    N cables stretch    elastic cables at N actuators; the files of the arms do not contain elastic cables
-    all                 all effects of the arm's file, without and with the elastic cables
+    all                 all effects of the arm's file
 
 The repetitions of the rows alternate, so that other processes slow all rows equally. Times are CPU times of this
 process, minima over the repetitions. The real-time factor is simulated time divided by CPU time.
@@ -20,7 +19,6 @@ The result depends on the memory allocator. To select a faster allocator, see do
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 
 import numpy as np
@@ -30,29 +28,16 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 from timing import measured_times, print_table, write_json
 
-from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, Cable
+from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 SECONDS = 0.5
-#: Elongation of a cable at the maximum effort of its motor [rad], and ratio of its damping to its stiffness [s].
-STRETCH, RELAXATION = 5e-3, 1e-3
-
-
-def with_cables(arm: Arm) -> ArmEffects:
-    """Returns the effects of the arm plus an elastic cable for each actuator that moves only one joint."""
-    cables = {}
-    for i, name in enumerate(arm.joint_names):
-        if not arm.prismatic[i] and np.array_equal(joint_row(arm, f"actuator.{name}"), np.eye(arm.num_joints)[i]):
-            stiffness = arm.effects.saturation[name] / STRETCH
-            cables[name] = Cable(stiffness, RELAXATION * stiffness)
-    return dataclasses.replace(arm.effects, stretch=cables)
 
 
 def start(arm: Arm, effects: ArmEffects | None, closure: Closure) -> Simulator:
@@ -83,15 +68,12 @@ def main() -> None:
     parser.add_argument("--json", default="", help="write the results to this file")
     args = parser.parse_args()
     arm = load_arm(args.arm)
-    effects, stretching = arm.effects, with_cables(arm)
-    cables = f"{len(stretching.stretch)} cables stretch"
+    effects = arm.effects
     rows: dict[str, ArmEffects | None] = {
         "ideal": None,
         "none": ArmEffects(),
         **{name: effects.only([name]) for name in EFFECT_NAMES if getattr(effects, name)},
-        cables: stretching.only(["stretch"]),
         "all": effects,
-        f"all, {cables}": stretching,
     }
     ready: dict[str, Simulator] = {}
     times = measured_times(

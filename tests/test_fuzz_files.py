@@ -102,7 +102,6 @@ start: [0, 0, 0.1, 0, 0, 0, 0]
 targets: [{time: 0.5, pose: [0.1, 0.1, 0.12, 0, 0, 0, 0]}]
 hand: {path: []}
 effects: [{coordinate: joint.yaw, kind: offset, coefficient: 0.1}]
-stretch: {yaw: {stiffness: 1000.0, damping: 1.0}}
 simulated_effects: [friction]
 seed: 3
 """

@@ -73,17 +73,6 @@ class FrictionEffect(DriveEffect):
 
 
 @dataclass
-class Cable(Shared):
-    """Elastic cable between the motor and the joint of an actuator that drives only this joint.
-
-    The units are N m/rad and N m s/rad, or N/m and N s/m for a prismatic actuator.
-    """
-
-    stiffness: float = field(default=0.0, metadata=within(1e-3, 1e6, "N m/rad or N/m"))
-    damping: float = field(default=0.0, metadata=within(0.0, 1000.0, "N m s/rad or N s/m"))
-
-
-@dataclass
 class EncoderEffect(Shared):
     """Quantization of positions, and low-pass filter of velocities.
 
@@ -127,8 +116,6 @@ class ArmEffects(Shared):
         cables: Position-dependent torques of cables.
         springs: Position-dependent torques of springs.
         stops: True if the arm's coupled limits are hard stops.
-        stretch: Mapping from an actuator to its elastic cable. Motor, encoder and actuator friction are on the motor
-            side of the cable. The cables of actuators without an entry are rigid.
         saturation: Mapping from an actuator to the largest effort of its motor [N m, N]. Actuators without an entry do
             not saturate.
         encoder: Quantization of positions, and estimation of velocities from the quantized positions.
@@ -140,7 +127,6 @@ class ArmEffects(Shared):
     cables: list[DriveEffect] = field(default_factory=list)
     springs: list[DriveEffect] = field(default_factory=list)
     stops: bool = False
-    stretch: dict[str, Cable] = field(default_factory=dict)
     saturation: dict[str, float] = field(default_factory=dict, metadata=within(0.001, 1e6, "N m or N"))
     encoder: EncoderEffect | None = None
     effort: EffortEffect | None = None
@@ -185,7 +171,7 @@ class ArmEffects(Shared):
         """
         if fault := number_fault(self):
             raise ArmError(fault)
-        tables: dict[str, dict[str, Any]] = {"saturation": self.saturation, "stretch": self.stretch}
+        tables: dict[str, dict[str, Any]] = {"saturation": self.saturation}
         if self.encoder is not None:
             tables["encoder.resolution"] = self.encoder.resolution
         if self.effort is not None:

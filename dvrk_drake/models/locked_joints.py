@@ -207,7 +207,6 @@ def _effects(effects: ArmEffects, coordinates: Iterable[str], actuators: list[st
         friction=[effect for effect in effects.friction if effect.coordinate in coordinates],
         cables=[effect for effect in effects.cables if effect.coordinate in coordinates],
         springs=[effect for effect in effects.springs if effect.coordinate in coordinates],
-        stretch=only(effects.stretch),
         saturation=only(effects.saturation),
         encoder=encoder and dataclasses.replace(encoder, resolution=only(encoder.resolution)),
         effort=effort and dataclasses.replace(effort, **{key: only(value) for key, value in vars(effort).items()}),

@@ -44,7 +44,7 @@ class ArmDrive(DrivePorts):
     step: DriveStep | None
 
     def set_positions(self, diagram: Diagram, context: Context, q: ArrayLike) -> None:
-        """Sets the pose of the arm, with its linkage and the elastic cables of its drive, and its velocities to zero.
+        """Sets the pose of the arm, with its linkage and the joints of its drive, and its velocities to zero.
 
         Args:
             diagram: Diagram that contains the plant and this drive.

@@ -21,7 +21,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
+from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
@@ -40,7 +40,6 @@ class ArmConfig:
         closure: Method that closes the loops of the linkage: "ball" or "mimic"; see `add_arm`.
         gravity: Gravity vector (3,) in the base frame [m/s^2]. None: the gravity vector of the arm.
         effects: Additional position-dependent effects in the drive of the simulated arm. Controllers do not model them.
-        stretch: Additional elastic cables of the simulated arm, by name of the actuator.
         simulated_effects: Names of the arm's `effects` that are simulated; ["all"] for all of them.
         seed: Seed of all noise.
     """
@@ -49,7 +48,6 @@ class ArmConfig:
     closure: str = "mimic"
     gravity: list[float] | None = field(default=None, metadata=GRAVITIES)
     effects: list[DriveEffect] = field(default_factory=list)
-    stretch: dict[str, Cable] = field(default_factory=dict)
     simulated_effects: list[str] = field(default_factory=list)
     seed: int = field(default=0, metadata=within(0, 2**63 - 1))
 
@@ -61,15 +59,15 @@ class ArmConfig:
 
     @property
     def all_effects(self) -> ArmEffects | None:
-        """Effects of the simulated arm: `simulated_effects`, `effects` and `stretch`. None if there are none.
+        """Effects of the simulated arm: `simulated_effects` and `effects`. None if there are none.
 
         Raises:
             ArmError: A name in `simulated_effects` is unknown.
         """
-        if not (self.simulated_effects or self.effects or self.stretch):
+        if not (self.simulated_effects or self.effects):
             return None
         own = self.mounted_arm.effects.only(self.simulated_effects)
-        return own.joined(ArmEffects(cables=self.effects, stretch=self.stretch))
+        return own.joined(ArmEffects(cables=self.effects))
 
     def arm_fault(self) -> str:
         """Describes the first field that is not valid for a simulation, or returns "" if all fields are valid.
@@ -86,7 +84,6 @@ class ArmConfig:
             return fault
         try:
             arm.effects.only(self.simulated_effects)
-            ArmEffects(stretch=self.stretch).check(arm.joint_names)
         except ArmError as error:
             return f"simulated arm: {error}"
         for i, effect in enumerate(self.effects):

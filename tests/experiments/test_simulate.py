@@ -164,7 +164,6 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("simulated_effects=[al]", "unknown effect al; allowed: all, friction"),
         ("targets=3", "targets is 3; allowed: a list of mappings with the keys time, pose"),
         ("seed=1.5", "seed is 1.5; allowed: an integer"),
-        ("stretch.yaw.stiffness=soft", 'stretch.yaw.stiffness is "soft"; allowed: a number'),
         ("controller.gains.kp=[1, a]", 'controller.gains.kp[1] is "a"; allowed: a number'),
         ("duration=", "duration is empty; allowed: a number"),
         ("duration.x=1", "duration is {'x': 1}; allowed: a number"),

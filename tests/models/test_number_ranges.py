@@ -32,7 +32,7 @@ from dvrk_drake.models.arm_schema import (
     Mechanism,
     load_gains,
 )
-from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
+from dvrk_drake.models.effects_schema import ArmEffects, FrictionEffect
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
 from dvrk_drake.models.sdf_model import _RANGES, MODELS_FOLDER
 from dvrk_drake.processes.collector import CollectionSettings
@@ -130,10 +130,8 @@ def test_a_file_with_a_number_outside_its_range_is_refused():
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1e300])
 def test_an_arm_with_a_number_outside_its_range_is_refused(value):
     arm = load_arm("mtml")
-    effects = dataclasses.replace(arm.effects, stretch={"outer_yaw": Cable(1000.0, 1.0)})
     whole = dataclasses.replace(
         arm,
-        effects=effects,
         friction_coordinates={"pulley": np.eye(7)[0]},
         locked_joints={"held": 0.0},
         position_offsets={"outer_yaw": 0.0},
@@ -273,7 +271,6 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
         ("mechanism", ("motion", "effort_delay"), [5.0, 0, 0], r"effort_delay\[0\] is 5; .*0\.2 s; is it in ms\?"),
         ("mechanism", ("bounding_shapes", "margin"), 40, r"bounding_shapes\.margin is 40; .* m; is it in mm\?"),
         ("mechanism", ("effects", "saturation", "yaw"), 1e-9, r"effects\.saturation\.yaw is 1e-09; allowed: "),
-        ("mechanism", ("effects", "stretch"), {"yaw": {"damping": 1.0}}, r"effects\.stretch\.yaw\.stiffness is 0; "),
         ("mechanism", ("effects", "encoder", "resolution", "yaw"), 4000, r"resolution\.yaw is 4000; allowed: 1e-09"),
         ("mechanism", ("gains", "kp"), [1e-4, 99.0, 1320.0], r"gains\.kp\[0\] is 0\.0001; .* effort limit of yaw"),
         ("mechanism", ("gains", "kd"), [9.5, 1e5, 79.0], r"gains\.kd\[1\] is 100000; allowed: 0 or .* limit of pitch"),
@@ -369,7 +366,6 @@ def test_invalid_numbers_of_an_arm_made_in_python_are_refused():
         ({"coupled_limits": (dataclasses.replace(never, coefficients={"outer_yaw": math.nan}),)}, "is nan; allowed"),
         ({"effort_limits": arm.effort_limits[:6]}, "effort_limits has 6 numbers; allowed: 7, one per joint"),
         ({"gains": Gains([1.0], [1.0], [1.0])}, r"gains\.kp has 1 number; allowed: 7, one per joint"),
-        ({"effects": ArmEffects(stretch={"outer_yaw": Cable()})}, r"effects\.stretch\.outer_yaw\.stiffness is 0; all"),
         ({"effects": ArmEffects(friction=[FrictionEffect(coefficient=math.nan)])}, r"coefficient is nan; allowed: "),
         ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing: all coefficients are 0"),
         ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be a vector of three numbers with a norm up to 30"),

@@ -14,7 +14,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     Joint,
-    JointActuator,
     ModelInstanceIndex,
     RevoluteJoint,
     RigidBody,
@@ -23,9 +22,7 @@ from pydrake.multibody.tree import (
 )
 
 from dvrk_drake.dynamics.actuator_effects import joint_row
-from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effects_schema import Cable
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
 #: Inertia of each added body, as a fraction of the arm's inertia along the coordinate. Mass of each added body [kg].
@@ -34,8 +31,6 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_sele
 SHARE, MASS = 2e-3, 1e-6
 #: Distance from the axis at which coupled bodies are constrained [m].
 RADIUS = 0.1
-#: Inextensible cable. Only the compliance of Drake's solver remains.
-STIFF = Cable(stiffness=float("inf"))
 
 
 class DriveJoints:
@@ -48,45 +43,15 @@ class DriveJoints:
     - to a link that rotates by x about the same axis, e.g. the crank of the parallelogram relative to the yaw link,
     - otherwise to the last body of a chain that begins at the world. Each body of the chain rotates relative to the
       previous body by the contribution of one joint to x.
-
-    Attributes:
-        motors: Mapping from the name of an actuator to the motor that `add_motor` created.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
         """Creates the object for the `arm` that `add_arm` added to `plant` as `instance`."""
         self._plant, self._arm, self._instance = plant, arm, instance
         self._added: list[tuple[Joint, NDArray[np.float64]]] = []
-        self.motors: dict[str, JointActuator] = {}
-
-    def add_motor(self, name: str, cable: Cable) -> None:
-        """Adds a separate joint for the motor of an actuator and couples this joint to the arm by an elastic cable.
-
-        Afterwards, `joint_of_coordinate` returns the joint of the motor for this actuator. The rotor inertia in the SDF
-        is moved from the actuator's joint to the motor.
-
-        Raises:
-            StationError: The actuator is prismatic or drives several joints, so no separate rotor is defined.
-        """
-        plant, i = self._plant, self._arm.joint_names.index(name)
-        row = joint_row(self._arm, f"actuator.{name}")
-        if self._arm.prismatic[i] or not np.array_equal(row, np.eye(len(row))[i]):
-            raise StationError(
-                f"{self._arm.name}: stretch.{name}: the actuator must drive one revolute joint and no other joint"
-            )
-        joint = self._new(row, cable)
-        motor = plant.AddJointActuator(f"motor_{name}", joint)
-        at_joint = plant.GetJointActuatorByName(name, self._instance)
-        motor.set_default_rotor_inertia(at_joint.default_rotor_inertia())
-        motor.set_default_gear_ratio(at_joint.default_gear_ratio())
-        at_joint.set_default_rotor_inertia(0.0)
-        self.motors[name] = motor
 
     def joint_of_coordinate(self, coordinate: str) -> tuple[Joint, float]:
         """Returns the joint of a named coordinate of the drive, and the factor from joint position to coordinate."""
-        owner, _, name = coordinate.partition(".")
-        if owner == "actuator" and name in self.motors:
-            return self.motors[name].joint(), 1.0
         return self.joint(joint_row(self._arm, coordinate))
 
     def joint(self, row: NDArray[np.float64]) -> tuple[Joint, float]:
@@ -96,14 +61,11 @@ class DriveJoints:
             (i,) = terms
             return self._plant.GetJointByName(self._arm.joint_names[i], self._instance), float(row[i])
         for joint, known in self._added:
-            if np.allclose(known, row, atol=1e-12) and joint not in [motor.joint() for motor in self.motors.values()]:
+            if np.allclose(known, row, atol=1e-12):
                 return joint, 1.0
-        return self._new(row, STIFF), 1.0
-
-    def _new(self, row: NDArray[np.float64], cable: Cable) -> Joint:
-        joint = self._coaxial(row, cable) or self._chain(row, cable)
+        joint = self._coaxial(row) or self._chain(row)
         self._added.append((joint, row))
-        return joint
+        return joint, 1.0
 
     def set_positions(self, q_plant: NDArray[np.float64], q: ArrayLike) -> None:
         """Writes the positions of the added joints at the pose q (n,) into `q_plant` (nq,)."""
@@ -115,7 +77,7 @@ class DriveJoints:
                 if self._plant.HasJointNamed(name, self._instance):
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
-    def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
+    def _coaxial(self, row: NDArray[np.float64]) -> Joint | None:
         """Returns a new joint for x = row @ q if x is the sum of the angles of coaxial joints, otherwise None."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
@@ -129,7 +91,7 @@ class DriveJoints:
                 total = total + sign * self._arm.linkage.matrix[names.index(joint.name())]
                 if np.allclose(total, row, atol=1e-12):
                     origin = _offset(joint.frame_on_parent()) + along
-                    return self._add_coaxial_joint(row, cable, joint.parent_body(), origin, last)
+                    return self._add_coaxial_joint(row, joint.parent_body(), origin, last)
                 parent = joint.parent_body()
                 if parent.index() not in above:
                     break
@@ -143,7 +105,6 @@ class DriveJoints:
     def _add_coaxial_joint(
         self,
         row: NDArray[np.float64],
-        cable: Cable,
         parent: RigidBody,
         p_PR: NDArray[np.float64],
         last: RevoluteJoint,
@@ -152,7 +113,6 @@ class DriveJoints:
 
         Args:
             row: Row (n,) of the coordinate.
-            cable: Cable that couples the new body to the child of `last`.
             parent: Parent body P of the joint.
             p_PR: Position (3,) of the joint in P [m].
             last: Last of the coaxial joints.
@@ -161,10 +121,10 @@ class DriveJoints:
         body = self._body(name, row)
         frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", parent, RigidTransform(p_PR)))
         joint = plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), last.revolute_axis()))
-        self._couple_rotation(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis(), cable)
+        self._couple_rotation(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis())
         return joint
 
-    def _chain(self, row: NDArray[np.float64], cable: Cable) -> Joint:
+    def _chain(self, row: NDArray[np.float64]) -> Joint:
         plant, i = self._plant, len(self._added)
         axis, end = np.array([0.0, 0.0, 1.0]), plant.world_body()
         for k in np.flatnonzero(row):
@@ -176,22 +136,21 @@ class DriveJoints:
             end = body
         body = self._body(f"drive_{i}", row)
         joint = plant.AddJoint(RevoluteJoint(f"drive_{i}", plant.world_frame(), body.body_frame(), axis))
-        self._couple_rotation(end, np.zeros(3), body, axis, cable)
+        self._couple_rotation(end, np.zeros(3), body, axis)
         return joint
 
     def _couple_rotation(
-        self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64], cable: Cable
+        self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64]
     ) -> None:
-        """Couples the rotations of A and B about a common axis by a rod between them.
+        """Couples the rotations of A and B about a common axis by a rigid rod between them.
 
-        Seen along the axis, the ends of the rod on A and B are 90 degrees apart.
+        Seen along the axis, the ends of the rod on A and B are 90 degrees apart. Only the compliance of Drake's solver
+        remains.
         """
         e = np.eye(3)[np.argmin(np.abs(axis))]
         f = np.cross(axis, e)
-        # The distance of the rod from the axis is RADIUS / sqrt(2).
-        lever, length = 0.5 * RADIUS**2, float(np.sqrt(2.0)) * RADIUS
         p_AP, p_BQ = p_AAxis + RADIUS * e, RADIUS * f
-        self._plant.AddDistanceConstraint(A, p_AP, B, p_BQ, length, cable.stiffness / lever, cable.damping / lever)
+        self._plant.AddDistanceConstraint(A, p_AP, B, p_BQ, float(np.sqrt(2.0)) * RADIUS)
 
     def _body(self, name: str, row: NDArray[np.float64]) -> RigidBody:
         about_axis = SHARE / float(row @ np.linalg.solve(_mass_matrix(self._arm), row))

@@ -134,7 +134,7 @@ def _add_damping(joint: Joint, damping: float) -> None:
 
 
 class PlantEffects:
-    """Friction, stops and elastic cables of an arm in a plant, which may contain other arms and objects.
+    """Friction and stops of an arm in a plant, which may contain other arms and objects.
 
     Create it before the plant is finalized, and give it to `add_arm_drive`, which adds the other effects.
 
@@ -163,7 +163,7 @@ class PlantEffects:
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex, effects: ArmEffects) -> None:
-        """Adds the effects `friction`, `stops` and `stretch` to the plant.
+        """Adds the effects `friction` and `stops` to the plant.
 
         Args:
             plant: Plant that is not finalized. A command acts after its measurement only if the sampled output ports of
@@ -183,8 +183,6 @@ class PlantEffects:
             raise StationError(fault)
         self.plant, self.arm, self.instance, self.effects = plant, arm, instance, effects
         self.drive = DriveJoints(plant, arm, instance)
-        for actuator, cable in effects.stretch.items():
-            self.drive.add_motor(actuator, cable)
         self._elements = add_friction(plant, arm, self.drive, effects.friction)
         # Drake disables the gains of all actuators of an instance while their desired state is not connected.
         self.needs_desired_state = any(effect.kind != "viscous" for effect in effects.friction)
@@ -206,8 +204,3 @@ class PlantEffects:
         self.to_actuators: NDArray[np.float64] = np.ascontiguousarray(J @ joints.selection.T)
         self.from_motors: NDArray[np.float64] = np.zeros((plant.num_velocities(), self.arm.num_joints))
         self.from_motors[joints.velocity_index] = J.T
-        for i, name in enumerate(self.arm.joint_names):
-            if (motor := self.drive.motors.get(name)) is not None:
-                self.to_actuators[i] = self.from_motors[:, i] = 0.0
-                self.to_actuators[i, joints.position_index(motor.joint())] = 1.0
-                self.from_motors[motor.joint().velocity_start(), i] = 1.0

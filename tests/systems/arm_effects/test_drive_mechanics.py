@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from simulated_effects import ARMS, Run, middle, weightless
 
-from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect, FrictionEffect
-from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 
 pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
 
@@ -108,78 +106,3 @@ def test_cables_and_springs_are_conservative(name):
     work = np.sum(0.5 * (f[1:] + f[:-1]) * np.diff(q, axis=0), axis=1)
     assert abs(work.sum()) < 1e-4 * np.abs(work).sum()
     assert np.abs(f).max() > 1e-3
-
-
-CABLES = {"outer_yaw": Cable(80.0, 0.05), "shoulder_pitch": Cable(60.0, 0.02), "wrist_roll": Cable(0.5, 1e-4)}
-
-
-def stretched(friction=()):
-    arm = weightless("mtml")
-    return arm, Run(arm, ArmEffects(stretch=CABLES, friction=list(friction)))
-
-
-def test_cable_stretches_by_its_load():
-    """A motor that holds against a joint effort rotates by the cable's stretch. The encoder is on the motor."""
-    brakes = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 0.5) for joint in load_arm("mtml").joint_names]
-    arm, run = stretched(brakes)
-    load = dict.fromkeys(arm.joint_names, 0.0) | {"outer_yaw": 0.8, "shoulder_pitch": -0.6, "wrist_roll": 0.01}
-    effort = arm.transmission.pull_back_effort(list(load.values()))
-    run.fix("effort_commanded", -effort)
-    run.fix("effort_disturbance", effort)
-    run.advance(2500)
-    stretch = arm.transmission.position(run.get("position_measured") - run.q)
-    for i, joint in enumerate(arm.joint_names):
-        expected = -load[joint] / CABLES[joint].stiffness if joint in CABLES else 0.0
-        # The constraint is a rod whose length is nearly linear in the angle: 1 % at 10 mrad.
-        assert stretch[i] == pytest.approx(expected, rel=0.02, abs=2e-4)
-    assert np.abs(run.v).max() < 1e-3
-
-
-@pytest.mark.parametrize(("name", "actuator"), [("mtml", "elbow_pitch"), ("psm", "insertion"), ("psm", "jaw")])
-def test_cable_without_rotor_inertia_is_refused(name, actuator):
-    with pytest.raises(StationError, match=f"stretch.{actuator}: the actuator must drive one revolute joint"):
-        ArmStation(load_arm(name), effects=ArmEffects(stretch={actuator: Cable(100.0)}))
-
-
-def test_elastic_cables_add_no_energy():
-    """The sum of kinetic and elastic energy never increases without external effort."""
-    arm, run = stretched()
-    plant = run.station.plant
-    plant_context = plant.GetMyContextFromRoot(run.context)
-    stiffness = np.array([CABLES[joint].stiffness if joint in CABLES else 0.0 for joint in arm.joint_names])
-
-    def energy():
-        stretch = arm.transmission.position(run.get("position_measured") - run.q)
-        return plant.CalcKineticEnergy(plant_context) + 0.5 * stiffness @ stretch**2
-
-    run.fix("effort_commanded", np.array([0.5, 0.3, -0.3, 0.0, 0.0, 0.0, 0.005]))
-    run.advance(60)
-    run.fix("effort_commanded", np.zeros(7))
-    path = []
-    for _ in range(400):
-        run.advance()
-        path.append(energy())
-    path = np.array(path)
-    # Drake integrates Coriolis and centrifugal forces explicitly: 2e-4 of the energy, as without cables.
-    assert np.all(np.maximum.accumulate(path[::-1])[::-1] <= path * (1 + 1e-3))
-    assert path[-1] < 0.9 * path[0]
-
-
-def test_rotor_behind_cable_has_inertia_of_sdf():
-    arm, run = stretched()
-    plant = run.station.plant
-    plant_context = plant.GetMyContextFromRoot(run.context)
-    rigid = Run(arm, ArmEffects()).station.plant
-    M = plant.CalcMassMatrix(plant_context)
-    rigid = Run(arm, ArmEffects())
-    M_rigid = rigid.station.plant.CalcMassMatrix(rigid.station.plant.GetMyContextFromRoot(rigid.context))
-    for joint in ("outer_yaw", "wrist_roll"):
-        motor = plant.GetJointActuatorByName(f"motor_{joint}").joint().velocity_start()
-        at_joint = plant.GetJointByName(joint).velocity_start()
-        was = rigid.station.plant.GetJointByName(joint).velocity_start()
-        rotor = rigid.station.plant.GetJointActuatorByName(joint)
-        reflected = rotor.default_rotor_inertia() * rotor.default_gear_ratio() ** 2
-        # The added bodies have 0.2 % of the arm's inertia at their coordinates.
-        share = 4e-3 * M_rigid[was, was]
-        assert reflected <= M[motor, motor] <= reflected + share
-        assert abs(M[at_joint, at_joint] - (M_rigid[was, was] - reflected)) <= share

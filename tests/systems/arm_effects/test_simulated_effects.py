@@ -50,7 +50,7 @@ def test_gravity_controller_holds_arm_with_effects(name):
 def test_every_part_can_be_selected():
     arm = load_arm("mtml")
     for name in EFFECT_NAMES:
-        assert getattr(arm.effects, name) or name == "stretch"
+        assert getattr(arm.effects, name)
         alone, rest = arm.effects.only([name]), arm.effects.without(name)
         for other in EFFECT_NAMES:
             kept, dropped = (alone, rest) if other == name else (rest, alone)
@@ -157,28 +157,9 @@ def test_saturation_limits_fast_motion():
     assert error["[saturation]"] > 1.2 * error["[]"]
 
 
-def test_scenario_cable_stretches():
-    """At rest it carries the motor effort minus the friction at the motor."""
-    arm, start = load_arm("mtml"), "start=[0.0, 0.4, -0.2, 0.0, 0.5, 0.0, 0.0]"
-    friction = sum(e.coefficient for e in arm.effects.friction if e.coordinate == "actuator.shoulder_pitch")
-    stretch, load = {}, {}
-    for stiffness in (50.0, 200.0):
-        cable = f"stretch.shoulder_pitch={{stiffness: {stiffness}, damping: 1.0}}"
-        settings = ["duration=1", "controller.mode=gravity", "simulated_effects=[friction]", start, cable]
-        simulation = simulate(load_scenario("mtml", settings))
-        assert np.abs(simulation.state_true[-1, 7:]).max() < 0.02
-        stretch[stiffness] = (simulation.recording.q - simulation.state_true[:, :7])[-1, 1]
-        load[stiffness] = arm.transmission.inverse.pull_back_effort(simulation.recording.tau[-1])[1]
-        assert stretch[stiffness] == pytest.approx(load[stiffness] / stiffness, abs=friction / stiffness)
-        assert abs(load[stiffness]) > 2 * friction
-    assert abs(stretch[50.0]) > 2 * abs(stretch[200.0])
-
-
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("stretch.elbow={stiffness: 100.0}", "simulated arm: stretch: unknown actuator elbow"),
-        ("stretch.outer_yaw={stiffness: -1.0}", "stretch.outer_yaw.stiffness is -1; allowed: "),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path must have 2 or more poses"),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0]}]", r"hand.path\[0\].pose has 3 numbers"),
         ("hand.grip=1", "allowed"),
