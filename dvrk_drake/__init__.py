@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dvrk_drake.recordings.recording import Recording
     from dvrk_drake.recordings.samples import write_samples
     from dvrk_drake.recordings.writing import write_recording
-    from dvrk_drake.reports.html.write import write_report
+    from dvrk_drake.reports.write import write_report
     from dvrk_drake.systems.arm_drive import add_arm_drive
     from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
     from dvrk_drake.systems.arm_station import ArmStation
@@ -82,7 +82,7 @@ _MODULES = {
     "start_meshcat": "systems.arm_view.page",
     "validate": "analysis.validation",
     "write_recording": "recordings.writing",
-    "write_report": "reports.html.write",
+    "write_report": "reports.write",
     "write_samples": "recordings.samples",
 }
 

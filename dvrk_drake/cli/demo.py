@@ -29,17 +29,21 @@ def demo(
         arm: Arm to simulate.
     """
     from dvrk_drake.experiments.demo.demo import run_demo
-    from dvrk_drake.reports.demo import print_demo
-    from dvrk_drake.reports.figures.demo import plot_demo
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.demo import demo_page
+    from dvrk_drake.reports.html_file import write_html
+    from dvrk_drake.reports.image_files import write_images
+    from dvrk_drake.reports.provenance import Provenance
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     quiet_drake()
     output = new_folder(folder, overwrite=overwrite)
     with Steps(*_DEMO_STEPS) as steps:
         result = run_demo(output, arm, seed, steps)
         steps("drawing", 0.0)
-        plot_demo(output, result)
-    print_demo(make_console(), result, output, verbose=verbose)
+        page = demo_page(result, output)
+        write_images(page, output)
+        write_html(page, output / "report.html", Provenance.of([output / "poses.csv"], command_words))
+    print_page(make_console(), page, verbose=verbose)
     print_written(output)
 
 
@@ -61,8 +65,8 @@ def teleop(
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation
     from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.demo import print_teleoperation
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.demo import teleoperation_page
+    from dvrk_drake.reports.terminal import make_console, print_page
     from dvrk_drake.systems.arm_view.page import page_html
 
     quiet_drake()
@@ -81,7 +85,7 @@ def teleop(
         result = play_teleoperation(meshcat, progress=step_progress(steps, "playing"))
     with atomic_write(output) as stream:
         stream.write(page_html(meshcat, "MTML teleoperates PSM"))
-    print_teleoperation(make_console(), result, output, verbose=verbose)
+    print_page(make_console(), teleoperation_page(result, output), verbose=verbose)
     print_written(output)
 
 
@@ -107,7 +111,7 @@ def reproduce(
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
     from dvrk_drake.reports.reproduction.run import NAMES
     from dvrk_drake.reports.reproduction.run import reproduce as reproduce_paper
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.terminal import make_console
 
     quiet_drake()
     recordings = PaperRecordings.find(data)

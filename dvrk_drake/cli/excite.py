@@ -82,7 +82,7 @@ def excite(
     import numpy as np
 
     from dvrk_drake.recordings.writer_csv import write_csv
-    from dvrk_drake.reports.terminal_tables import make_console, print_answer
+    from dvrk_drake.reports.terminal import make_console, print_answer
 
     of_motion = {
         "model": model,
@@ -170,7 +170,7 @@ def _select_poses(
 ) -> None:
     """Selects static poses, writes the pose file and prints the expected errors."""
     from dvrk_drake.analysis.excitation.static_poses import MARGIN
-    from dvrk_drake.reports.terminal_tables import make_console, print_answer
+    from dvrk_drake.reports.terminal import make_console, print_answer
 
     limits = dvrk.MotionLimits(
         margin=MARGIN if margin is None else margin, effort=effort, positions=positions, environment=environment

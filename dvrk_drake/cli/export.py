@@ -73,8 +73,8 @@ def export(
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import configuration_beside, prepare_export
     from dvrk_drake.export.sdf import mesh_folder, refuse_existing_meshes, sdf_difference
-    from dvrk_drake.reports.export import print_export
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.export import export_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     requested: dict[Format, str | None] = {
         "sdf": sdf,
@@ -111,7 +111,7 @@ def export(
         exports[format].write(path)
     for format, path in outputs.items():
         if format != "urdf" or "sdf" not in outputs:  # both formats contain the same model
-            print_export(make_console(), path, exports[format], verbose=verbose)
+            print_page(make_console(), export_page(path, exports[format]), verbose=verbose)
     for format, path in outputs.items():
         if omitted := exports[format].omitted_shapes:
             shapes = ", ".join(f"{shape} of {link}" for link, shape in omitted)
@@ -151,8 +151,8 @@ def compare_gc(
     """
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-    from dvrk_drake.reports.export import print_comparison
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.export import compensation_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     if json is not None:
         check_output(json, file, model or "", overwrite=overwrite)
@@ -167,22 +167,10 @@ def compare_gc(
         raise ModelError(f"{file}: {error}") from error
     if json is not None:
         write_json(json, comparison.as_dict())
-    print_comparison(make_console(), file, origin, comparison, verbose=verbose)
+    page = compensation_page(comparison, file_name=file, model_name=origin)
+    print_page(make_console(), page, verbose=verbose)
     for warning in comparison.warnings:
         print(f"dvrk-drake: warning: {file}: {warning}", file=sys.stderr, flush=True)
-    if folder is not None:
-        from dvrk_drake.reports.figures.export import plot_compensation
-
-        plot_compensation(
-            folder / "compensation.png",
-            comparison,
-            f"Static torque of {Path(file).name} and of {origin} over the joint range",
-        )
-        print_written(folder)
     if json is not None:
         print_written(json)
-    if report is not None:
-        from dvrk_drake.reports.html.compensation import compensation_page
-
-        inputs = [file, *([model] if model else [])]
-        write_page(report, lambda provenance: compensation_page(comparison, provenance, file, origin), *inputs)
+    write_page(page, folder, report, file, *([model] if model else []))

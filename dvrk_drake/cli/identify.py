@@ -27,6 +27,7 @@ from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
+    command_words,
     load_model,
     mounted,
     plots_folder,
@@ -41,7 +42,7 @@ from dvrk_drake.errors import ModelError
 if TYPE_CHECKING:
     from dvrk_drake.analysis.results import Identification, Validation
     from dvrk_drake.reports.html.page import Page
-    from dvrk_drake.reports.html.provenance import Provenance
+    from dvrk_drake.reports.provenance import Provenance
 
 
 def _gravity(_: object, tokens: Sequence[Token]) -> tuple[float, float, float] | Literal["estimate"]:
@@ -158,13 +159,16 @@ def _write_report(
         print("--report FILE.html writes plots, parameters with intervals and a 3D view of the recording.", flush=True)
         return
     from dvrk_drake.reports.html.identification import identification_page
+    from dvrk_drake.reports.provenance import Provenance
 
     quiet_drake()
 
     def page(provenance: Provenance) -> Page:
         return identification_page(result, provenance, model_path=model, file_options=file.as_text(), saved=saved)
 
-    write_page(report, page, *inputs)
+    with Steps("writing the report"):
+        page(Provenance.of(inputs, command_words)).write(report)
+    print_written(report, "report")
 
 
 def _model_and_recording(
@@ -342,8 +346,8 @@ def payload(
         loaded: Recording of the same motion with the payload.
         link: SDF link to which the payload is attached. Default: the link with the smallest cross-validated error.
     """
-    from dvrk_drake.reports.payload import print_payload
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.payload import payload_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     if model is not None and gravity is not None:
         raise ModelError("--gravity requires --arm; with --model, the gravity vector of the model is used")
@@ -368,12 +372,9 @@ def payload(
     if json is not None:
         write_json(json, result.as_dicts())
     console = make_console()
-    print_payload(console, result, model_path=model, verbose=verbose)
+    page = payload_page(result, model_path=model)
+    print_page(console, page, verbose=verbose)
     print_warnings(console, [warning for warning in result.warnings if warning.kind == "other link"])
     if json is not None:
         print_written(json)
-    if report is not None:
-        from dvrk_drake.reports.html.payload import payload_page
-
-        inputs = [*paths, *([model] if model else [])]
-        write_page(report, lambda origin: payload_page(result, origin, model), *inputs)
+    write_page(page, None, report, *paths, *([model] if model else []))

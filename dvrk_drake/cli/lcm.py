@@ -110,8 +110,8 @@ def status(*, connected: LcmArm, watch: bool = False) -> None:
     """
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.arm_operator import observe
-    from dvrk_drake.reports.arm_status import print_status
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.arm_status import status_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     loaded, console = load_arm(connected.arm), make_console()
     with suppress(KeyboardInterrupt), _operator_link(connected) as link:
@@ -119,7 +119,7 @@ def status(*, connected: LcmArm, watch: bool = False) -> None:
             observation = observe(link)
             if watch:
                 console.clear()
-            print_status(console, loaded, observation)
+            print_page(console, status_page(loaded, observation))
             if not watch:
                 return
 

@@ -33,8 +33,8 @@ def equations(
     from dvrk_drake.export import gravity_sources
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.model import print_symbolic_model
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.model import symbolic_model_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     if output is not None:
         if format is None:
@@ -44,7 +44,7 @@ def equations(
     with Steps("deriving the gravity torque"):
         derived = derive_gravity(shown)
     if format is None:
-        print_symbolic_model(make_console(), derived)
+        print_page(make_console(), symbolic_model_page(derived))
         return
     writers = {
         "latex": lambda: gravity_sources.to_latex(derived, SymbolicPlant(shown).frame_poses()),

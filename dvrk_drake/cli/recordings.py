@@ -22,6 +22,7 @@ from dvrk_drake.cli.app import (
     app,
     one_of,
 )
+from dvrk_drake.cli.report import write_page
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
@@ -81,8 +82,8 @@ def check(
     The exit code is 2 if the recording is not suitable for identification.
     """
     from dvrk_drake.models.locked_joints import locked_option
-    from dvrk_drake.reports.recording_check import print_report
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.recording_check import check_page, has_spectra
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     if model is not None and locked is not None:
         raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
@@ -99,23 +100,21 @@ def check(
         write_json(json, report.as_dict())
     options = f"--arm {arm}{locked_option(recorded_arm)}" if model is None else f"--model {model}"
     other = _other_arm(checked, recorded_arm)
-    print_report(
-        make_console(),
+    page = check_page(
         report,
         source=options + file.as_text(),
         is_model=model is not None,
         other_arm=f"{other}{file.as_text()}" if other else "",
-        verbose=verbose,
+        recording=None if folder is None else checked,
+        arm=recorded_arm,
     )
+    print_page(make_console(), page, verbose=verbose)
     if json is not None:
         print_written(json)
-    if folder is not None:
-        from dvrk_drake.reports.figures.recording_check import plot_report
-
-        if plot_report(folder, report, checked, recorded_arm):
-            print_written(folder)
-        else:
-            print_notes(recording, ["no plots were written; spectra require a motion with efforts and time stamps"])
+    if folder is not None and not has_spectra(report):
+        print_notes(recording, ["no plots were written; spectra require a motion with efforts and time stamps"])
+    elif folder is not None:
+        write_page(page, folder, None)
     for refusal in report.refusals[1:]:
         print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:

@@ -46,8 +46,8 @@ def simulate(
         meshcat: Show the simulation in a web browser, in real time.
     """
     from dvrk_drake.models.arm_files import known_arms
-    from dvrk_drake.reports.simulation import print_simulation
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.simulation import simulation_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     quiet_drake()
     if scenario in known_arms():
@@ -67,14 +67,11 @@ def simulate(
     argument = (scenario or f"--arm {arm}") if folder is None else None
     if output is not None:
         dvrk.write_recording(simulation.recording, output, loaded.mounted_arm, simulation.setpoints)
-    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=argument, verbose=verbose)
+    result = simulation_page(simulation, loaded.mounted_arm, scenario=argument)
+    print_page(make_console(), result, verbose=verbose)
     if output is not None:
         print_written(output, f"{len(simulation.recording)} rows")
-    if folder is not None:
-        from dvrk_drake.reports.figures.simulation import plot_simulation
-
-        plot_simulation(folder / "simulation.png", simulation, loaded)
-        print_written(folder)
+    write_page(result, folder, None)
     if page is not None:
         print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)
         until_stopped(page)
@@ -113,8 +110,8 @@ def study(
     """
     from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
     from dvrk_drake.experiments.study.study_file import load_study
-    from dvrk_drake.reports.study import print_study
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.study import study_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     quiet_drake()
     loaded = load_study(study, set or [])
@@ -134,17 +131,10 @@ def study(
         else:
             with dask_executor(scheduler) as executor:
                 rows = run_study(loaded, executor, output, show)
-    print_study(make_console(), loaded, rows, study_path=study if folder is None else None, verbose=verbose)
+    page = study_page(loaded, rows, study_path=study if folder is None else None)
+    print_page(make_console(), page, verbose=verbose)
     print_written(output, f"{len(rows)} runs")
-    if folder is not None:
-        from dvrk_drake.reports.figures.study import plot_study
-
-        plot_study(folder / "study.png", loaded, rows)
-        print_written(folder)
-    if report is not None:
-        from dvrk_drake.reports.html.study import study_page
-
-        write_page(report, lambda origin: study_page(loaded, rows, origin, study), study, output)
+    write_page(page, folder, report, study, output)
 
 
 @app.command(group=SIMULATE)
@@ -174,8 +164,8 @@ def tune(
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.arm_schema import save_gains
-    from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.tuning import print_tuning
+    from dvrk_drake.reports.terminal import make_console, print_page
+    from dvrk_drake.reports.tuning import tuning_page
 
     quiet_drake()
     tuned = load_arm(arm)
@@ -190,18 +180,11 @@ def tune(
     best = tuning.comparison.best(tuning.found)
     if output is not None:
         save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake tune --arm {arm}, method {best}.")
-    print_tuning(make_console(), tuning, gains_path=output, verbose=verbose)
+    page = tuning_page(tuning, gains_path=output)
+    print_page(make_console(), page, verbose=verbose)
     if output is not None:
         print_written(output)
-    if folder is not None:
-        from dvrk_drake.reports.figures.tuning import plot_steps
-
-        plot_steps(folder / "steps.png", tuning.comparison)
-        print_written(folder)
-    if report is not None:
-        from dvrk_drake.reports.html.tuning import tuning_page
-
-        write_page(report, lambda origin: tuning_page(tuning, origin, output))
+    write_page(page, folder, report)
 
 
 @app.command(group=SIMULATE)
@@ -236,8 +219,8 @@ def transparency(
     """
     from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.transparency import print_transparency, write_transparency
+    from dvrk_drake.reports.terminal import make_console, print_page
+    from dvrk_drake.reports.transparency import transparency_page, write_transparency
 
     quiet_drake()
     moved_arm = load_arm(arm)
@@ -269,19 +252,11 @@ def transparency(
             )
     if output is not None:
         write_transparency(Path(output), forces)
-    print_transparency(make_console(), moved_arm, forces, verbose=verbose)
+    page = transparency_page(moved_arm, forces)
+    print_page(make_console(), page, verbose=verbose)
     if output is not None:
         print_written(output)
-    if folder is not None:
-        from dvrk_drake.reports.figures.transparency import plot_transparency
-
-        plot_transparency(folder / "transparency.png", moved_arm, forces)
-        print_written(folder)
-    if report is not None:
-        from dvrk_drake.reports.html.transparency import transparency_page
-
-        inputs = [*([path] if path else []), *(model or [])]
-        write_page(report, lambda origin: transparency_page(moved_arm, forces, origin), *inputs)
+    write_page(page, folder, report, *([path] if path else []), *(model or []))
 
 
 def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> list[Compensation]:

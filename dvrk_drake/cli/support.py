@@ -166,7 +166,7 @@ def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
     if path is None:
         return None
     with interrupt_ends_process():
-        importlib.import_module("dvrk_drake.reports.figures.style")
+        importlib.import_module("dvrk_drake.reports.image_files")
     return new_folder(path, overwrite=overwrite)
 
 

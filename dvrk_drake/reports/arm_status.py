@@ -1,15 +1,14 @@
-"""Prints the state of an arm over LCM, and what its operator can do next."""
+"""Page of the state of an arm over LCM, and of what its operator can do next."""
 
 from __future__ import annotations
 
 import numpy as np
-from rich.console import Console
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.processes.arm_operator import ArmObservation
-from dvrk_drake.reports.terminal_tables import make_table, print_answer
+from dvrk_drake.reports.page import Block, Level, Page, Section, Table, Text
 
 #: Bits of `joint_flags` and what they mean.
 _FLAGS = {
@@ -22,31 +21,32 @@ _FLAGS = {
 }
 
 
-def print_status(console: Console, arm: Arm, observation: ArmObservation) -> None:
-    """Prints one screen: state and its reason, rates, weaker settings of the guard, and joints beside their limits."""
+def status_page(arm: Arm, observation: ArmObservation) -> Page:
+    """Returns state and its reason, rates, weaker settings of the guard, and the joints beside their limits."""
     status = observation.last
     why, next_step = observation.explanation()
     is_fault = status.fault_code != lcmt_dvrk_status.FAULT_NONE
-    style = "red" if is_fault else "yellow" if next_step else "green"
-    print_answer(console, f"{arm.name}: {describe_state(status.guard_state)}, {why}.", next_step or None, style)
+    level: Level = "bad" if is_fault else "warning" if next_step else "good"
     rate = observation.count / observation.seconds
     counts = f"{status.num_refused} refused, {status.num_ignored} ignored, {status.num_expired} expired"
-    lines = [
-        f"Statuses: {rate:.0f} per second, {observation.lost} lost. Commands since the start of the arm: "
-        f"{status.num_accepted} accepted, {status.num_lost} lost, {counts}.",
-        *([f"Guard settings weaker than the defaults: {status.weaker_settings}."] if status.weaker_settings else []),
+    blocks: list[Block] = [
+        Text(
+            f"Statuses: {rate:.0f} per second, {observation.lost} lost. Commands since the start of the arm: "
+            f"{status.num_accepted} accepted, {status.num_lost} lost, {counts}."
+        )
     ]
-    for line in lines:
-        console.print(line, markup=False)
-    console.print()
-    table = make_table(
-        "Joints [rad, N m; prismatic: m, N]", "", "position", "limits", "velocity", "effort", "share of limit", ""
-    )
+    if status.weaker_settings:
+        blocks.append(Text(f"Guard settings weaker than the defaults: {status.weaker_settings}."))
+    rows = []
     shares = np.abs(status.effort_measured) / arm.effort_limits
     for j, name in enumerate(arm.joint_names):
         flags = [text for bit, text in _FLAGS.items() if status.joint_flags[j] & bit]
         limits = f"{arm.position_lower[j]:.3g} .. {arm.position_upper[j]:.3g}"
         measured = status.position[j], status.velocity[j], status.effort_measured[j]
         position, velocity, effort = (f"{round(x, 3) + 0.0:.3f}" for x in measured)  # no -0.000
-        table.add_row(name, position, limits, velocity, effort, f"{100 * shares[j]:.0f} %", ", ".join(flags))
-    console.print(table)
+        rows.append((name, position, limits, velocity, effort, f"{100 * shares[j]:.0f} %", ", ".join(flags)))
+    header = ("", "position", "limits", "velocity", "effort", "share of limit", "")
+    right = [False, True, True, True, True, True, False]
+    blocks.append(Table(header, rows, "Joints [rad, N m; prismatic: m, N]", right=right))
+    answer = f"{arm.name}: {describe_state(status.guard_state)}, {why}."
+    return Page(f"State of {arm.name}", answer, [Section("Joints", blocks)], level, next_step)

@@ -1,4 +1,4 @@
-"""Prints the results of the demo and of the teleoperation to a terminal."""
+"""Pages of the demo and of the teleoperation."""
 
 from __future__ import annotations
 
@@ -6,77 +6,72 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.markup import escape
 
 from dvrk_drake.experiments.demo.demo import PLANS, DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.identification import print_static_parameters
-from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
+from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, NEUTRAL, REFERENCE
+from dvrk_drake.reports.page import Block, Command, Page, Plot, Scene, Section, Table, Text
+from dvrk_drake.reports.plot import Curve, Dots, Guide, Mark, Panel, category_panel, joint_label
 
-WITH_A_REAL_ARM = """
-With a real arm:
-1. Record at least 40 different static poses with dvrk-drake collect, or
-   convert a recording of another program (docs/recordings.md).
-2. dvrk-drake identify POSES.csv --arm {arm} --output model.yaml
-3. On another day: dvrk-drake validate OTHER.csv --model model.yaml --save
-4. Disable the gravity compensation of the dVRK controller. Otherwise gravity is
-   compensated twice. Keep a hand on the emergency stop.
-5. Only if no verdict is "do not use":
-   dvrk-drake control --arm {arm} --model model.yaml --mode damped
-"""
-#: Note on the simulated arm and on the start of the release.
-GROUND_TRUTH = (
-    "The simulated arm has the friction, cables, stops and sensors of the arm file. Its links are {:g} to {:g} times "
-    "as heavy as in the SDF, except for its counterweights. At the start of the release, its friction carries no load. "
-    "After an approach from one side, a joint can move back or slip further than the limit."
+_REAL_ARM = (
+    "With a real arm: record at least 40 different static poses with `dvrk-drake collect`, or convert a recording of "
+    "another program. Identify the model, and validate it on another day with `--save`. Disable the gravity "
+    "compensation of the dVRK controller; otherwise gravity is compensated twice. Keep a hand on the emergency stop. "
+    'Run the controller only if no verdict is "do not use".'
 )
+#: Smallest half-width of the drift axis, as a multiple of the limit of the drift.
+_MIN_RANGE = 2.0
 
 
-def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: bool = False) -> None:
-    """Prints whether the released arm stays at its pose, its drift, and the errors of the models at new poses.
+def demo_page(result: DemoResult, folder: Path) -> Page:
+    """Returns whether the released arm stays at its pose, its drift, and the errors of the models at new poses.
 
     Args:
-        console: Console to print to.
         result: Result of the demo.
-        folder: Output folder of the demo.
-        verbose: Whether to print the identified parameters, and instructions for a real arm.
+        folder: Output folder of the demo, for the suggested next command.
     """
     arm, duration = result.arm, result.time[-1]
-    drifts = result.drifts
+    drifts, held = result.drifts, result.holds("identified")
     largest = {model: _largest_rotation(arm, drift) for model, drift in drifts.items()}
-    print_answer(
-        console,
-        f"Verdict: the identified model {'holds' if result.holds('identified') else 'does not hold'} the released "
-        f"{arm.name} for {duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the "
-        f"SDF, the same arm {result.nominal_outcome}. Its largest drift is {largest['nominal']}.",
-        f"open {folder}/arm.html in a browser, or drift.png",
-        style="green" if result.holds("identified") else "yellow",
-    )
-    table = make_table(
-        f"Largest drift in {duration:g} s [mrad; mm], RMS torque error at {result.fresh.poses} new poses [N m; N]",
-        *("", "drift, identified", "drift, SDF", "error, identified", "error, SDF", "no model"),
-    )
+    rows = []
     for i, (ours, sdf) in enumerate(zip(result.fresh.joints, result.fresh_nominal.joints, strict=True)):
         drift = (f"{1e3 * drifts[model][i]:.1f}" for model in ("identified", "nominal"))
         errors = (f"{error:.4f}" for error in (ours.rms_error, sdf.rms_error, ours.rms_torque))
-        table.add_row(ours.name, *drift, *errors)
-    console.print(table)
-    console.print()
-    for purpose, command in (
-        (
-            "Plots and parameters with intervals:",
-            f"{folder}/poses.csv --arm {arm.source} \\\n    --output new_model.yaml --report report.html",
+        rows.append((ours.name, *drift, *errors))
+    low, high = PLANS[arm.source].mass_ratios
+    blocks: list[Block] = [
+        Table(
+            ("", "drift, identified", "drift, SDF", "error, identified", "error, SDF", "zero torque"),
+            rows,
+            f"Largest drift in {duration:g} s [mrad; mm], RMS torque error at {result.fresh.poses} new poses [N m; N]",
         ),
-        ("With a real arm:", f"POSES.csv --arm {arm.source} --output MODEL.yaml"),
-    ):
-        console.print(f"{purpose}\n  dvrk-drake identify {command}", markup=False, soft_wrap=True)
-    if not verbose:
-        return
-    print_note(console, GROUND_TRUTH.format(*PLANS[arm.source].mass_ratios))
-    print_static_parameters(console, result.identification.model)
-    console.print(WITH_A_REAL_ARM.format(arm=arm.source), markup=False)
+        Text(
+            "The simulated arm has the friction, cables, stops and sensors of the arm file. Its links are "
+            f"{low:g} to {high:g} times as heavy as in the SDF, except for its counterweights. At the start of the "
+            "release, its friction carries no load. After an approach from one side, a joint can move back or slip "
+            "further than the limit.",
+            show="details",
+        ),
+        Text(_REAL_ARM, show="details"),
+    ]
+    view = folder / "arm.html"
+    scene = [Scene(view.read_text, "Release with the identified model (grey) and with the model of the SDF (green)")]
+    identify = f"dvrk-drake identify {folder}/poses.csv --arm {arm.source} --output MODEL.yaml --report report.html"
+    return Page(
+        f"Demo: {arm.name}, simulated",
+        f"Verdict: the identified model {'holds' if held else 'does not hold'} the released {arm.name} for "
+        f"{duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the SDF, the same "
+        f"arm {result.nominal_outcome}. Its largest drift is {largest['nominal']}.",
+        [
+            Section("Drift and torque errors", blocks),
+            Section("Release", [*scene, _drift_plot(result)]),
+            Section("Errors at new poses", [_error_plot(result)]),
+            Section("With your own recording", [Command(identify, "Plots and parameters with intervals.")]),
+        ],
+        "good" if held else "warning",
+        f"open {folder}/report.html in a browser",
+    )
 
 
 def _largest_rotation(arm: Arm, drift: NDArray[np.float64]) -> str:
@@ -85,34 +80,71 @@ def _largest_rotation(arm: Arm, drift: NDArray[np.float64]) -> str:
     return f"{1e3 * angles.max():.1f} mrad ({arm.joint_names[int(np.argmax(angles))]})"
 
 
-def print_teleoperation(console: Console, result: TeleoperationResult, file: str, *, verbose: bool = False) -> None:
-    """Prints the tracking error of the instrument tip.
+def _drift_plot(result: DemoResult) -> Plot:
+    """Returns the drift of the released arm with both models.
+
+    Each joint has one panel, in which both models have the same scale. The panel shows the largest drift of a held
+    joint, and the position limits of the joint that are inside its range.
+    """
+    arm, t, panels = result.arm, result.time, []
+    limits = "15 mrad or 1.5 mm" if np.any(arm.prismatic) else "15 mrad"
+    for j in range(arm.num_joints):
+        q0, held = result.identified[0, j], 1e3 * result.limits[j]
+        nominal = 1e3 * (result.nominal[:, j] - result.nominal[0, j])
+        identified = 1e3 * (result.identified[:, j] - q0)
+        marks: list[Mark] = [
+            Guide("y", -held, held, NEUTRAL, f"limit of a held joint: {limits}"),
+            Curve("model of the SDF (not identified)", t, nominal, REFERENCE, "dashed"),
+            Curve("identified model", t, identified, FITTED),
+        ]
+        low = min(nominal.min(), identified.min(), -_MIN_RANGE * held)
+        high = max(nominal.max(), identified.max(), _MIN_RANGE * held)
+        for stop in 1e3 * (np.array([arm.position_lower[j], arm.position_upper[j]]) - q0):
+            if low <= stop <= high:
+                marks.append(Guide("y", float(stop), None, LIMIT, "joint limit"))
+        label = f"drift [{'mm' if arm.prismatic[j] else 'mrad'}]"
+        margin = 0.05 * (high - low)
+        y_range = (low - margin, high + margin)
+        panels.append(Panel(joint_label(arm, j), marks, "time since the release [s]", label, y_range=y_range))
+    return Plot("drift", "drift from the release position with both models", panels, columns=2)
+
+
+def _error_plot(result: DemoResult) -> Plot:
+    """Returns the RMS torque errors of both models and of zero torque at poses that were not used for fitting."""
+    names = [joint_label(result.arm, j) for j in range(result.arm.num_joints)]
+    dots = [
+        Dots("zero torque", names, [joint.rms_torque for joint in result.fresh.joints], MEASURED),
+        Dots("model of the SDF", names, [joint.rms_error for joint in result.fresh_nominal.joints], REFERENCE),
+        Dots("identified model", names, [joint.rms_error for joint in result.fresh.joints], FITTED, style="diamonds"),
+    ]
+    forces = "".join(f"; J{j + 1}: N" for j in np.flatnonzero(result.arm.prismatic))
+    panel = category_panel("", dots, f"RMS torque error [N m{forces}]", log_x=True)
+    caption = f"RMS torque error at {result.fresh.poses} poses that were not used for fitting"
+    return Plot("torque_error", caption, [panel])
+
+
+def teleoperation_page(result: TeleoperationResult, file: str) -> Page:
+    """Returns the tracking error of the instrument tip.
 
     Args:
-        console: Console to print to.
         result: Result of the teleoperation.
         file: Path of the page with the recorded motion.
-        verbose: Whether to print the definition of the errors.
     """
-    print_answer(
-        console,
-        f"The tip follows the handle within {1e3 * result.max_position_error:.3f} mm "
-        f"(RMS {1e3 * result.rms_position_error:.3f} mm).",
+    largest, rms = 1e3 * result.max_position_error, 1e3 * result.rms_position_error
+    rows = [
+        ("position [mm]", f"{rms:.3f}", f"{largest:.3f}"),
+        ("rotation [mrad]", f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}"),
+        ("motion while the clutch is open [mm]", "", f"{1e3 * result.max_motion_held:.1g}"),
+    ]
+    definition = (
+        "Error: motion of the tip minus the scaled motion of the handle. Both motions are measured from the positions "
+        f"at which the clutch was closed. Length of the path of the handle: {result.handle_path:.2f} m."
+    )
+    blocks = [Table(("", "RMS", "largest"), rows, "Tracking error of the instrument tip")]
+    return Page(
+        "Teleoperation of a PSM with an MTM, simulated",
+        f"The tip follows the handle within {largest:.3f} mm (RMS {rms:.3f} mm).",
+        [Section("Tracking error", [*blocks, Text(definition, show="details")])],
+        "good",
         f"open {file} in a browser",
     )
-    table = make_table("Tracking error of the instrument tip", "", "RMS", "largest")
-    table.add_row(
-        escape("position [mm]"), f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}"
-    )
-    table.add_row(
-        escape("rotation [mrad]"), f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}"
-    )
-    table.add_row(escape("motion while the clutch is open [mm]"), "", f"{1e3 * result.max_motion_held:.1g}")
-    console.print(table)
-    if verbose:
-        console.print()
-        print_note(
-            console,
-            "Error: motion of the tip minus the scaled motion of the handle. Both motions are measured from the "
-            f"positions at which the clutch was closed. Length of the path of the handle: {result.handle_path:.2f} m.",
-        )

@@ -1,4 +1,4 @@
-"""Prints exported models, and comparisons of gravity-compensation files of the dVRK with models, to a terminal."""
+"""Pages of exported models, and of comparisons of gravity-compensation files of the dVRK with models."""
 
 from __future__ import annotations
 
@@ -7,40 +7,37 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies
 from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import POSES, compensation_loss
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison, JointComparison
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, KinematicCompensation
 from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLoss
 from dvrk_drake.export.model_export import ModelExport
 from dvrk_drake.export.sdf import LinkChange, changed_links
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
+from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE, SERIES
+from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
+from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, Style
+
+#: Number of bins over the position of a joint, and number of panels. The file has no torque for joint 7.
+_BINS, _PANELS = 60, 6
 
 
-def print_export(console: Console, path: str, export: ModelExport, *, verbose: bool = False) -> None:
-    """Prints the content of an exported file, and the effects of the model that the file cannot represent.
+def export_page(path: str, export: ModelExport) -> Page:
+    """Returns the content of an exported file, and the effects of the model that the file cannot represent.
 
     Args:
-        console: Console to print to.
         path: Path of the file.
         export: Exported model.
-        verbose: Whether to print all numbers of the file.
     """
-    arm = export.model.arm
     if export.bodies is not None:
-        _print_bodies(console, arm, export, export.bodies, verbose)
-    elif isinstance(export.compensation, KinematicCompensation):
-        _print_kinematic_compensation(console, path, export, export.compensation, verbose)
-    else:
-        written = GravityCompensationFile.load(path)
-        _print_compensation(console, path, export, written, verbose)
+        return _bodies_page(path, export, export.bodies)
+    if isinstance(export.compensation, KinematicCompensation):
+        return _kinematic_compensation_page(path, export, export.compensation)
+    return _compensation_page(path, export, GravityCompensationFile.load(path))
 
 
 def _source(model: IdentifiedModel, origin: str) -> str:
@@ -54,39 +51,36 @@ def _next_step(model: IdentifiedModel, origin: str) -> str:
     return f"dvrk-drake export --model {origin} --dvrk-gc NEW.json"
 
 
-def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: ModelBodies, verbose: bool) -> None:
-    changes = changed_links(arm, bodies.links)
+def _bodies_page(path: str, export: ModelExport, bodies: ModelBodies) -> Page:
+    changes = changed_links(export.model.arm, bodies.links)
     answer = f"The {export.format.upper()} has the same inertias as the SDF of the arm."
+    blocks: list[Block] = []
     if changes:
         before, after = (sum(getattr(c, which).parameters[0] for c in changes) for which in ("before", "after"))
         answer = f"{len(changes)} links differ from the SDF of the arm. Their mass changes by {after - before:+.4f} kg."
-    print_answer(console, answer, f"dvrk-drake export {_source(export.model, export.origin)} --diff")
-    if changes:
-        console.print(_mass_table(changes))
-    if changes and verbose:
-        console.print(_inertia_table(changes))
-        console.print()
+        blocks = [_mass_table(changes), _inertia_table(changes)]
     if bodies.rotors:
         rotors = ", ".join(f"{name} {inertia:.3g}" for name, inertia in bodies.rotors.items())
-        console.print(f"Reflected rotor inertias [kg m^2; kg if prismatic]: {rotors}", markup=False)
-    for remark in bodies.left_out:
-        console.print(f"Not exported: {remark}", markup=False)
+        blocks.append(Text(f"Reflected rotor inertias [kg m^2; kg if prismatic]: {rotors}"))
+    blocks += [Text(f"Not exported: {remark}") for remark in bodies.left_out]
+    command = f"dvrk-drake export {_source(export.model, export.origin)} --diff"
+    return Page(f"Exported model {path}", answer, [Section("Links", blocks)], "good", command)
 
 
 def _mass_table(changes: Sequence[LinkChange]) -> Table:
     """Returns a table with the mass and the centre of mass of each changed link."""
-    columns = ("mass, SDF [kg]", "mass [kg]", "centre of mass, SDF [mm]", "centre of mass [mm]")
-    table = make_table("Links in the SDF of the arm and in the exported file, in link frames", "", *columns)
+    rows = []
     for change in changes:
         bodies = [inertia.to_spatial_inertia() for inertia in (change.before, change.after)]
         masses = [f"{body.get_mass():.4f}" for body in bodies]
-        table.add_row(change.link, *masses, *(_place(body.get_com()) for body in bodies))
-    return table
+        rows.append((change.link, *masses, *(_place(body.get_com()) for body in bodies)))
+    header = ("", "mass, SDF [kg]", "mass [kg]", "centre of mass, SDF [mm]", "centre of mass [mm]")
+    caption = "Links in the SDF of the arm and in the exported file, in link frames"
+    return Table(header, rows, caption, right=[False, True, True, True, True])
 
 
 def _inertia_table(changes: Sequence[LinkChange]) -> Table:
-    title = "Principal moments of inertia about the centre of mass [kg cm^2]"
-    table = make_table(title, "", "SDF of the arm", "exported")
+    rows = []
     for change in changes:
         cells = []
         for inertia in (change.before, change.after):
@@ -94,88 +88,86 @@ def _inertia_table(changes: Sequence[LinkChange]) -> Table:
             about_centre = body.Shift(body.get_com()).CalcRotationalInertia()
             moments = about_centre.CalcPrincipalMomentsAndAxesOfInertia()[0]
             cells.append(" ".join(f"{1e4 * x:9.4f}" for x in moments))
-        table.add_row(change.link, *cells)
-    return table
+        rows.append((change.link, *cells))
+    caption = "Principal moments of inertia about the centre of mass [kg cm^2]"
+    return Table(("", "SDF of the arm", "exported"), rows, caption, show="details", right=[False, True, True])
 
 
 def _place(place: NDArray[np.float64]) -> str:
     return " ".join(f"{1e3 * x:+.1f}" for x in place)
 
 
-def _print_compensation(
-    console: Console, path: str, export: ModelExport, file: GravityCompensationFile, verbose: bool
-) -> None:
-    """Prints the largest differences between a written file and its model, and the torque limits of the file."""
+def _compensation_page(path: str, export: ModelExport, file: GravityCompensationFile) -> Page:
+    """Returns the largest differences between a written file and its model, and the torque limits of the file."""
     arm, loss = export.model.arm, compensation_loss(file, export.model)
-    next_step = f"dvrk-drake compare-gc {path} {_source(export.model, export.origin)}"
-    print_answer(console, _loss_text(loss), next_step)
-    table = make_table("Torques at rest [N m]", "", "difference*", "% of limit", "torque limits", "friction")
     friction = np.append((file.positive - file.negative)[10::5] / 2, 0.0)
+    rows, settings = [], []
     for j, name in enumerate(MTM_JOINTS):
         limits = f"{file.torque_lower[j]:+.4f}..{file.torque_upper[j]:+.4f}"
-        table.add_row(name, *_loss_cells(loss, j), limits, f"{friction[j]:.4f}")
-    console.print(table)
-    print_note(
-        console,
+        rows.append((name, *_loss_cells(loss, j), limits, f"{friction[j]:.4f}"))
+        settings.append((name, *(f"{x[j]:g}" for x in (file.friction_ratio, file.dead_band, file.saturation))))
+    note = (
         f"* largest difference between file and model at {POSES} random poses over the joint range, also in % of the "
-        "effort limit. Friction: dry friction that the file compensates during a motion.",
+        "effort limit. Friction: dry friction that the file compensates during a motion."
     )
-    _print_causes(console, loss)
-    if verbose:
-        table = make_table("Friction compensation", "", "ratio", "dead band [rad/s]", "saturation [rad/s]")
-        for j, name in enumerate(MTM_JOINTS):
-            table.add_row(name, *(f"{x[j]:g}" for x in (file.friction_ratio, file.dead_band, file.saturation)))
-        console.print(table)
-        console.print()
-    _print_disabled_joints(console, export.model, MTM_JOINTS)
+    header = ("", "difference*", "% of limit", "torque limits", "friction")
+    settings_header = ("", "ratio", "dead band [rad/s]", "saturation [rad/s]")
+    blocks: list[Block] = [
+        Table(header, rows, "Torques at rest [N m]", note),
+        *_causes(loss),
+        Table(settings_header, settings, "Friction compensation", show="details"),
+        *_disabled_joints(export.model, MTM_JOINTS),
+    ]
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
-        console.print(f"Joints whose torque limit equals the effort limit of the arm: {', '.join(short)}.")
-    _print_estimates(console, export)
+        blocks.append(Text(f"Joints whose torque limit equals the effort limit of the arm: {', '.join(short)}."))
     name = Path(path).name
-    console.print(f'Install: enter "gravity_compensation": "{name}" in the JSON file of the arm.', markup=False)
+    blocks += _estimates(export)
+    blocks.append(Text(f'Install: enter "gravity_compensation": "{name}" in the JSON file of the arm.', unwrapped=True))
     usual = f"gc-{arm.name}-"
     if not name.startswith(usual):
-        console.print(f"The usual name of the file is {usual}<serial number>.json.", markup=False)
+        blocks.append(Text(f"The usual name of the file is {usual}<serial number>.json."))
+    command = f"dvrk-drake compare-gc {path} {_source(export.model, export.origin)}"
+    return Page(f"Exported file {path}", _loss_text(loss), [Section("Torques", blocks)], "good", command)
 
 
-def _print_kinematic_compensation(
-    console: Console, path: str, export: ModelExport, file: KinematicCompensation, verbose: bool
-) -> None:
-    """Prints the largest differences from the model, and the links of the kinematic chain in the file."""
+def _kinematic_compensation_page(path: str, export: ModelExport, file: KinematicCompensation) -> Page:
+    """Returns the largest differences from the model, and the links of the kinematic chain in the file."""
     entries = f'"kinematic_gc": "{Path(path).name}", "mounting_pitch": {file.mounting_pitch:.6g}'
     where = "the arm's JSON" if export.configuration is None else f"{export.configuration}"
-    print_answer(console, _loss_text(file.loss), f"enter {entries} in {where}")
+    blocks: list[Block] = []
     if file.configured_pitch is not None:
         what = f"mounting_pitch of {export.configuration}, {file.configured_pitch:.6g} rad (0 if it is not stated)"
-        console.print(f"Compared with the {what}. The model requires {file.mounting_pitch:.6g}.\n", markup=False)
+        blocks.append(Text(f"Compared with the {what}. The model requires {file.mounting_pitch:.6g}."))
     locked = export.model.arm.locked_text
     columns = (f"with {locked}",) if locked else ("straight instrument", "change by a bent wrist")
-    title = "Largest difference from the model at rest, also in % of the effort limit"
-    table = make_table(title, "", "", columns[0], "%", *columns[1:])
-    for j, (name, wrist) in enumerate(zip(ARM_JOINTS, file.wrist, strict=True)):
-        cells = _loss_cells(file.loss, j)
-        table.add_row(name, file.loss.units[j], *cells, *([] if locked else [f"{wrist:.2g}"]))
-    console.print(table)
-    if locked:
-        print_note(console, "The torque for other positions of the instrument is not identified.")
-    else:
-        console.print()
-    _print_causes(console, file.loss)
-    if verbose:
-        table = make_table("Links of the chain, centre of mass in the DH frame", "", "mass [kg]", "x, y, z [mm]")
-        for name, mass, centre in zip(NAMES, file.mass, file.center, strict=True):
-            table.add_row(name, f"{mass:.4f}", " ".join(f"{1e3 * x:+8.2f}" for x in centre))
-        console.print(table)
-        console.print()
-    _print_disabled_joints(console, export.model, ARM_JOINTS)
-    _print_estimates(console, export)
+    rows = [
+        (name, file.loss.units[j], *_loss_cells(file.loss, j), *([] if locked else [f"{wrist:.2g}"]))
+        for j, (name, wrist) in enumerate(zip(ARM_JOINTS, file.wrist, strict=True))
+    ]
+    header = ("", "", columns[0], "%", *columns[1:])
+    caption = "Largest difference from the model at rest, also in % of the effort limit"
+    note = "The torque for other positions of the instrument is not identified." if locked else ""
+    links = [
+        (name, f"{mass:.4f}", " ".join(f"{1e3 * x:+8.2f}" for x in centre))
+        for name, mass, centre in zip(NAMES, file.mass, file.center, strict=True)
+    ]
+    chain = "Links of the chain, centre of mass in the DH frame"
+    blocks += [
+        Table(header, rows, caption, note),
+        *_causes(file.loss),
+        Table(("", "mass [kg]", "x, y, z [mm]"), links, chain, show="details", right=[False, True, True]),
+        *_disabled_joints(export.model, ARM_JOINTS),
+        *_estimates(export),
+    ]
+    next_step = f"enter {entries} in {where}"
+    return Page(f"Exported file {path}", _loss_text(file.loss), [Section("Torques", blocks)], "good", next_step)
 
 
-def _print_disabled_joints(console: Console, model: IdentifiedModel, names: Sequence[str]) -> None:
-    """Prints the joints of the file whose feedforward is disabled."""
-    if off := [joint.name for joint in model.joints if joint.name in names and joint.feedforward_scale == 0]:
-        console.print(f"The file applies no torque because the feedforward scale is 0: {', '.join(off)}.")
+def _disabled_joints(model: IdentifiedModel, names: Sequence[str]) -> list[Block]:
+    """Returns a text that names the joints of the file whose feedforward is disabled."""
+    off = [joint.name for joint in model.joints if joint.name in names and joint.feedforward_scale == 0]
+    return [Text(f"The file applies no torque because the feedforward scale is 0: {', '.join(off)}.")] if off else []
 
 
 def _loss_text(loss: CompensationLoss) -> str:
@@ -195,80 +187,128 @@ def _loss_cells(loss: CompensationLoss, j: int) -> tuple[str, str]:
     return f"{loss.difference[j]:.2g}", f"{100 * loss.share[j]:.2g}"
 
 
-def _print_causes(console: Console, loss: CompensationLoss) -> None:
-    """Prints the cause of the difference on each joint, and the pose of the largest difference."""
+def _causes(loss: CompensationLoss) -> list[Block]:
+    """Returns the cause of the difference on each joint, and the pose of the largest difference."""
+    blocks: list[Block] = []
     for cause in dict.fromkeys(filter(None, loss.causes)):
         joints = ", ".join(name for name, own in zip(loss.joints, loss.causes, strict=True) if own == cause)
-        console.print(f"Cause ({joints}): {cause}.", markup=False)
-    if any(loss.causes):
+        blocks.append(Text(f"Cause ({joints}): {cause}."))
+    if blocks:
         pose = " ".join(f"{x:.2f}" for x in loss.poses[loss.worst])
-        console.print(f"Pose of the largest difference ({loss.joints[loss.worst]}) [rad; m]: {pose}.\n", markup=False)
+        blocks.append(Text(f"Pose of the largest difference ({loss.joints[loss.worst]}) [rad; m]: {pose}."))
+    return blocks
 
 
-def _print_estimates(console: Console, export: ModelExport) -> None:
-    if export.model.provenance.method == "nominal":
-        console.print("The masses of the SDF are estimates. Identify your arm before you install a file.")
+def _estimates(export: ModelExport) -> list[Block]:
+    if export.model.provenance.method != "nominal":
+        return []
+    return [Text("The masses of the SDF are estimates. Identify your arm before you install a file.")]
 
 
-def print_comparison(
-    console: Console, file_name: str, model_name: str, comparison: CompensationComparison, *, verbose: bool = False
-) -> None:
-    """Prints the differences between a gravity-compensation file and a model.
+def compensation_page(comparison: CompensationComparison, *, file_name: str = "", model_name: str = "") -> Page:
+    """Returns the differences between a gravity-compensation file and a model.
 
     Args:
-        console: Console to print to.
-        file_name: Path of the file.
-        model_name: Path of the model, or name of the arm of a nominal model.
-        comparison: Comparison to print.
-        verbose: Whether to print the definitions of the columns and the ranges of the torques.
+        comparison: Comparison of the file with the model.
+        file_name: Path of the file. "": name of the arm in the file.
+        model_name: Path of the model, or name of the arm of a nominal model. "": source of the arm of the model.
     """
+    file_name = file_name or f"file of {comparison.file.arm_name}"
+    model_name = model_name or comparison.model.arm.source
     joints = comparison.joints
     difference = np.abs(comparison.clipped_torque - comparison.model_torque).max(axis=0)
     j = int(np.argmax(difference))
     faults = comparison.clipped | comparison.runaway | comparison.opposed
     marked = 100 * faults[:, : len(MTM_JOINTS) - 1].any(axis=1).mean()
-    print_answer(
-        console,
-        f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). Poses with a torque "
-        f"at limit, runaway or opposed: {marked:.3g} %.",
-        _next_step(comparison.model, model_name),
-        "yellow" if marked else "green",
-    )
-    table = make_table(
-        f"Torque of the file minus model [N m], {len(comparison.q)} random static poses",
-        *("", "largest", "RMS, in sweep", "RMS, outside", "at limit", "runaway", "opposed"),
-    )
+    rows, ranges = [], []
     for joint, largest in zip(joints, difference, strict=True):
         shares = (f"{100 * x:.0f} %" if x else "" for x in (joint.clipped, joint.runaway, joint.opposed))
-        table.add_row(joint.name, f"{largest:.3f}", _number(joint.rms_inside), _number(joint.rms_outside), *shares)
-    console.print(table)
-    if not verbose:
-        print_note(console, "--verbose explains these columns.")
-        return
-    console.print()
-    print_note(
-        console,
-        f"Sweep: joint positions of the recording from which the file was computed ({_sweep(comparison)}). At "
-        "limit, runaway, opposed: shares of the poses. At limit: the torque of the file is at a torque limit. Runaway: "
-        "without the torque limits, the torque of the file is outside the torque range of the model by more than half "
-        "of the width of this range. Opposed: the torques of file and model have opposite signs, and both exceed a "
-        "tenth of the largest torque of the model.",
+        rows.append((joint.name, f"{largest:.3f}", _number(joint.rms_inside), _number(joint.rms_outside), *shares))
+        bounds = ((joint.model_lower, joint.model_upper), (joint.file_lower, joint.file_upper))
+        ranges.append((joint.name, *(_range(*ends) for ends in (*bounds, (joint.clip_lower, joint.clip_upper)))))
+    sweep = "not stated in the file"
+    if comparison.file.sweep is not None:
+        sweep = f"contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
+    explanation = (
+        f"Sweep: joint positions of the recording from which the file was computed ({sweep}). At limit, runaway, "
+        "opposed: shares of the poses. At limit: the torque of the file is at a torque limit. Runaway: without the "
+        "torque limits, the torque of the file is outside the torque range of the model by more than half of the width "
+        "of this range. Opposed: the torques of file and model have opposite signs, and both exceed a tenth of the "
+        "largest torque of the model."
     )
-    table = make_table(f"Torque ranges [N m] of {file_name}, {model_name}", "", "model", "file before limits", "limits")
-    for joint in joints:
-        table.add_row(
-            joint.name,
-            _range(joint.model_lower, joint.model_upper),
-            _range(joint.file_lower, joint.file_upper),
-            _range(joint.clip_lower, joint.clip_upper),
-        )
-    console.print(table)
+    header = ("", "largest", "RMS, in sweep", "RMS, outside", "at limit", "runaway", "opposed")
+    caption = f"Torque of the file minus model [N m], {len(comparison.q)} random static poses"
+    limits = f"Torque ranges [N m] of {file_name}, {model_name}"
+    blocks: list[Block] = [
+        *(Text(f"{file_name}: {warning}.", "warning", show="page") for warning in comparison.warnings),
+        Table(header, rows, caption, right=[k > 0 for k in range(7)]),
+        Text("--verbose explains these columns.", show="brief"),
+        Text(explanation, show="details"),
+        Table(("", "model", "file before limits", "limits"), ranges, limits, show="details"),
+    ]
+    return Page(
+        f"{Path(file_name).name} compared with {model_name}",
+        f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). Poses with a torque "
+        f"at limit, runaway or opposed: {marked:.3g} %.",
+        [Section("Differences per joint", blocks), Section("Torque over position", [_compensation_plot(comparison)])],
+        "warning" if marked else "good",
+        _next_step(comparison.model, model_name),
+    )
 
 
-def _sweep(comparison: CompensationComparison) -> str:
-    if comparison.file.sweep is None:
-        return "not stated in the file"
-    return f"contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
+def _compensation_plot(comparison: CompensationComparison) -> Plot:
+    """Returns the torques over the position of each joint, and below them the share of poses with each problem."""
+    panels: list[Panel] = []
+    for first in range(0, _PANELS, 2):
+        pair = range(first, first + 2)
+        panels += [_torque_panel(comparison, comparison.joints[j], j) for j in pair]
+        panels += [_problem_panel(comparison, j) for j in pair]
+    caption = (
+        "static torque: mean (line) and range (band) over the positions of the other joints, and share of the poses "
+        "with each problem"
+    )
+    return Plot("compensation", caption, panels, columns=2)
+
+
+def _torque_panel(comparison: CompensationComparison, joint: JointComparison, j: int) -> Panel:
+    edges, centres, members = _position_bins(comparison, j)
+    marks: list[Mark] = []
+    if comparison.file.sweep is not None:
+        low, high = np.clip(comparison.file.sweep[:, j], edges[0], edges[-1])
+        marks.append(Guide("x", low, high, NEUTRAL, "positions in the recording of the file"))
+    torques: tuple[tuple[NDArray[np.float64], str, str, Style], ...] = (
+        (comparison.file_torque, REFERENCE, "file, without torque limits", "line"),
+        (comparison.model_torque, FITTED, "model", "dashed"),
+    )
+    for torque, colour, name, style in torques:
+        low, middle, high = (np.array([f(torque[m, j]) for m in members]) for f in (np.min, np.mean, np.max))
+        marks += [Band("", centres, low, high, colour), Curve(name, centres, middle, colour, style)]
+    for limit in (joint.clip_lower, joint.clip_upper):
+        marks.append(Guide("y", limit, None, LIMIT, "torque limits of the file"))
+    return Panel(f"J{j + 1} {joint.name}", marks, f"q{j + 1} [rad]", "torque [N m]", height=210)
+
+
+def _problem_panel(comparison: CompensationComparison, j: int) -> Panel:
+    _, centres, members = _position_bins(comparison, j)
+    flags = {"torque limit active": comparison.clipped, "opposite sign": comparison.opposed}
+    flags["runaway"] = comparison.runaway
+    curves = [
+        Curve(f"{name} (share of poses)", centres, [100 * float(flag[m, j].mean()) for m in members], SERIES[k])
+        for k, (name, flag) in enumerate(flags.items())
+    ]
+    return Panel("", curves, f"q{j + 1} [rad]", "poses [%]", y_range=(-3.0, 103.0), height=80)
+
+
+def _position_bins(
+    comparison: CompensationComparison, j: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.int_]]]:
+    """Returns the edges of all bins of q_j, the centres of the bins that contain poses, and the poses in each bin."""
+    q = comparison.q[:, j]
+    edges = np.linspace(q.min(), q.max(), _BINS + 1)
+    index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)
+    members = [np.flatnonzero(index == i) for i in range(_BINS)]
+    used = [i for i, m in enumerate(members) if len(m)]
+    return edges, (edges[:-1] + edges[1:])[used] / 2, [members[i] for i in used]
 
 
 def _range(lower: float, upper: float) -> str:

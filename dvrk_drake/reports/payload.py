@@ -1,12 +1,8 @@
-"""Prints an estimated payload to a terminal."""
+"""Page of an estimated payload."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from dvrk_drake.analysis.payload.payload import (
     CONFIDENCE,
@@ -17,20 +13,18 @@ from dvrk_drake.analysis.payload.payload import (
     equally_good_links,
 )
 from dvrk_drake.models.locked_joints import locked_option
-from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
+from dvrk_drake.reports.colours import FITTED, HELD_OUT
+from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
+from dvrk_drake.reports.plot import Dots, Style, category_panel
 
 
-def print_payload(
-    console: Console, result: PayloadIdentification, *, model_path: str | None = None, verbose: bool = False
-) -> None:
-    """Prints the mass and the link of the payload, then a table of mass and position with confidence intervals.
+def payload_page(result: PayloadIdentification, *, model_path: str | None = None) -> Page:
+    """Returns the page of an estimated payload.
 
     Args:
-        console: Console to print to.
-        result: Result to print.
+        result: Result of `dvrk_drake.payload`.
         model_path: Path of the model, for the suggested next command. None if the model was identified from the
             reference recording.
-        verbose: Whether to print the estimate for each link, and the efforts that the payload explains.
     """
     payload, estimates = result.payload, result.estimates
     others = equally_good_links(estimates) if result.link is None else better_links(payload, estimates)
@@ -44,76 +38,87 @@ def print_payload(
     elif payload.found and names:
         answer += f" A payload on {names[0]} explains the change of the efforts better."
     clear = payload.found and not names
-    command = (
-        f"--arm {result.model.arm.source}{locked_option(result.model.arm)}"
-        if model_path is None
-        else f"--model {model_path}"
-    )
+    arm = result.model.arm
+    source = f"--arm {arm.source}{locked_option(arm)}" if model_path is None else f"--model {model_path}"
     files = "REFERENCE LOADED" if result.has_reference else "LOADED"
-    command = f"dvrk-drake payload {files} {command} " + ("--json FILE" if clear else "--link LINK")
-    print_answer(console, answer, command, "green" if clear else "yellow")
-    if payload.found:
-        console.print(_estimate_table(payload))
+    estimate: list[Block] = [_estimate_table(payload)] if payload.found else []
     if not result.has_reference:
-        print_note(
-            console,
-            "The intervals contain the errors of the model. A recording of the same motion without the payload makes "
-            "them narrower.",
+        estimate.append(
+            Text(
+                "The intervals contain the errors of the model. A recording of the same motion without the payload "
+                "makes them narrower."
+            )
         )
-    if verbose:
-        console.print()
-        _print_links(console, estimates)
-        if payload.found:
-            _print_efforts(console, payload)
+    estimate += [Text(str(warning).removeprefix("warning: "), "warning", show="page") for warning in result.warnings]
+    return Page(
+        f"Payload of {arm.name}",
+        answer,
+        [
+            Section("Estimate", estimate),
+            Section("Links", [_link_plot(estimates, payload), _link_table(estimates)]),
+            *([Section("Efforts", [_effort_plot(payload), _effort_table(payload)])] if payload.found else []),
+        ],
+        "good" if clear else "warning",
+        f"dvrk-drake payload {files} {source} " + ("--json FILE" if clear else "--link LINK"),
+    )
 
 
 def _estimate_table(payload: Payload) -> Table:
-    columns = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
-    table = make_table(f"Payload on {payload.link}, position in the frame of the link", *columns)
-    rows = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
+    numbers = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
     for axis, x, error, base in zip(
         "xyz", payload.body.position, payload.position_error, payload.position_in_base, strict=True
     ):
-        rows.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
-    for k, (name, value, error, base) in enumerate(rows):
+        numbers.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
+    rows = []
+    for k, (name, value, error, base) in enumerate(numbers):
         if k and not payload.body.determined[k - 1]:
-            table.add_row(escape(name), "not determined", "", "", "")
+            rows.append((name, "not determined", "", "", ""))
             continue
         reach = payload.quantile * error
-        table.add_row(
-            escape(name), f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f}..{value + reach:+.4f}", base
-        )
-    return table
+        rows.append((name, f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f}..{value + reach:+.4f}", base))
+    header = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
+    caption = f"Payload on {payload.link}, position in the frame of the link"
+    return Table(header, rows, caption, right=[False, True, True, True, True])
 
 
-def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
-    """Prints the estimate for each link, best first."""
-    table = make_table("Estimates by link, best first", "", "error*", "mass [kg]", "+- [kg]", "")
-    table.columns[-1].justify = "left"
-    good = equally_good_links(estimates)
+def _link_table(estimates: Sequence[Payload]) -> Table:
+    """Returns the estimate for each link, best first."""
+    good, rows = equally_good_links(estimates), []
     for payload in estimates:
         note = "" if payload not in good else "best" if payload is estimates[0] else "equally good"
         mass, error = "none found", ""
         if payload.found:
             mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
-        error_share = f"{100 * payload.relative_error:.1f} %"
-        table.add_row(payload.link, error_share, mass, error, note if payload.found else "")
-    console.print(table)
-    print_note(
-        console,
+        share = f"{100 * payload.relative_error:.1f} %"
+        rows.append((payload.link, share, mass, error, note if payload.found else ""))
+    return Table(
+        ("", "error*", "mass [kg]", "+- [kg]", ""),
+        rows,
+        "Estimates by link, best first",
         "* whitened RMS error with payload / whitened RMS error without payload, cross-validated over the phase of the "
         "motion. Geometric mean over the actuators.",
+        show="details",
+        right=[False, True, True, True, False],
     )
 
 
-def _print_efforts(console: Console, payload: Payload) -> None:
-    table = make_table("RMS change of the efforts [N m; N]", "", "measured", "payload", "residual*", "explained")
-    for actuator in payload.actuators:
-        explained = "not loaded" if actuator.explained is None else f"{100 * actuator.explained:.1f} %"
-        numbers = (f"{x:.4f}" for x in (actuator.change, actuator.payload, actuator.left))
-        table.add_row(actuator.name, *numbers, explained)
-    console.print(table)
-    print_note(console, "* after subtraction of the efforts of the payload and of the changes of offsets and friction")
+def _effort_table(payload: Payload) -> Table:
+    rows = [
+        (
+            a.name,
+            *(f"{x:.4f}" for x in (a.change, a.payload, a.left)),
+            "not loaded" if a.explained is None else f"{100 * a.explained:.1f} %",
+        )
+        for a in payload.actuators
+    ]
+    return Table(
+        ("", "measured", "payload", "residual*", "explained"),
+        rows,
+        "RMS change of the efforts [N m; N]",
+        "* after subtraction of the efforts of the payload and of the changes of offsets and friction",
+        show="details",
+        right=[False, True, True, True, True],
+    )
 
 
 def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
@@ -127,3 +132,32 @@ def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
         return answer + "With this motion, a payload at the centre of mass of the link cannot be detected."
     largest = f"{1e3 * payload.largest_at_com:.3g} g ({100 * CONFIDENCE:.0f} %)"
     return answer + f"The mass of a payload at the centre of mass of the link is below {largest}."
+
+
+def _link_plot(estimates: Sequence[Payload], chosen: Payload) -> Plot:
+    """Returns the mass with its interval for a payload on each link on which one was found."""
+    dots = []
+    cases: tuple[tuple[str, Style, list[Payload]], ...] = (
+        (chosen.link, "diamonds", [chosen]),
+        ("other links", "circles", [payload for payload in estimates if payload is not chosen]),
+    )
+    for name, style, shown in cases:
+        mass = [p.body.mass if p.found else float("nan") for p in shown]
+        reach = [p.quantile * p.mass_error for p in shown]
+        low, high = ([m + sign * r for m, r in zip(mass, reach, strict=True)] for sign in (-1, 1))
+        dots.append(Dots(name, [p.link for p in shown], mass, FITTED, low, high, style))
+    label = f"mass with {100 * CONFIDENCE:.0f} % interval [kg]"
+    caption = "Mass of a payload on each link; no dot: no payload found"
+    return Plot("links", caption, [category_panel("", dots, label)])
+
+
+def _effort_plot(payload: Payload) -> Plot:
+    """Returns the effort of the payload and the residual, as shares of the RMS change of the efforts."""
+    moved = [a for a in payload.actuators if a.change]
+    names = [a.name for a in moved]
+    dots = [
+        Dots("payload", names, [100 * a.payload / a.change for a in moved], FITTED),
+        Dots("residual", names, [100 * a.left / a.change for a in moved], HELD_OUT, style="diamonds"),
+    ]
+    panel = category_panel("", dots, "RMS effort / RMS change of the effort [%]")
+    return Plot("efforts", f"Share of the change that a payload on {payload.link} explains", [panel])

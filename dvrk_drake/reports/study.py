@@ -1,67 +1,84 @@
-"""Prints the summary of a study to a terminal."""
+"""Page of a study: shares with intervals, and distributions of the measures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
-from rich.console import Console
+import numpy as np
 
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Study
-from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
+from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise, values_of
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
+from dvrk_drake.reports.colours import SERIES
+from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
+from dvrk_drake.reports.plot import Curve, Dots, Panel, category_panel
 
-#: Maximum number of variations in the first sentence, and of failed runs that are printed without `verbose`.
+#: Maximum number of variations in the answer, and of failed runs that a terminal lists without --verbose.
 _MAX_COUNT = 3
 
 
-def print_study(
-    console: Console, study: Study, rows: Mapping[int, Row], *, study_path: str | None = None, verbose: bool = False
-) -> None:
-    """Prints the values of the first measure, then those of all measures, and the error messages of failed runs.
+def study_page(study: Study, rows: Mapping[int, Row], *, study_path: str | None = None) -> Page:
+    """Returns the page of a study.
 
     Args:
-        console: Console to print to.
-        study: Study to summarize.
+        study: Study.
         rows: Mapping from the number of a case to its results.
-        study_path: Path of the study, for the suggested next command. None if the command has already written figures.
-        verbose: Whether to print all failed runs.
+        study_path: Path of the study, for the suggested next command. None if the figures were already written.
     """
     summaries = summarise(study, rows)
-    failed = [case for case in study.cases if case.index in rows and rows[case.index].error]
+    failed = [(c.index, c.variation, c.pose, c.seed, rows[c.index].error) for c in study.cases if _error(c.index, rows)]
     first = study.measures[0]
     found = "; ".join(f"{s.variation}: {_headline(first, s, study.arm)}" for s in summaries[:_MAX_COUNT])
-    answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
-    command = study_path and f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
-    print_answer(console, answer, command, "yellow" if failed else "green")
-    table = make_table(
-        f"{study.arm.name}, {len(rows)} runs",
-        *("", "variation", "share or median", "95 % interval or percentile", "largest"),
-    )
-    table.columns[1].justify, table.columns[1].no_wrap = "left", False
-    for measure in study.measures:
-        for k, summary in enumerate(summaries):
-            table.add_row(measure.column if k == 0 else "", summary.variation, *_cells(measure, summary, study.arm))
-    console.print(table)
-    console.print()
+    blocks: list[Block] = [_summary_table(study, rows, summaries)]
     if failed:
-        print_note(console, "A run that failed counts as the worst result.")
-    if verbose:
-        print_note(
-            console,
+        blocks.append(Text("A run that failed counts as the worst result."))
+    blocks.append(
+        Text(
             "Yes-or-no measures: share of the runs, and the 95 % Wilson interval for independent runs. Other measures: "
             "median and 95th percentile of the runs.",
+            show="details",
         )
+    )
     if len(study.seeds) > 1:
-        print_note(
-            console, "The intervals are too narrow, because runs with different seeds at one pose are not independent."
+        blocks.append(
+            Text("The intervals are too narrow, because runs with different seeds at one pose are not independent.")
         )
-    for case in failed if verbose else failed[:_MAX_COUNT]:
-        text = f"case {case.index}, {case.variation}, pose {case.pose}, seed {case.seed}: {rows[case.index].error}"
-        console.print(text, style="yellow", markup=False)
-    if not verbose and len(failed) > _MAX_COUNT:
-        console.print(f"{len(failed) - _MAX_COUNT} more runs failed. --verbose lists them.", style="yellow")
+    for k, (index, variation, pose, seed, error) in enumerate(failed):
+        text = f"case {index}, {variation}, pose {pose}, seed {seed}: {error}"
+        blocks.append(Text(text, "warning", show="details" if k >= _MAX_COUNT else "always", unwrapped=True))
+    if len(failed) > _MAX_COUNT:
+        blocks.append(Text(f"{len(failed)} runs failed. --verbose lists all.", "warning", show="brief"))
+    panels = [_panel(measure, study, rows, summaries) for measure in study.measures]
+    caption = (
+        f"Results of {len(rows)} runs. Shares with 95 % Wilson interval. Cumulative shares are better if they rise "
+        "further left"
+    )
+    return Page(
+        f"Study of {study.arm.name}, scenario {study.scenario}",
+        f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed.",
+        [
+            Section("Results", blocks),
+            Section("Distributions", [Plot("study", caption, panels, columns=min(2, len(panels)))]),
+        ],
+        "warning" if failed else "good",
+        f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER" if study_path else "",
+    )
+
+
+def _error(index: int, rows: Mapping[int, Row]) -> str:
+    return rows[index].error if index in rows else ""
+
+
+def _summary_table(study: Study, rows: Mapping[int, Row], summaries: Sequence[Summary]) -> Table:
+    cells = [
+        (measure.column if k == 0 else "", summary.variation, *_cells(measure, summary, study.arm))
+        for measure in study.measures
+        for k, summary in enumerate(summaries)
+    ]
+    header = ("measure", "variation", "share or median", "95 % interval or percentile", "largest")
+    return Table(header, cells, f"{study.arm.name}, {len(rows)} runs")
 
 
 def _headline(measure: Measure, summary: Summary, arm: Arm) -> str:
@@ -79,3 +96,47 @@ def _cells(measure: Measure, summary: Summary, arm: Arm) -> list[str]:
     return [
         f"{number:.4g} {measure.unit(arm)}".strip() for number in (value.median, value.percentile_95, value.largest)
     ]
+
+
+def _panel(measure: Measure, study: Study, rows: Mapping[int, Row], summaries: Sequence[Summary]) -> Panel:
+    if measure.is_boolean:
+        return _share_panel(measure, summaries)
+    curves, smallest, infinite = [], math.inf, 0
+    for i, variation in enumerate(study.variations):
+        cases = [c for c in study.cases if c.variation == variation.name and c.index in rows]
+        values = values_of(measure, [rows[c.index] for c in cases])
+        order = np.argsort(values)
+        share = 100 * np.arange(1, len(values) + 1) / max(len(values), 1)
+        finite = np.isfinite(values[order])  # the curve ends below 100 % if values are infinite
+        infinite += int(np.count_nonzero(~finite))
+        smallest = min(smallest, values.min(initial=math.inf))
+        x, y = values[order][finite], share[finite]
+        texts = [
+            f"{a:.4g}, {b:.1f} % of the runs, case {cases[k].index}, pose {cases[k].pose}"
+            for a, b, k in zip(x, y, order[finite], strict=True)
+        ]
+        curves.append(Curve(variation.name, x, y, SERIES[i % len(SERIES)], "step", texts))
+    unit = measure.unit(study.arm)
+    return Panel(
+        _title(measure) + (f", {infinite} of {len(rows)} are infinite" if infinite else ""),
+        curves,
+        f"{measure.kind.replace('_', ' ')} [{unit}]" if unit else "effort / effort limit [1]",
+        "cumulative share of runs [%]",
+        y_range=(-3.0, 103.0),
+        log_x=bool(unit) and 0 < smallest < math.inf,
+        height=240,
+    )
+
+
+def _share_panel(measure: Measure, summaries: Sequence[Summary]) -> Panel:
+    dots = []
+    for i, summary in enumerate(summaries):
+        share = summary.measures[measure.column]
+        assert isinstance(share, Share)
+        value, low, high = (100 * x for x in (share.count / share.runs, share.lower, share.upper))
+        dots.append(Dots("", [summary.variation], [value], SERIES[i % len(SERIES)], [low], [high]))
+    return category_panel(_title(measure), dots, "share of runs [%]", x_range=(-3.0, 103.0))
+
+
+def _title(measure: Measure) -> str:
+    return measure.title[0].upper() + measure.title[1:]

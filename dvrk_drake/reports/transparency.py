@@ -1,4 +1,4 @@
-"""Prints the interaction force at the handle of an arm, and writes it to a file."""
+"""Page of the interaction force at the handle of an arm, and a CSV file with its values."""
 
 from __future__ import annotations
 
@@ -6,51 +6,85 @@ import csv
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
+import numpy as np
 
 from dvrk_drake.experiments.transparency import GRASP_TIME, OperatorForces
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
+from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
+from dvrk_drake.reports.plot import Curve, Panel, series
 
 
-def print_transparency(console: Console, arm: Arm, forces: Sequence[OperatorForces], *, verbose: bool = False) -> None:
-    """Prints the compensation with the smallest interaction force, then the forces and torques with each compensation.
+def transparency_page(arm: Arm, forces: Sequence[OperatorForces]) -> Page:
+    """Returns the page of simulated interaction forces.
 
     Args:
-        console: Console to print to.
         arm: Simulated arm.
         forces: One result per compensation. The first is without compensation.
-        verbose: Whether to print the definition of the numbers.
     """
     best, without = min(forces, key=lambda one: one.rms_force), forces[0]
     answer = f"Smallest interaction force at the handle: {best.rms_force:.2f} N RMS with {best.name}"
     answer += "." if best is without else f", {without.rms_force:.2f} N without compensation."
-    print_answer(console, answer, f"dvrk-drake transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER")
-    headings = ("RMS force [N]", "95 % force [N]", "RMS torque [mN m]", "95 % torque [mN m]", "largest deviation [mm]")
-    title = f"{arm.name}, simulated: interaction force and torque at the handle during {forces[0].time[-1]:.3g} s"
-    table = make_table(title, "compensation", *headings)
+    note = Text(
+        "95 %: 95th percentile over time. Deviation: distance of the handle from the path of the hand. "
+        f"The first {GRASP_TIME:g} s are excluded.",
+        show="details",
+    )
+    return Page(
+        f"Transparency of {arm.name}, simulated",
+        answer,
+        [Section("Interaction force and torque", [forces_table(arm, forces), note, forces_plot(forces)])],
+        "good",
+        f"dvrk-drake transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER",
+    )
+
+
+def forces_table(arm: Arm, forces: Sequence[OperatorForces]) -> Table:
+    """Returns force, torque and deviation with each compensation."""
     scales, formats = (1, 1, 1e3, 1e3, 1e3), (".2f", ".2f", ".0f", ".0f", ".1f")
+    rows = []
     for one in forces:
-        name = "none" if one is without else one.name
         values = zip(_numbers(one).values(), scales, formats, strict=True)
-        table.add_row(name, *(f"{scale * value:{form}}" for value, scale, form in values))
-    console.print(table)
-    if verbose:
-        console.print()
-        print_note(
-            console,
-            "95 %: 95th percentile over time. Deviation: distance of the handle from the path of the hand. "
-            f"The first {GRASP_TIME:g} s are excluded.",
-        )
+        rows.append((_name(one, forces), *(f"{scale * value:{form}}" for value, scale, form in values)))
+    return Table(
+        (
+            "compensation",
+            "RMS force [N]",
+            "95 % force [N]",
+            "RMS torque [mN m]",
+            "95 % torque [mN m]",
+            "largest deviation [mm]",
+        ),
+        rows,
+        f"{arm.name}, simulated: interaction force and torque at the handle during {forces[0].time[-1]:.3g} s",
+    )
+
+
+def forces_plot(forces: Sequence[OperatorForces]) -> Plot:
+    """Returns the magnitudes of force and torque over time, after the initial transient of the grasp."""
+    panels = []
+    quantities = (("force", "N", 1.0), ("torque", "mN m", 1e3))
+    for row, (quantity, unit, scale) in enumerate(quantities):
+        curves = []
+        for i, one in enumerate(forces):
+            late = one.time >= GRASP_TIME
+            size = scale * np.linalg.norm((one.force, one.torque)[row][late], axis=1)
+            curves.append(Curve(_name(one, forces), one.time[late], size, **series(i)))
+        panels.append(Panel("", curves, "time [s]" if row else "", f"{quantity} [{unit}]", height=220, x_ticks=row > 0))
+    caption = f"Magnitude of interaction force and torque at the handle, from {GRASP_TIME:g} s on"
+    return Plot("transparency", caption, panels)
 
 
 def write_transparency(path: Path, forces: Sequence[OperatorForces]) -> None:
-    """Writes a CSV file with the values of `print_transparency` in SI units. Replaces the file atomically."""
+    """Writes a CSV file with the values of the page in SI units. Replaces the file atomically."""
     with atomic_write(path) as stream:
         rows = csv.writer(stream, lineterminator="\n")
         rows.writerow(["compensation", *_numbers(forces[0])])
         rows.writerows([one.name, *(f"{value:.6g}" for value in _numbers(one).values())] for one in forces)
+
+
+def _name(one: OperatorForces, forces: Sequence[OperatorForces]) -> str:
+    return "none" if one is forces[0] else one.name
 
 
 def _numbers(forces: OperatorForces) -> dict[str, float]:

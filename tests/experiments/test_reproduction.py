@@ -46,7 +46,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.reports.reproduction import run
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5
 from dvrk_drake.reports.reproduction.mechanisms import reproduce_table_1

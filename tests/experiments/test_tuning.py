@@ -1,14 +1,13 @@
 """Tuning: gains of joints with known equations, gains files, and invalid input."""
 
 import dataclasses
-import io
 from functools import partial
 
 import numpy as np
 import pytest
 from command_output import refusal
 from figure_rules import checked_figures
-from rich.console import Console
+from report_pages import printed
 from scipy.optimize import brentq
 
 from dvrk_drake.cli import main
@@ -47,8 +46,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains, load_gains, save_gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffect
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.reports.figures.tuning import plot_steps
-from dvrk_drake.reports.tuning import print_tuning
+from dvrk_drake.reports.image_files import write_images
+from dvrk_drake.reports.tuning import tuning_page
 from dvrk_drake.workers import local_executor
 
 #: The second-order approximation of the lags is valid only far below 1 / (9 ms).
@@ -404,10 +403,8 @@ def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
     settling = tuning.comparison.table("model", "settling")
     assert np.all(np.isfinite(settling))
     assert tuning.found == {"model": tuning.design.gains}
-    console = Console(record=True, width=120, file=io.StringIO())
-    print_tuning(console, tuning, verbose=True)
-    printed = console.export_text()
-    assert all(name in printed for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
+    text = printed(tuning_page(tuning), verbose=True)
+    assert all(name in text for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
     with checked_figures(monkeypatch):
-        plot_steps(tmp_path / "steps.png", tuning.comparison)
+        write_images(tuning_page(tuning), tmp_path)
     assert (tmp_path / "steps.png").stat().st_size > 10_000

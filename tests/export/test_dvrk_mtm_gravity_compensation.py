@@ -27,7 +27,8 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensa
 from dvrk_drake.export.gravity_compensation_loss import LEAST_TOLERANCE, accepted_differences
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.reports.figures.export import plot_compensation
+from dvrk_drake.reports.export import compensation_page
+from dvrk_drake.reports.image_files import write_images
 
 pytestmark = pytest.mark.slow
 
@@ -409,9 +410,8 @@ def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path, monkeypatc
     )
     opposed = compare_compensation(mirrored, model).joints
     assert opposed[1].opposed > 0.8 and opposed[4].opposed > 0.5
-    path = tmp_path / "plot.png"
     with checked_figures(monkeypatch):
-        plot_compensation(path, found, "test")
+        (path,) = write_images(compensation_page(found), tmp_path)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 import pytest
 from guard_bench import ARM
 from guarded_arm import GuardedArm
+from report_pages import printed
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -14,8 +15,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_operator import observe, reset_fault, stop_arm
 from dvrk_drake.processes.control import first_status
-from dvrk_drake.reports.arm_status import print_status
-from dvrk_drake.reports.terminal_tables import make_console
+from dvrk_drake.reports.arm_status import status_page
 
 ALL_MODES = (Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT)
 
@@ -123,15 +123,14 @@ def ignored(link):
         (ignored, "MTML: hold, messages are ignored: ", "give the arm's key to the controller"),
     ],
 )
-def test_status_explains_an_arm_that_does_not_move(prepare, why, next_step, capsys):
+def test_status_explains_an_arm_that_does_not_move(prepare, why, next_step):
     link = GuardedArm(ALL_MODES)
     prepare(link)
-    print_status(make_console(), ARM, observe(link))
-    text = " ".join(capsys.readouterr().out.split())
+    text = " ".join(printed(status_page(ARM, observe(link))).split())
     assert why in text and f"Next: {next_step}" in text.replace("look at the arm, remove the cause, then: ", "")
 
 
-def test_status_shows_controller_and_limits(controlled, capsys):
+def test_status_shows_controller_and_limits(controlled):
     link, control = controlled
     link.before_step = lambda: None
     first = observe(link, 0.001).last
@@ -139,8 +138,7 @@ def test_status_shows_controller_and_limits(controlled, capsys):
         control()
     seen = observe(link, 0.001)
     assert seen.last.num_accepted == first.num_accepted + 100
-    print_status(make_console(), ARM, seen)
-    text = capsys.readouterr().out
+    text = printed(status_page(ARM, seen))
     assert all(name in text for name in ARM.joint_names) and " 5 %" in text
 
 

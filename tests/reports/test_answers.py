@@ -1,4 +1,4 @@
-"""Tests of the terminal reports: answer, next step, then tables of at most 80 columns."""
+"""Pages in a terminal: answer, next step, then tables of at most 80 columns."""
 
 import os
 import re
@@ -23,15 +23,15 @@ from dvrk_drake.reports import (
     demo,
     export,
     identification,
-    model,
-    payload,
     recording_check,
     simulation,
-    study,
-    transparency,
-    tuning,
 )
-from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
+from dvrk_drake.reports.model import symbolic_model_page
+from dvrk_drake.reports.payload import payload_page
+from dvrk_drake.reports.study import study_page
+from dvrk_drake.reports.terminal import TABLE_WIDTH, TableConsole, print_page
+from dvrk_drake.reports.transparency import transparency_page
+from dvrk_drake.reports.tuning import tuning_page
 
 pytestmark = pytest.mark.slow
 
@@ -75,7 +75,7 @@ def exported(console, verbose, model, name, **options):
         os.chdir(folder)
         try:
             written = dvrk.export_model(model, name, origin="model.yaml", **options)
-            export.print_export(console, name, written, verbose=verbose)
+            print_page(console, export.export_page(name, written), verbose=verbose)
         finally:
             os.chdir(before)
 
@@ -86,30 +86,21 @@ def compared(console, verbose):
         dvrk.export_model(identified, f"{folder}/gc.json", "dvrk-gc", tolerance=1.0)
         file = GravityCompensationFile.load(f"{folder}/gc.json")
     file.torque_upper[1] = 0.3
-    export.print_comparison(console, "gc.json", "model.yaml", compare_compensation(file, identified), verbose=verbose)
+    found = compare_compensation(file, identified)
+    page = export.compensation_page(found, file_name="gc.json", model_name="model.yaml")
+    print_page(console, page, verbose=verbose)
 
 
 def checked(console, verbose, **changes):
     reference = motions()[0]
     report = dvrk.check(replace(reference, **changes), dvrk.load_arm("psm"))
-    recording_check.print_report(console, report, source="--arm psm", verbose=verbose)
+    print_page(console, recording_check.check_page(report, source="--arm psm"), verbose=verbose)
 
 
 def simulated(console, verbose, settings):
     scenario = dvrk.load_scenario("psm", ["duration=0.1", *settings])
-    simulation.print_simulation(console, dvrk.simulate(scenario), scenario.mounted_arm, scenario="psm", verbose=verbose)
-
-
-def studied(console, verbose):
-    study.print_study(console, *study_results(), study_path="study.yaml", verbose=verbose)
-
-
-def tuned(console, verbose):
-    tuning.print_tuning(console, tuning_result(), verbose=verbose)
-
-
-def forces(console, verbose):
-    transparency.print_transparency(console, *operator_forces(), verbose=verbose)
+    page = simulation.simulation_page(dvrk.simulate(scenario), scenario.mounted_arm, scenario="psm")
+    print_page(console, page, verbose=verbose)
 
 
 def demonstrated(console, verbose):
@@ -126,7 +117,7 @@ def demonstrated(console, verbose):
         nominal=0.5 * q,
         descent=0.005,
     )
-    demo.print_demo(console, result, Path("demo_output"), verbose=verbose)
+    print_page(console, demo.demo_page(result, Path("demo_output")), verbose=verbose)
 
 
 VERDICT = r"Verdict: (good|usable|do not use) ?[(.]"
@@ -155,11 +146,11 @@ CASES = {
     ),
     "payload": (
         r"Payload: 0\.\d{4} \+- 0\.\d{4} kg on \w+\.",
-        lambda c, v: payload.print_payload(c, payloads(), verbose=v),
+        lambda c, v: print_page(c, payload_page(payloads()), verbose=v),
     ),
     "payload, none": (
         r"No payload found on insertion_link",
-        lambda c, v: payload.print_payload(c, on_insertion_link(payloads()), model_path="m.yaml", verbose=v),
+        lambda c, v: print_page(c, payload_page(on_insertion_link(payloads()), model_path="m.yaml"), verbose=v),
     ),
     "export SDF": (r"\d+ links differ", lambda c, v: exported(c, v, poses()[0].model, "out.sdf")),
     "export URDF": (r"\d+ links differ", lambda c, v: exported(c, v, motions()[2].model, "out.urdf")),
@@ -183,19 +174,30 @@ CASES = {
         r"Largest motion from the start \S+ \w+ \(\w+\)",
         lambda c, v: simulated(c, v, ["controller.mode=gravity"]),
     ),
-    "study": (r"held exact: \d+ of 12 runs; another one: \d+ of 12 runs\.", studied),
-    "tune": (r"Gains of method model are better than the arm's own: ", tuned),
-    "transparency": (r"Smallest interaction force at the handle: \d+\.\d\d N RMS with model A, friction 0\.5", forces),
+    "study": (
+        r"held exact: \d+ of 12 runs; another one: \d+ of 12 runs\.",
+        
+        lambda c, v: print_page(c, study_page(*study_results(), study_path="s"), verbose=v),
+    ,
+    ),
+    "tune": (
+        r"Gains of method model are better than the arm's own: ",
+        lambda c, v: print_page(c, tuning_page(tuning_result()), verbose=v),
+    ),
+    "transparency": (
+        r"Smallest interaction force at the handle: \d+\.\d\d N RMS with model A, friction 0\.5",
+        lambda c, v: print_page(c, transparency_page(*operator_forces()), verbose=v),
+    ),
     "demo": ("Verdict: the identified model holds the released MTML for 2 s. Largest drift: 10.0 mrad", demonstrated),
     "teleop": (
         r"The tip follows the handle within 0\.500 mm",
-        lambda c, v: demo.print_teleoperation(
-            c, TeleoperationResult(1.2, 1e-4, 5e-4, 1e-3, 2e-3, 1e-6), "page.html", verbose=v
+        lambda c, v: print_page(
+            c, demo.teleoperation_page(TeleoperationResult(1.2, 1e-4, 5e-4, 1e-3, 2e-3, 1e-6), "page.html"), verbose=v
         ),
     ),
     "model": (
         r"The gravity torque of MTML depends on 12 base parameters\.",
-        lambda c, v: model.print_symbolic_model(c, derive_gravity(dvrk.load_arm("mtml")), verbose=v),
+        lambda c, v: print_page(c, symbolic_model_page(derive_gravity(dvrk.load_arm("mtml"))), verbose=v),
     ),
 }
 

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from dvrk_drake.reports.figures.colours import ROLES, SERIES
+from dvrk_drake.reports.colours import ROLES, SERIES
 
 #: Linear RGB of a colour -> linear RGB that a deuteranope sees as the same colour. Machado, Oliveira and
 #: Fernandes (2009), "A physiologically-based model for simulation of color vision deficiency", severity 1.0.

@@ -1,7 +1,5 @@
 """Figures of identifications, validations and simulations keep the rules of the style, and show what they state."""
 
-import dataclasses
-
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -11,10 +9,10 @@ from matplotlib.collections import LineCollection
 from dvrk_drake.analysis.dynamic.validation import ActuatorError, DynamicValidation, ErrorShares
 from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.simulation import Simulation, scenario_of_arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.figures import colours, identification, motion, simulation
+from dvrk_drake.reports import colours
+from dvrk_drake.reports.figures import identification, motion
 from dvrk_drake.reports.figures.style import WIDTH, add_legend, panel_grid, set_title
 
 MTM = load_arm("mtml")
@@ -99,27 +97,6 @@ def test_outliers_do_not_determine_the_range_of_a_panel(monkeypatch, tmp_path):
     for ax in panels:  # all points are inside the axes
         for line in ax.lines:
             assert np.all(line.get_xdata() >= ax.get_xlim()[0]) and np.all(line.get_xdata() <= ax.get_xlim()[1])
-
-
-def test_simulation_shows_position_error_effort_and_disturbance(monkeypatch, tmp_path):
-    scenario = scenario_of_arm(MTM, False, np.zeros(7), ())
-    scenario.mounted_arm = MTM
-    t, generator = np.arange(11) / 100, np.random.default_rng(0)
-    q, noise = 0.1 * np.sin(t[:, None] + np.arange(7)), 1e-3 * generator.normal(size=(11, 7))
-    hand = np.zeros((11, 6))
-    hand[3:6] = 1.0
-    recording = Recording(q=q + noise, qd=np.gradient(q, t, axis=0), tau=0.1 * q, t=t)
-    done = Simulation(recording, np.hstack([q, q]), hand, desired=q)
-    with checked_figures(monkeypatch) as figures:
-        simulation.plot_simulation(tmp_path / "a.png", done, scenario)
-        simulation.plot_simulation(tmp_path / "b.png", dataclasses.replace(done, desired=None), scenario)
-    assert len(figures[1].axes) == 2 * 7  # no errors without desired positions
-    axes = figures[0].axes
-    assert len(axes) == 3 * 7
-    assert [ax.get_ylabel().split(" [")[0] for ax in axes[:3]] == ["position", "error", "effort"]
-    assert all(np.ptp(ax.get_ylim()) >= 0.0199 for ax in axes[::3])
-    assert any("disturbance" in text.get_text() for text in figures[0].legends[0].get_texts())
-    assert colours_of(figures[0])["measured position and effort"] == colours.MEASURED
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,8 @@
 
 import pytest
 
-from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, make_console, make_table
+from dvrk_drake.reports.page import Page, Section, Table
+from dvrk_drake.reports.terminal import TABLE_WIDTH, make_console, print_page
 
 NAME = "L4 (m4+...+m7) + m3 c3z + m4 c4y + m_crank c_crank_y"
 CELLS = (NAME, "-0.0371 .. +0.0514", "+0.01277", "0.00303", "kg m^2")
@@ -13,10 +14,12 @@ def printed(capsys, monkeypatch, columns):
         monkeypatch.delenv("COLUMNS", raising=False)
     else:
         monkeypatch.setenv("COLUMNS", str(columns))
-    table = make_table("Estimates", "", "clip [N m]", "dead band [rad/s]", "standard error", "saturation [rad/s]")
-    table.add_row(*CELLS)
-    make_console().print(table)
-    return capsys.readouterr().out.splitlines()
+    header = ("", "clip [N m]", "dead band [rad/s]", "standard error", "saturation [rad/s]")
+    table = Table(header, [CELLS], "Estimates", right=[False, True, True, True, True])
+    print_page(make_console(), Page("", "answer", [Section("", [table])]))
+    answer, empty, *lines = capsys.readouterr().out.splitlines()
+    assert answer == "answer" and not empty
+    return lines
 
 
 @pytest.mark.parametrize("columns", [64, 80, 100, 120, None])

@@ -94,8 +94,10 @@ def open_page(chromium_browser: Any) -> Iterator[Callable[..., OpenedPage]]:
     """Function that opens a file or URL in a window of a given size [px], and returns an `OpenedPage`."""
     contexts = []
 
-    def open_in_window(location: Path | str, width: int = 1280, height: int = 800) -> OpenedPage:
-        context = chromium_browser.new_context(viewport={"width": width, "height": height})
+    def open_in_window(
+        location: Path | str, width: int = 1280, height: int = 800, color_scheme: str = "light"
+    ) -> OpenedPage:
+        context = chromium_browser.new_context(viewport={"width": width, "height": height}, color_scheme=color_scheme)
         contexts.append(context)
         opened = OpenedPage(context.new_page())
         opened.page.set_default_timeout(TIME_LIMIT)

@@ -6,7 +6,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from dvrk_drake.reports.figures.style import DPI, SMALLEST_TEXT, WIDTH
+from dvrk_drake.reports.image_files import DPI, SMALLEST_TEXT, WIDTH
 
 #: Axis labels of quantities without a unit in brackets.
 WITHOUT_UNIT = ("",)

@@ -5,23 +5,36 @@ import subprocess
 #: Boxes of a report that must not overlap: text, tables, plots, 3D views, and the text inside plots.
 BOXES = "nav, h1, h2, p, figcaption, summary, table, iframe, .canvas, .player, .line"
 PLOT_TEXT = ".canvas text"
+_VISIBLE = "[...document.querySelectorAll('.canvas')].filter((plot) => plot.checkVisibility())"
+#: Whether all visible plots have the width of their elements.
+FITS = f"{_VISIBLE}.every((plot) => Math.abs(plot._fullLayout.width - plot.clientWidth) <= 1)"
+#: Captions of the tables that are wider than the page.
+CUT = """[...document.querySelectorAll(".scroll")].filter((one) => one.scrollWidth > one.clientWidth + 1)
+  .map((one) => one.parentElement.textContent.slice(0, 60))"""
+
+
+#: Widths [px] and colours at which a report is checked.
+VIEWS = ((1920, "light"), (800, "light"), (1280, "dark"))
 
 
 def check_report(open_page, path):
-    """Opens a report at both sizes and checks it.
+    """Opens a report in all `VIEWS` and checks it.
 
-    Checks errors, requests, overlaps, the width of the page, the smallest text of the plots, the size of the file, and
-    the headings of the printed page.
+    Checks errors, requests, overlaps, cut tables, the width of the page, the smallest text of the plots, the size of
+    the file, and the headings of the printed page. All sections and tables are opened.
 
     Returns:
         The page, 1280 px wide.
     """
-    for width in (1920, 1280):
-        opened = open_page(path, width=width)
+    for width, colours in VIEWS:
+        opened = open_page(path, width=width, color_scheme=colours)
         opened.wait_for("document.documentElement.dataset.ready === 'yes'")
+        opened.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        opened.wait_for(FITS)
         assert not opened.errors and not opened.requests
         assert not opened.overlaps(BOXES)
         assert not opened.overlaps(PLOT_TEXT)
+        assert not opened.page.evaluate(CUT), f"a table is cut at {width} px"
         assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "must not scroll sideways"
         sizes = opened.page.evaluate(
             "[...document.querySelectorAll('.canvas text')].map((text) => parseFloat(getComputedStyle(text).fontSize))"
@@ -38,14 +51,12 @@ def check_report(open_page, path):
 
 def check_resized(opened):
     """Checks that visible plots keep their height when the window is resized, also in print and afterwards."""
-    visible = "[...document.querySelectorAll('.canvas')].filter((plot) => plot.checkVisibility())"
-    heights = f"""{visible}.map(
+    heights = f"""{_VISIBLE}.map(
       (plot) => [plot.clientHeight, plot.querySelector('.main-svg').clientHeight, plot._fullLayout.height])"""
-    fits = f"{visible}.every((plot) => Math.abs(plot._fullLayout.width - plot.clientWidth) <= 1)"
     before = opened.page.evaluate(heights)
     assert all(len(set(plot)) == 1 for plot in before)
     opened.page.set_viewport_size({"width": 1400, "height": 800})
-    opened.wait_for(fits)
+    opened.wait_for(FITS)
     assert opened.page.evaluate(heights) == before
     opened.page.evaluate("dispatchEvent(new Event('beforeprint'))")
     printed = opened.page.evaluate(heights)
@@ -53,7 +64,7 @@ def check_resized(opened):
     assert len(printed) >= len(before) and all(len(set(plot)) == 1 and plot[0] <= 920 for plot in printed)
     opened.page.evaluate("dispatchEvent(new Event('afterprint'))")
     opened.page.set_viewport_size({"width": 1280, "height": 800})
-    opened.wait_for(fits)
+    opened.wait_for(FITS)
     assert all(plot in opened.page.evaluate(heights) for plot in before)
 
 

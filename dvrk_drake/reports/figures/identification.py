@@ -16,7 +16,7 @@ from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.figures.colours import FITTED, HELD_OUT, LIMIT, MEASURED, NEUTRAL, REFERENCE
+from dvrk_drake.reports.colours import FITTED, HELD_OUT, LIMIT, MEASURED, NEUTRAL, REFERENCE
 from dvrk_drake.reports.figures.motion import plot_motion
 from dvrk_drake.reports.figures.style import (
     WIDTH,

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.validation import SHARE_LABELS, DynamicValidation
-from dvrk_drake.reports.figures.colours import FITTED, HELD_OUT, MEASURED, NEUTRAL, SERIES
+from dvrk_drake.reports.colours import FITTED, HELD_OUT, MEASURED, NEUTRAL, SERIES
 from dvrk_drake.reports.figures.style import (
     WIDTH,
     add_legend,

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.reports.figures.colours import SERIES
+from dvrk_drake.reports.colours import SERIES
 
 #: Width of all figures [inch].
 WIDTH = 11.0

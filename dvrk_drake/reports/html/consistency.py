@@ -21,7 +21,7 @@ from dvrk_drake.dynamics.physical_consistency import (
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.sdf_model import compose_sdf
-from dvrk_drake.reports.figures.colours import SERIES
+from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.html.labels import NO_BREAK
 from dvrk_drake.reports.html.page import Block, Cell, Plot, Table, Text, Verdict
 from dvrk_drake.reports.html.plot_style import COLOURS

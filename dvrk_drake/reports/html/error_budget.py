@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.validation import SHARE_LABELS, error_shares
-from dvrk_drake.reports.figures.colours import NEUTRAL, SERIES
+from dvrk_drake.reports.colours import NEUTRAL, SERIES
 from dvrk_drake.reports.html.motion_plots import MotionEfforts
 from dvrk_drake.reports.html.plot_style import COLOURS
 from dvrk_drake.reports.html.pose_plots import PoseEfforts

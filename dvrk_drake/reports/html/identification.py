@@ -39,7 +39,7 @@ from dvrk_drake.reports.html.pose_plots import (
     predicted_over_measured,
     residuals_over_position,
 )
-from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.provenance import Provenance
 
 Efforts = MotionEfforts | PoseEfforts
 

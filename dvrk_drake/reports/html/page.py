@@ -43,7 +43,7 @@ from plotly.offline import get_plotlyjs
 
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.reports.html.plot_style import DEFAULT_HEIGHT, TEMPLATE
-from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.provenance import Provenance
 
 
 @dataclass(frozen=True)

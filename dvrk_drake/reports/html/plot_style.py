@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from dvrk_drake.reports.figures.colours import ROLES, SERIES
+from dvrk_drake.reports.colours import ROLES, SERIES
 
 #: Fonts of the page and of its plots. No font is loaded.
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"

@@ -17,7 +17,7 @@ from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.experiments.tuning.model_based import friction
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
-from dvrk_drake.reports.figures.colours import FITTED, LIMIT, MEASURED, REFERENCE
+from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.figures.style import (
     add_legend,
     joint_title,

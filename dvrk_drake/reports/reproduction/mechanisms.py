@@ -17,7 +17,7 @@ from dvrk_drake.experiments.reproduction.published import PAPER_ARM, TABLE_1
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import base_body, make_arm_plant
-from dvrk_drake.reports.figures.colours import FITTED, REFERENCE
+from dvrk_drake.reports.colours import FITTED, REFERENCE
 from dvrk_drake.reports.reproduction.drift import plot_largest_drifts
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
 

@@ -15,7 +15,7 @@ from dvrk_drake.experiments.study.table import Share
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.reports.html import page as html_page
 from dvrk_drake.reports.html.page import Block, Command, Image, Page, Plot, Table, Text
-from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.provenance import Provenance
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.experiments.reproduction.published import PaperRecordings
 from dvrk_drake.experiments.reproduction.session import ReproductionSession, SampleSizes
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
 from dvrk_drake.reports.reproduction.mechanisms import reproduce_psm, reproduce_table_1
 from dvrk_drake.reports.reproduction.page import Section, write_page

@@ -22,7 +22,7 @@ from dvrk_drake.experiments.reproduction.step_response import (
     simulate_paper_controller,
 )
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.reports.figures.colours import COMMANDED, SERIES
+from dvrk_drake.reports.colours import COMMANDED, SERIES
 from dvrk_drake.reports.figures.style import add_legend, panel_grid, save_figure, set_title
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 

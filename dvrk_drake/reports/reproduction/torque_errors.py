@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.experiments.reproduction.published import FIGURE_4_MEANS, PAPER_ARM, PaperRecordings
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.reports.figures.colours import HELD_OUT, LIMIT, MEASURED, REFERENCE
+from dvrk_drake.reports.colours import HELD_OUT, LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.figures.style import add_legend, joint_title, panel_grid, save_figure, set_title
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 

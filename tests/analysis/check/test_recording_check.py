@@ -8,7 +8,6 @@ import pytest
 from check_findings import ARMS, changed, found
 from command_output import refusal
 from figure_rules import checked_figures
-from rich.console import Console
 from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
 from dvrk_drake.analysis.check.motion_check import _lags
@@ -26,7 +25,6 @@ from dvrk_drake.recordings.reader_lcm import LcmEvent, event_bytes
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import MIN_ROWS, Recording
 from dvrk_drake.recordings.writing import write_recording
-from dvrk_drake.reports.terminal_tables import make_table
 
 pytestmark = pytest.mark.slow
 
@@ -230,12 +228,6 @@ def test_motion_with_decreasing_times_is_not_poses(rows):
     shuffled = Recording(q=motion.q[rows], tau=motion.tau[rows], qd=motion.qd[rows], t=motion.t[rows])
     with pytest.raises(RecordingError, match="t does not increase"):
         Observations(shuffled, load_arm("psm")).poses()
-
-
-def test_units_in_the_headings_of_tables_are_printed():
-    console = Console(record=True, width=120)
-    console.print(make_table("title [kg]", "", "mass [kg]"))
-    assert "mass [kg]" in console.export_text()
 
 
 def test_friction_does_not_explain_leading_efforts():

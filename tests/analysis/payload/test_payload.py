@@ -8,6 +8,7 @@ import pytest
 from command_output import messages
 from loaded_arm import two_days
 from pydrake.multibody.tree import MultibodyForces
+from report_pages import printed
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.observations.observations import Observations
@@ -29,8 +30,7 @@ from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
-from dvrk_drake.reports.payload import print_payload
-from dvrk_drake.reports.terminal_tables import make_console
+from dvrk_drake.reports.payload import payload_page
 
 pytestmark = pytest.mark.slow
 
@@ -134,14 +134,13 @@ def test_rejects_identical_recordings():
         point_masses(reference, reference, model, ["end_link"])
 
 
-def test_largest_mass_is_printed_without_payload(capsys):
+def test_largest_mass_is_printed_without_payload():
     link = "end_link"
     model, reference, other = two_days("psm", link, 0.0, [0.0, 0.0, 0.0], 0)
     (none,) = point_masses(reference, other, model, [link])
-    print_payload(make_console(), result_of(none, [none]))
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "No payload found on end_link" in printed and f"below {1e3 * none.largest_at_com:.3g} g (95 %)" in printed
-    assert "mass [kg]" not in printed
+    text = " ".join(printed(payload_page(result_of(none, [none]))).split())
+    assert "No payload found on end_link" in text and f"below {1e3 * none.largest_at_com:.3g} g (95 %)" in text
+    assert "mass [kg]" not in text
     # A larger mass has a larger upper limit.
     com = next(own for own in model.regressor.links if own.link == link).parameters
     mass = 1.5 * none.largest_at_com
@@ -154,7 +153,7 @@ def result_of(payload, estimates):
     return PayloadIdentification(payload, estimates, IdentifiedModel.from_arm(load_arm("psm")), link=payload.link)
 
 
-def assert_end_link_explains(estimates, capsys):
+def assert_end_link_explains(estimates):
     """Asserts that estimates on other links have a warning about a payload on the end link."""
     by_link = {payload.link: payload for payload in estimates}
     wrong = [by_link["insertion_link"], by_link["bottom_bar_link"]]
@@ -163,10 +162,9 @@ def assert_end_link_explains(estimates, capsys):
         assert f"{payload.link}: a payload on" in warning and "on end_link" in warning
         assert "\n" not in warning and "--link end_link" in warning
         assert payload.as_dict(estimates)["better_links"][0] == "end_link"
-        print_payload(make_console(), result_of(payload, estimates))
-        printed = " ".join(capsys.readouterr().out.split())
-        assert "below" not in printed
-        assert "A payload on end_link explains the change" in printed
+        text = " ".join(printed(payload_page(result_of(payload, estimates))).split())
+        assert "below" not in text
+        assert "A payload on end_link explains the change" in text
     assert not wrong[0].found and wrong[0].as_dict(estimates)["largest_at_com"] is None
     end = by_link["end_link"]
     assert not better_link_warnings(end, estimates) and end.as_dict(estimates)["better_links"] == []
@@ -175,12 +173,11 @@ def assert_end_link_explains(estimates, capsys):
 LINKS = ["insertion_link", "bottom_bar_link", "end_link"]
 
 
-def test_reports_a_payload_on_another_link(capsys):
+def test_reports_a_payload_on_another_link():
     name, link, mass, position = CASES["end"]
     model, reference, loaded = two_days(name, link, mass, position, 0)
     assert_end_link_explains(
         point_masses(reference, loaded, model, LINKS),
-        capsys,
     )
 
 
@@ -307,10 +304,9 @@ def test_known_weights_without_reference(unloaded, file, link, mass, height):
     assert abs(payload.position_in_base[2] - height) < payload.quantile * payload.position_error[2]
 
 
-def test_reports_a_real_payload_on_another_link(unloaded, capsys):
+def test_reports_a_real_payload_on_another_link(unloaded):
     folder, reference, model = unloaded
     loaded = read_recording(folder / "psm_one_205g_insertion.csv", model.arm, "actuator")
     assert_end_link_explains(
         point_masses(reference, loaded, model, LINKS),
-        capsys,
     )

@@ -1,11 +1,10 @@
 """Runs the demo with fewer poses: it must identify and hold the ground-truth arm."""
 
 import dataclasses
-import io
+from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
@@ -19,9 +18,9 @@ from dvrk_drake.experiments.ground_truth import (
 )
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.reports.demo import print_demo
-from dvrk_drake.reports.figures import demo as demo_figures
-from dvrk_drake.reports.figures.demo import plot_demo
+from dvrk_drake.reports.demo import demo_page
+from dvrk_drake.reports.page import Command
+from dvrk_drake.reports.plot import Curve
 from dvrk_drake.systems.arm_station import ArmStation
 
 
@@ -46,7 +45,6 @@ def result(tmp_path_factory):
     stages = []
     run = run_with(poses=8, fresh_poses=2, settle=0.1, max_angle=0.6)
     outcome = run(folder, progress=lambda step, share: stages.append((step, share)))
-    plot_demo(folder, outcome)
     return folder, outcome, stages
 
 
@@ -61,9 +59,7 @@ def held(result):
 def test_demo_writes_everything(result):
     folder, outcome, stages = result
     files = {path.name: path for path in folder.iterdir()}
-    pages = {"arm.html"}
-    pictures = {"drift.png", "torque_error.png"}
-    assert set(files) == pages | pictures | {"fresh_poses.csv", "model.yaml", "poses.csv"}
+    assert set(files) == {"arm.html", "fresh_poses.csv", "model.yaml", "poses.csv"}
     assert len(read_recording(files["poses.csv"])) == 8
     assert IdentifiedModel.load(files["model.yaml"]).arm.name == "MTML"
     assert all(0.0 <= share <= 1.0 for _, share in stages)
@@ -101,32 +97,25 @@ def test_outcome_with_nominal_model(result, amplitude, descent, verb):
     assert dataclasses.replace(outcome, nominal=q, descent=descent).nominal_outcome == verb
 
 
-def test_drift_plot_shows_models_and_limit(held, tmp_path, monkeypatch):
-    outcome = held
-    drawn = []
-    monkeypatch.setattr(demo_figures, "save_figure", lambda figure, path: drawn.append(figure))
-    demo_figures.plot_drift(tmp_path / "drift.png", outcome)
-    (figure,) = drawn
-    assert len(figure.axes) == 7
-    for j, ax in enumerate(figure.axes):
-        lines = {line.get_label(): line.get_ydata() for line in ax.lines}
-        largest = np.abs(lines["identified model"]).max()
-        assert largest == pytest.approx(1e3 * outcome.drifts["identified"][j], abs=1e-9)
-        low, high = ax.get_ylim()
+def test_drift_plot_shows_models_and_limit(held):
+    (plot,) = (block for block in demo_page(held, Path("folder")).blocks if getattr(block, "name", "") == "drift")
+    assert len(plot.panels) == 7
+    for j, panel in enumerate(plot.panels):
+        curves = {mark.name: mark.y for mark in panel.marks if isinstance(mark, Curve)}
+        assert np.abs(curves["identified model"]).max() == pytest.approx(1e3 * held.drifts["identified"][j], abs=1e-9)
+        low, high = panel.y_range
         assert low < -15 and high > 15, "the limit is visible"
-        assert low <= min(map(np.min, lines.values())) and high >= max(map(np.max, lines.values()))
-    assert "holds" in figure.get_suptitle() and "it falls" in figure.get_suptitle()
+        assert low <= min(map(np.min, curves.values())) and high >= max(map(np.max, curves.values()))
 
 
-def test_demo_prints_verdict_and_next_commands(result, held):
-    folder, outcome = result[0], held
-    console = Console(record=True, width=120, file=io.StringIO())
-    print_demo(console, outcome, folder)
-    text = console.export_text()
-    assert text.startswith("Verdict: the identified model holds the released MTML for 4 s.")
-    assert "the same arm falls" in text
-    assert f"Next: open {folder}/arm.html in a browser" in text
-    assert f"dvrk-drake identify {folder}/poses.csv --arm mtml" in text and "--report report.html" in text
+def test_demo_page_has_verdict_and_next_commands(result, held):
+    folder = result[0]
+    page = demo_page(held, folder)
+    assert page.answer.startswith("Verdict: the identified model holds the released MTML for 4 s.")
+    assert "the same arm falls" in page.answer
+    assert page.next_step == f"open {folder}/report.html in a browser"
+    (command,) = (block.command for block in page.blocks if isinstance(block, Command))
+    assert f"dvrk-drake identify {folder}/poses.csv --arm mtml" in command and "--report report.html" in command
 
 
 @pytest.mark.slow

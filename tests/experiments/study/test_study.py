@@ -8,7 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 import numpy as np
 import pytest
 from figure_rules import checked_figures
-from rich.console import Console
+from report_pages import printed
 from scipy.stats import norm
 
 import dvrk_drake.experiments.study.study as study_module
@@ -20,8 +20,8 @@ from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variatio
 from dvrk_drake.experiments.study.table import Quantiles, Share, StudyTable, summarise
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.figures.study import plot_study
-from dvrk_drake.reports.study import print_study
+from dvrk_drake.reports.image_files import write_images
+from dvrk_drake.reports.study import study_page
 
 MTM = load_arm("mtml")
 
@@ -280,14 +280,13 @@ def test_report_lists_all_measures_and_errors(tmp_path, monkeypatch):
     study = make_study()
     with ThreadPoolExecutor(1) as executor:
         rows = run_study(study, executor, tmp_path / "r.csv")
-    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    print_study(console, study, rows)
-    text = console.export_text()
+    page = study_page(study, rows)
+    text = " ".join(printed(page).split())
     for word in ("held exact: ", "; wrong, a lot: ", " of 12 runs", "24 of 24 runs"):
         assert word in text
     assert "drift" in text and "the simulation failed at 0.3 s" in text
     with checked_figures(monkeypatch):
-        plot_study(tmp_path / "study.png", study, rows)
+        write_images(page, tmp_path)
     assert (tmp_path / "study.png").stat().st_size > 10_000
 
 

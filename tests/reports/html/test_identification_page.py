@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from command_output import refusal
+from dvrk_drake.reports.html.write import write_report
 from report_checks import check_report
 
 import dvrk_drake as dvrk
@@ -26,8 +27,7 @@ from dvrk_drake.reports.html.parameter_tables import _estimate, interval, parame
 from dvrk_drake.reports.html.playback import MAX_FRAMES, MAX_RATE, frame_times
 from dvrk_drake.reports.html.plot_style import axis_range
 from dvrk_drake.reports.html.pose_plots import PoseEfforts, predicted_over_measured
-from dvrk_drake.reports.html.provenance import Provenance
-from dvrk_drake.reports.html.write import write_report
+from dvrk_drake.reports.provenance import Provenance
 
 SAMPLES = files("dvrk_drake") / "samples"
 TITLES = [

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_output import refusal
+from figure_rules import checked_figures
 from loaded_arm import two_days
 from report_checks import check_report
 from report_results import operator_forces, study_results, tuning_result
@@ -21,13 +22,17 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.files import Reportable
-from dvrk_drake.reports.html.compensation import compensation_page
-from dvrk_drake.reports.html.page import Command, Plot, Provenance, Table
-from dvrk_drake.reports.html.payload import payload_page
-from dvrk_drake.reports.html.study import study_page
-from dvrk_drake.reports.html.transparency import transparency_page
-from dvrk_drake.reports.html.tuning import tuning_page
-from dvrk_drake.reports.html.write import _MAKERS
+from dvrk_drake.reports.export import compensation_page
+from dvrk_drake.reports.html_file import render_html, write_html
+from dvrk_drake.reports.image_files import write_images
+from dvrk_drake.reports.page import Plot, Table
+from dvrk_drake.reports.payload import payload_page
+from dvrk_drake.reports.plot import Curve, Dots, Guide
+from dvrk_drake.reports.provenance import Provenance
+from dvrk_drake.reports.study import study_page
+from dvrk_drake.reports.transparency import transparency_page
+from dvrk_drake.reports.tuning import tuning_page
+from dvrk_drake.reports.write import _MAKERS
 
 ORIGIN = Provenance.of()
 
@@ -51,56 +56,57 @@ def payload():
 
 
 PAGES = {
-    "study": lambda: study_page(*study_results(), ORIGIN),
-    "tune": lambda: tuning_page(tuning_result(), ORIGIN),
-    "transparency": lambda: transparency_page(*operator_forces(), ORIGIN),
-    "compare-gc": lambda: compensation_page(comparison(), ORIGIN, "gc.json", "model.yaml"),
-    "payload": lambda: payload_page(payload(), ORIGIN),
+    "study": lambda: study_page(*study_results(), study_path="study.yaml"),
+    "tune": lambda: tuning_page(tuning_result()),
+    "transparency": lambda: transparency_page(*operator_forces()),
+    "compare-gc": lambda: compensation_page(comparison(), file_name="gc.json", model_name="model.yaml"),
+    "payload": lambda: payload_page(payload()),
 }
 SLOW = {"payload"}
 
 
 def blocks(page, kind):
-    return [block for section in (*page.sections, *page.closing) for block in section.blocks if isinstance(block, kind)]
+    return [block for block in page.blocks if isinstance(block, kind)]
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in PAGES])
-def test_report_has_answer_tables_plots_and_next_step(name):
+def test_page_has_answer_tables_plots_and_next_step(name, tmp_path, monkeypatch):
     page = PAGES[name]()
-    assert page.subtitle and page.level in ("good", "warning")
-    assert blocks(page, Table) and blocks(page, Plot)
-    assert [command.command.split()[:1] for command in blocks(page, Command)] == [["dvrk-drake"]]
-    assert "--verbose" not in page.html()
+    assert page.answer and page.level in ("good", "warning")
+    assert blocks(page, Table) and page.next_step.startswith("dvrk-drake ")
+    assert "--verbose" not in render_html(page, ORIGIN)
+    with checked_figures(monkeypatch):
+        assert [path.stem for path in write_images(page, tmp_path)] == [plot.name for plot in blocks(page, Plot)] != []
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_layout_in_a_browser(name, open_page, tmp_path):
-    PAGES[name]().write(tmp_path / "report.html")
+    write_html(PAGES[name](), tmp_path / "report.html", ORIGIN)
     check_report(open_page, tmp_path / "report.html")
 
 
 def test_study_plots_show_all_runs_and_name_infinite_values():
     study, rows = study_results()
-    share, drift, _ = blocks(study_page(study, rows, ORIGIN), Plot)
+    (plot,) = blocks(study_page(study, rows), Plot)
+    share, drift, _ = plot.panels
     cases = [[c.index for c in study.cases if c.variation == v.name] for v in study.variations]
     held = [np.mean([rows[k].values.get("held", False) for k in indices]) for indices in cases]
-    assert [trace.x[0] for trace in share.figure.data] == pytest.approx([100 * x for x in held], abs=1e-9)
-    assert sum(len(trace.x) for trace in drift.figure.data) == len(rows) - 1
-    assert "1 of 24 are infinite" in drift.caption
+    np.testing.assert_allclose([mark.values[0] for mark in share.marks], [100 * x for x in held], atol=1e-9)
+    assert all(isinstance(mark, Dots) and mark.low[0] < mark.values[0] < mark.high[0] for mark in share.marks)
+    assert sum(len(mark.x) for mark in drift.marks) == len(rows) - 1
+    assert "1 of 24 are infinite" in drift.title
 
 
 def test_tuning_plot_shows_each_response_and_the_goal():
     tuning = tuning_result()
-    steps, _ = blocks(tuning_page(tuning, ORIGIN), Plot)
-    n = tuning.arm.num_joints
-    assert len(steps.figure.data) == n * len(tuning.comparison.responses)
-    # All responses start at 0 and approach the goal, which the band surrounds.
-    for trace in steps.figure.data:
-        assert trace.y[0] == pytest.approx(0.0, abs=1e-9)
-    # The slowest response, exp(-3 t), ends inside the band of 2 % around the goal after 2 s.
-    bands = [(shape.y0, shape.y1) for shape in steps.figure.layout.shapes]
-    final = [trace.y[-1] for trace in steps.figure.data[:: len(tuning.comparison.responses)]]
-    assert all(low < y < high for (low, high), y in zip(bands, final, strict=True))
+    steps, _ = blocks(tuning_page(tuning), Plot)
+    for panel in steps.panels:
+        curves = [mark for mark in panel.marks if isinstance(mark, Curve)]
+        assert len(curves) == len(tuning.comparison.responses)
+        # All responses start at 0. The slowest, exp(-3 t), ends inside the band of 2 % around the goal after 2 s.
+        assert all(curve.y[0] == pytest.approx(0.0, abs=1e-9) for curve in curves)
+        band, goal = (mark for mark in panel.marks if isinstance(mark, Guide))
+        assert band.low < curves[0].y[-1] < band.high and band.low < goal.low < band.high
 
 
 def test_write_report_selects_the_page_by_type(tmp_path):
@@ -128,18 +134,18 @@ def test_all_results_with_a_page_have_the_method():
         return {kind.__name__}.union(*map(names, kind.__subclasses__()))
 
     for module, _ in _MAKERS.values():
-        import_module(f"dvrk_drake.reports.html.{module}")
+        import_module(f"dvrk_drake.reports.{module}")
     assert names(Reportable) >= _MAKERS.keys()
 
 
 @pytest.mark.slow
 def test_payload_report_shows_the_interval_of_the_mass():
     result = payload()
-    mass = next(row for row in blocks(payload_page(result, ORIGIN), Table)[0].rows if row[0] == "mass [kg]")
+    mass = next(row for row in blocks(payload_page(result), Table)[0].rows if row[0] == "mass [kg]")
     assert float(mass[1]) == pytest.approx(result.payload.body.mass, abs=1e-4)
     other = next(one for one in result.estimates if one.link == "insertion_link")
-    page = payload_page(replace(result, payload=other, link=other.link), ORIGIN)
-    assert page.level == "warning" and page.subtitle.startswith("No payload found on insertion_link")
+    page = payload_page(replace(result, payload=other, link=other.link))
+    assert page.level == "warning" and page.answer.startswith("No payload found on insertion_link")
 
 
 @pytest.fixture

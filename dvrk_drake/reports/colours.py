@@ -34,3 +34,18 @@ ROLES = {
 
 #: Colours of series without a role, for example variations or joints in one plot. Use them in this order.
 SERIES = ("#1a429b", "#eb9804", "#cd1265", "#84ddb8", "#4e5d02", "#976a9f", "#fb6b5f", "#570e2d")
+
+#: Mapping from a colour to its replacement on a dark page. The other colours are visible on both.
+DARK = {
+    MEASURED: "#e4e8ec",
+    "rgba(31,31,31,0.35)": "rgba(228,232,236,0.4)",
+    COMMANDED: "#d67ad2",
+    LIMIT: "#ff7a5c",
+    "#1a429b": "#7ea2f0",
+    "#cd1265": "#f0569a",
+    "#4e5d02": "#b3c75b",
+    "#570e2d": "#d98aa8",
+    "#1b2733": "#dfe5ea",
+    "#6b7785": "#9aa6b2",
+    "#e3e7eb": "#34404b",
+}

@@ -1,18 +1,19 @@
-"""The page builder, in a browser: plots, time cursor with the animation, layout, printing."""
+"""HTML of a page, in a browser: plots, time cursor with the animation, layout, printing."""
 
 import hashlib
 
 import numpy as np
-import plotly.graph_objects as go
 import pytest
-from plotly.subplots import make_subplots
 from pydrake.geometry import Box, MeshcatAnimation
 from pydrake.math import RigidTransform
 from report_checks import check_report, printed_text
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.reports.html.page import Command, Page, Plot, Provenance, Section, Table, Text, Verdict
-from dvrk_drake.reports.html.page import Meshcat as MeshcatBlock
+from dvrk_drake.reports.colours import MEASURED, SERIES
+from dvrk_drake.reports.html_file import write_html
+from dvrk_drake.reports.page import Command, Page, Plot, Scene, Section, Table, Text, Verdict
+from dvrk_drake.reports.plot import Bars, Curve, Panel, category_panel
+from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
 #: Duration of the animation [s]. The box moves along x with 0.1 m/s.
@@ -31,13 +32,14 @@ def scene():
     return meshcat.StaticHtml()
 
 
-def effort_figure():
-    """Returns a figure with two panels over time."""
+def effort_plot():
+    """Returns a plot with two panels over time."""
     t = np.linspace(0.0, DURATION, 401)
-    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, subplot_titles=["shoulder", "elbow"])
-    for row in (1, 2):
-        figure.add_scatter(x=t, y=np.sin(row * t), name=f"measured {row}", row=row, col=1)
-    return figure.update_xaxes(title="t [s]", row=2).update_yaxes(title="effort [N m]").update_layout(height=480)
+    panels = [
+        Panel(name, [Curve("measured", t, np.sin(k * t), MEASURED)], "t [s]", "effort [N m]", x_ticks=k == 2)
+        for k, name in ((1, "shoulder"), (2, "elbow"))
+    ]
+    return Plot("efforts", "Efforts over time", panels, time=True)
 
 
 @pytest.fixture(scope="module")
@@ -45,20 +47,22 @@ def report(scene, tmp_path_factory):
     """Path of a page with all kinds of blocks."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "poses.csv").write_text("q1,tau1\n0,1\n")
-    rows = [("shoulder", 0.0361, Verdict("good", "good")), ("elbow", 1.25, Verdict("do not use", "bad", "0.1 < 0.2"))]
+    rows = [("shoulder", Verdict("good", "good"), 0.0361), ("elbow", Verdict("do not use", "bad"), 1.25)]
+    bars = category_panel("", [Bars("friction", ["a", "b"], [1, 2], SERIES[0])], "error [%]")
     page = Page(
         title="MTML & <friends>",
-        subtitle="1 of 2 joints is usable.",
+        answer="1 of 2 joints is usable.",
         level="warning",
         sections=[
-            Section("Verdict per joint", [Table(("joint", "error [N m]", "verdict"), rows, caption="Error")]),
-            Section("Efforts", [MeshcatBlock(scene), Plot(effort_figure(), "Efforts over time", time=True)]),
-            Section("Errors", [Plot(go.Figure(go.Bar(x=["a", "b"], y=[1, 2])), "Errors"), Text("Note", "warning")]),
-            Section("Next step", [Command("dvrk-drake validate model.yaml", "Validates the model.")]),
+            Section("Verdict per joint", [Table(("joint", "verdict", "error [N m]"), rows, "Error")]),
+            Section("Efforts", [Scene(lambda: scene), effort_plot()]),
+            Section("Errors", [Plot("errors", "Errors", [bars]), Text("Note", "warning")], folded=True),
+            Section("Parameters", [Command("dvrk-drake predict")], folded=True),
         ],
-        provenance=Provenance.of([folder / "poses.csv"], ["identify", "my poses.csv"]),
+        next_step="dvrk-drake validate model.yaml",
+        next_purpose="Validates the model.",
     )
-    page.write(folder / "report.html")
+    write_html(page, folder / "report.html", Provenance.of([folder / "poses.csv"], ["identify", "my poses.csv"]))
     return folder / "report.html"
 
 
@@ -144,7 +148,7 @@ def test_zoom_of_a_plot(opened):
 def test_copy_button_copies_the_command(opened):
     opened, _ = opened
     opened.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
-    opened.page.locator(".copy").click()
+    opened.page.locator(".copy:visible").click()
     assert opened.page.evaluate("navigator.clipboard.readText()") == "dvrk-drake validate model.yaml"
 
 
@@ -153,13 +157,16 @@ def test_printed_page_has_text_tables_and_plots(opened, tmp_path):
     text = printed_text(opened, tmp_path)
     if text is None:
         pytest.skip("needs pdftotext (apt-get install poppler-utils)")
-    for part in ("MTML & <friends>", "do not use", "0.1 < 0.2", "shoulder", "effort [N m]", "SHA-256", "validate"):
+    for part in ("MTML & <friends>", "do not use", "shoulder", "effort [N m]", "SHA-256", "validate"):
         assert part in text
     # The plots have their former size again.
     opened.wait_for(
         "[...document.querySelectorAll('.canvas')].every((c) => Math.abs(c._fullLayout.width - c.clientWidth) < 2)"
     )
-    assert opened.page.evaluate("document.querySelector('[data-time]')._fullLayout.height") == 480
+    heights = (
+        "[...document.querySelectorAll('[data-time]')].map((plot) => [plot._fullLayout.height, plot.clientHeight])"
+    )
+    assert all(height == shown > 400 for height, shown in opened.page.evaluate(heights))
     # The frame of the 3D view does not print, so its picture does.
     assert opened.page.evaluate(
         """() => {
@@ -177,16 +184,27 @@ def test_page_states_hash_and_command(report):
     assert "MTML &amp; &lt;friends&gt;" in html and "<friends>" not in html
 
 
+def test_dark_page_has_light_text_and_curves(open_page, report):
+    opened = open_page(report, color_scheme="dark")
+    opened.wait_for("document.documentElement.dataset.ready === 'yes'")
+    light = """(selector) => {
+      const element = document.querySelector(selector), style = getComputedStyle(element);
+      const colour = element.closest("svg") ? style.fill : style.color;
+      return colour.match(/\\d+/g).slice(0, 3).reduce((sum, part) => sum + Number(part), 0) / 765;
+    }"""
+    for selector in ("h1", "td", ".canvas .xtick text", ".canvas .legendtext"):
+        assert opened.page.evaluate(light, selector) > 0.6, selector
+
+
 def test_columns_of_numbers_are_aligned_right():
     table = Table(("a", "b", "c", "d"), [("joint", 1.5, "-0.2", "3..5 %"), ("1 mm", 2, "12", "")])
-    assert table.alignment == ["name", "number", "number", "number"]
-    assert Table(("a", "b"), [("x", "inf")], right=[False, True]).alignment == ["name", "number"]
+    assert table.aligned_right == [False, True, True, True]
+    assert Table(("a", "b"), [("x", "inf")], right=[False, True]).aligned_right == [False, True]
     with pytest.raises(ValueError, match="a row has 1 cells, the header has 2"):
         Table(("a", "b"), [("1",)])
 
 
 def test_failed_write_leaves_no_file(tmp_path):
-    page = Page("title", "answer", [], Provenance.of())
     with pytest.raises((DvrkDrakeError, OSError)):
-        page.write(tmp_path / "missing" / "report.html")
+        write_html(Page("title", "answer", []), tmp_path / "missing" / "report.html", Provenance.of())
     assert not list(tmp_path.iterdir())

@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.reports.html.provenance import Provenance
+from dvrk_drake.reports.html_file import write_html
+from dvrk_drake.reports.provenance import Provenance
 
-#: Mapping from the name of a result's class to the module of its report and the function in it that returns the page:
-#: `function(result, provenance) -> Page`. Modules are imported when they are needed.
+#: Mapping from the name of a result's class to the module of its page and the function in it that returns the page:
+#: `function(result) -> Page`. Modules are imported when they are needed.
 _MAKERS = {
-    "CompensationComparison": ("compensation", "compensation_page"),
+    "CompensationComparison": ("export", "compensation_page"),
     "PayloadIdentification": ("payload", "payload_page"),
     "Tuning": ("tuning", "tuning_page"),
-    "DynamicIdentification": ("identification", "identification_page"),
-    "DynamicValidation": ("identification", "identification_page"),
-    "StaticIdentification": ("identification", "identification_page"),
-    "StaticValidation": ("identification", "identification_page"),
+    "DynamicIdentification": ("html.identification", "identification_page"),
+    "DynamicValidation": ("html.identification", "identification_page"),
+    "StaticIdentification": ("html.identification", "identification_page"),
+    "StaticValidation": ("html.identification", "identification_page"),
 }
 
 
@@ -53,5 +54,9 @@ def write_report(
     if name not in _MAKERS:
         raise DvrkDrakeError(f"there is no report for {name}; allowed: {', '.join(sorted(_MAKERS))}")
     module, function = _MAKERS[name]
-    make = getattr(import_module(f"dvrk_drake.reports.html.{module}"), function)
-    make(result, Provenance.of(inputs, command)).write(path)
+    make = getattr(import_module(f"dvrk_drake.reports.{module}"), function)
+    if module.startswith("html."):
+        make(result, Provenance.of(inputs, command)).write(path)
+        return
+    page = make(result)
+    write_html(page, path, Provenance.of(inputs, command))
