@@ -107,7 +107,7 @@ class Table:
 
     @property
     def aligned_right(self) -> list[bool]:
-        """Whether each column is aligned right."""
+        """True for each column that is aligned right."""
         if self.right is not None:
             return list(self.right)
         columns = map(list, zip(*self.rows, strict=True)) if self.rows else ([] for _ in self.header)
@@ -190,7 +190,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """What a person reads about a result.
+    """Answer, next step and sections that a person reads about a result.
 
     Attributes:
         title: What was examined, e.g. the arm and the recording.

@@ -327,4 +327,4 @@ def test_compensation_reduces_operator_force(truth, tmp_path):
         section = reproduce_transparency(exact_session(truth, tmp_path, executor, SampleSizes(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]
     assert force[0] > force[2] > force[3] > 0  # unpowered, our model, our model with friction compensation
-    assert len(section.plots) == 2
+    assert len(section.plots) == 1

@@ -176,9 +176,7 @@ CASES = {
     ),
     "study": (
         r"held exact: \d+ of 12 runs; another one: \d+ of 12 runs\.",
-        
         lambda c, v: print_page(c, study_page(*study_results(), study_path="s"), verbose=v),
-    ,
     ),
     "tune": (
         r"Gains of method model are better than the arm's own: ",
