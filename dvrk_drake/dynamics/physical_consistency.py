@@ -21,6 +21,10 @@ from dvrk_drake.models.arm_schema import BoundingShapes, BoxCorners
 from dvrk_drake.models.plant import add_arm
 from dvrk_drake.models.sdf_model import compose_sdf
 
+#: Factor of the width of a bounding box that follows from the inertia in the SDF. The mass of the real link may be
+#: farther out. A factor of 1 increases the error of a UR10 by a quarter, 3 changes that of four robots by at most 1 %.
+WIDENING = 2.0
+
 
 @dataclass(frozen=True, eq=False)
 class BoundingBox:
@@ -43,7 +47,7 @@ class BoundingBox:
 def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
     """Returns link -> bounding box for every moving link, according to `bounding_shapes` in the arm's files.
 
-    A link without collision shapes gets a box that contains its joints and a box with the link's inertia.
+    A link without collision shapes gets a box `WIDENING` times as wide as one around its joints and its inertia.
 
     Raises:
         ArmError: A box is not valid.
@@ -95,7 +99,7 @@ def _box_around_shapes(
 
 
 def _box_from_inertia(plant: MultibodyPlant, link: str, margin: float) -> BoundingBox:
-    """Returns a box with a margin [m] around the joints of a link and around a solid box with its inertia.
+    """Returns a box around the joints of a link and around a solid box with its inertia, with a margin [m], widened.
 
     The moments of a solid box with the half widths w about its centre of mass are m w^2 / 3.
     """
@@ -107,7 +111,8 @@ def _box_from_inertia(plant: MultibodyPlant, link: str, margin: float) -> Boundi
     joints = map(plant.get_joint, plant.GetJointIndices())
     ends = [j.frame_on_parent().GetFixedPoseInBodyFrame().translation() for j in joints if j.parent_body() is body]
     points = np.array([np.zeros(3), p_LoLcm_L - half_width, p_LoLcm_L + half_width, *ends])
-    return BoundingBox(points.min(axis=0) - margin, points.max(axis=0) + margin)
+    box = BoundingBox(points.min(axis=0) - margin, points.max(axis=0) + margin)
+    return BoundingBox(box.center - WIDENING * box.half_width, box.center + WIDENING * box.half_width)
 
 
 def _box_from_corners(link: str, corners: BoxCorners) -> BoundingBox:

@@ -160,16 +160,6 @@ class SimulatedArm:
         self._simulator.AdvanceTo(self._ticks * self.driver.status_period)
         self._memory.HandleSubscriptions(0)
 
-    def stall(self, seconds: float) -> None:
-        """Simulates a bridge process that is suspended for `seconds` of the arm's clock.
-
-        The guard is not stepped and no status is sent. The motors apply the last commanded efforts, as on a dVRK.
-        """
-        self._driver.SetStalled(True)
-        for _ in range(round(seconds / self.driver.status_period)):
-            self.step()
-        self._driver.SetStalled(False)
-
     def send(self, network: lcm.LCM) -> None:
         """Publishes the last status."""
         network.publish(status_channel(self.arm), self._status)

@@ -1,5 +1,7 @@
 """Simulated arm with a stopped bridge, process or controller: state of the guard and motion of the arm."""
 
+from unittest import mock
+
 import numpy as np
 import pytest
 from forked import run_forked
@@ -10,6 +12,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.simulated_arm import SimulatedArm
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 STALLS = pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])
@@ -28,13 +31,27 @@ class Loop:
     def __init__(self, name, speed=0.0):
         arm = load_arm(name)
         self.wall, self.time, self.motion_time, self.status = 10**9, 0.0, 0.0, Status()
-        self.arm = SimulatedArm(arm, DvrkDriver(), "memq://", POSES[name], wall_clock=lambda: self.wall)
+        self.is_bridge_stopped = False
+        methods = {
+            name: self.unless_stopped(getattr(DvrkCommandReceiver, name)) for name in ("_update", "_store_effort")
+        }
+        with mock.patch.multiple(DvrkCommandReceiver, **methods):
+            self.arm = SimulatedArm(arm, DvrkDriver(), "memq://", POSES[name], wall_clock=lambda: self.wall)
         self.controller = ArmController(arm, IdentifiedModel.from_arm(arm), "hold", 1e-3)
         self.velocity = speed * np.eye(arm.num_joints)[0]
         self.moved = []
         for _ in range(900):  # start check, then 0.6 s of motion or rest
             self.tick()
         assert self.status.guard_state == Status.STATE_EFFORT
+
+    def unless_stopped(self, method):
+        """Returns a method of the receiver that does nothing while the bridge is stopped. Its outputs are kept."""
+
+        def call(receiver, *arguments):
+            if not self.is_bridge_stopped:
+                method(receiver, *arguments)
+
+        return call
 
     def publish(self, channel, data):
         self.status = Status.decode(data)
@@ -58,9 +75,12 @@ class Loop:
             self.arm.receive("", self.controller.answer(self.status, self.time, desired).encode())
 
     def stall_bridge(self, seconds):
-        """The motors apply the last commanded efforts."""
+        """The guard is not stepped and no status is sent. The motors apply the last commanded efforts, as on a dVRK."""
         self.wait(seconds)
-        self.arm.stall(seconds)
+        self.is_bridge_stopped = True
+        for _ in range(round(1e3 * seconds)):
+            self.arm.step()
+        self.is_bridge_stopped = False
 
     def stall_process(self, seconds):
         """The arm's clock and the simulation stand still, as when `dvrk-drake sim-arm` is stopped."""

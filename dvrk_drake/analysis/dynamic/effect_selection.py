@@ -80,6 +80,9 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     phi = problem.prior
     if has_converted_model(problem.regressor.arm):
         problem = _with_link_scale(problem, mandatory)
+        linear = problem.selection(problem.prior, folds=False)
+        coefficients = linear.fit_with(mandatory)[linear.num_rigid :][: problem.num_effects]
+        problem = replace(problem, friction=problem.friction_efforts(np.arange(problem.num_effects), coefficients))
     # The efforts contain products of the tilt or a friction coefficient and the link parameters. Each iteration is
     # linear, because it uses the previous link parameters in these products.
     for iteration in range(NUM_ITERATIONS if tilts or problem.is_loaded else 0):

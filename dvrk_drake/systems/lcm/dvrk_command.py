@@ -116,10 +116,6 @@ class DvrkCommandReceiver(LeafSystem):
 
     The guard is an abstract state that is updated once per period of the clock. Drake updates abstract states before it
     steps a discrete plant at the same time. A command therefore acts in the next step of the plant.
-
-    Attributes:
-        stalled: If true, the guard is not stepped, as in a bridge whose process is stopped. Messages then wait in the
-            inbox, and the outputs keep their last values.
     """
 
     def __init__(
@@ -139,7 +135,7 @@ class DvrkCommandReceiver(LeafSystem):
         """
         super().__init__()
         n = arm.num_joints
-        self.stalled = self._allows_reset = False
+        self._allows_reset = False
         self._num_joints, self._clock = n, clock or ArmClock()
         self._effort_limits = arm.effort_limits
         self._command = self.DeclareAbstractInputPort("lcmt_dvrk_command", AbstractValue.Make(lcmt_dvrk_command()))
@@ -176,8 +172,6 @@ class DvrkCommandReceiver(LeafSystem):
         return context.get_abstract_state(int(self._guard)).get_value()
 
     def _update(self, context: Context, state: State) -> None:
-        if self.stalled:
-            return
         guard = state.get_mutable_abstract_state(int(self._guard)).get_mutable_value()
         utime = self._clock.utime(context)
         if self._allows_reset:
@@ -198,8 +192,7 @@ class DvrkCommandReceiver(LeafSystem):
 
     def _store_effort(self, context: Context, values: DiscreteValues) -> None:
         # Drake calls this method after `_update`, and together with the step of a discrete plant that uses the effort.
-        if not self.stalled:
-            values.set_value(self._applied.Eval(context))
+        values.set_value(self._applied.Eval(context))
 
     def _calc_control_mode(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self.GetGuard(context).output.control_mode)

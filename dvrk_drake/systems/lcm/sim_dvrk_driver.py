@@ -114,13 +114,6 @@ class SimDvrkDriver(Diagram):
         """Allows the reset of a fault in the next update; see `CommandGuard.allow_reset`."""
         self._receiver.AllowReset()
 
-    def SetStalled(self, stalled: bool) -> None:
-        """Stops or continues the steps of the guard, to simulate a bridge whose process is stopped.
-
-        While the guard is stopped, no command is received and the motors keep their last efforts.
-        """
-        self._receiver.stalled = stalled
-
     def GetGuard(self, context: Context) -> CommandGuard:
         """Returns the guard in this driver's context, read-only."""
         return self._receiver.GetGuard(self.GetSubsystemContext(self._receiver, context))
