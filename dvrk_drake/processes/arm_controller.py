@@ -1,6 +1,9 @@
-"""Controller of one arm. It computes one command for each status message."""
+"""Controllers of one arm. They compute one command for each status message."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +12,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.approach import approach_offset
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.effort_ramp import EffortRamp
@@ -16,7 +20,79 @@ from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.lcm.arm_link import ArmLink
+from dvrk_drake.systems.lcm.dvrk_command import draw_id, make_command
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+
+
+#: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
+#: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
+#: the approach. After a longer approach, the controller's integrator may hold the arm with any part of the friction.
+APPROACH = 0.3
+#: Speed of an approach with the arm's own controller, as a fraction of the speed of other motions. A fast approach
+#: would end with an overshoot, which changes the friction at the pose.
+_APPROACH_SPEED = 0.4
+#: Time for which the arm must be at rest before such an approach [s].
+_APPROACH_REST = 0.2
+
+
+@dataclass(frozen=True)
+class MotionStyle:
+    """Differences between the controllers that move an arm along a trajectory.
+
+    Attributes:
+        approach_offset: Offset (n,) of the pose at which the approach of a static pose begins [rad, m].
+        approach_speed: Speed of the approach, relative to that of other motions.
+        approach_rest: Time for which the arm must be at rest before the approach [s]. 0: it does not stop.
+        waits: Whether the trajectory waits for an arm that is behind. If not, such an arm is an error. A controller
+            that waits commands HOLD if there is no desired state.
+        max_step: Largest time step of the trajectory between two statuses [s]. It prevents a jump of the desired state
+            after a pause of the computer.
+    """
+
+    approach_offset: NDArray[np.float64]
+    approach_speed: float
+    approach_rest: float
+    waits: bool
+    max_step: float
+
+    @classmethod
+    def of_efforts(cls, arm: Arm) -> MotionStyle:
+        """Returns the style of a controller that commands efforts to an arm."""
+        return cls(np.asarray(APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)), 1.0, 0.0, False, 0.01)
+
+    @classmethod
+    def of_goals(cls, arm: Arm) -> MotionStyle:
+        """Returns the style of a controller that commands goals to the arm's own controller."""
+        return cls(approach_offset(arm), _APPROACH_SPEED, _APPROACH_REST, True, 0.05)
+
+
+class GoalController:
+    """Controller of an arm whose own controller moves it: it commands each desired state as a position.
+
+    Attributes:
+        arm: Controlled arm.
+        sender_id: Identifier of this controller in its command messages.
+        acting: True if the arm has received a command of this controller.
+        style: How this controller moves the arm.
+    """
+
+    def __init__(self, arm: Arm, is_busy: Callable[[], bool] = lambda: False) -> None:
+        """Creates the controller. `is_busy` returns whether the arm still moves to its goal, as it states itself."""
+        self.arm, self.style, self.sender_id, self.acting = arm, MotionStyle.of_goals(arm), draw_id(), False
+        self.is_busy = is_busy
+
+    @property
+    def ramped(self) -> bool:
+        """True if the arm follows the desired state."""
+        return self.acting
+
+    def answer(
+        self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None
+    ) -> lcmt_dvrk_command:
+        """Returns the command for a status; see `ArmController.answer`. Without a desired state, it is HOLD."""
+        self.acting = status.command_sender_id == self.sender_id
+        mode = lcmt_dvrk_command.HOLD if desired_state is None else lcmt_dvrk_command.POSITION
+        return make_command(status, self.sender_id, round(1e6 * time), mode, desired_state=desired_state)
 
 
 class _Exchange(ArmLink):
@@ -60,6 +136,7 @@ class ArmController:
         arm: Controlled arm.
         sender_id: Identifier of this controller in its command messages.
         acting: True if the last status shows that the arm applies the efforts of this controller.
+        style: How this controller moves the arm in mode "hold".
     """
 
     def __init__(
@@ -84,7 +161,7 @@ class ArmController:
         """
         builder = DiagramBuilder()
         self.arm, self._mode, self._period = arm, mode, period
-        self._link = _Exchange(arm)
+        self._link, self.style = _Exchange(arm), MotionStyle.of_efforts(arm)
         station = builder.AddSystem(HardwareArmStation(arm, driver=DvrkDriver(status_period=period), link=self._link))
         self._controller = builder.AddSystem(GravityPidController(model, period=period, gains=gains, mode="gravity"))
         self._ramp = builder.AddSystem(EffortRamp(arm.num_joints, period=period))
@@ -105,6 +182,10 @@ class ArmController:
         self._ramp_context = self._ramp.GetMyContextFromRoot(context)
         self._controller_context = self._controller.GetMyMutableContextFromRoot(context)
         self._num_answers, self.sender_id, self.acting = 0, station.sender_id, False
+
+    def is_busy(self) -> bool:
+        """Returns False: the arm has no goal of its own."""
+        return False
 
     @property
     def ramped(self) -> bool:

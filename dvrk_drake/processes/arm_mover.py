@@ -1,4 +1,4 @@
-"""Moves an arm over LCM along trajectories, with checks of the arm at each status."""
+"""Moves an arm along trajectories, with checks of the arm at each status."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.arm_controller import ArmController, GoalController
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.teacher import RestDetector
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 
-#: Largest time step of the trajectory between two statuses [s]. This limit prevents a jump of the desired state after a
-#: pause of the computer.
-_MAX_STEP = 0.01
 #: Longest time until the arm applies the commanded efforts [s].
 _START = 10.0
 #: Position tolerance [rad], [m] of an arm at rest, to which 1.5 encoder counts are added. Time for which the arm must
@@ -27,6 +24,9 @@ REST, REST_TIME, SETTLE = (2e-3, 2e-4), 0.5, 10.0
 _BRAKE = 0.3
 #: Largest allowed tracking error of a joint, as a fraction of the range of the joint.
 MAX_TRACKING_ERROR = 0.1
+#: Time without progress towards the goal after which a motion that waits is stopped [s]. Smallest progress, relative to
+#: the largest tracking error.
+STALL, _PROGRESS = 2.0, 0.05
 
 Steps = Generator[None, None, None]
 
@@ -36,11 +36,11 @@ class TrackingError(CollectionError):
 
 
 class ArmMover(ABC):
-    """Computes the desired state of a controller in mode "hold" for each status, until its task is finished.
+    """Computes the desired state of a controller for each status, until its task is finished.
 
     The task is the generator `_task` of a subclass, which advances by one step per status. The task also ends if
-    `stopped` returns true, after the arm has braked. It ends with an error if the guard holds the arm or if a joint
-    does not follow its target. After the end of the task, the caller must command HOLD.
+    `stopped` returns true, after the arm has braked. It ends with an error if the guard holds the arm, or if a joint
+    does not follow its target; see `MotionStyle.waits`. After the end of the task, the caller must command HOLD.
 
     Attributes:
         finished: True after the end of the task.
@@ -49,7 +49,7 @@ class ArmMover(ABC):
 
     def __init__(
         self,
-        controller: ArmController,
+        controller: ArmController | GoalController,
         traverse_time: float,
         *,
         stopped: Callable[[], bool] = lambda: False,
@@ -58,7 +58,8 @@ class ArmMover(ABC):
         """Creates a mover for the arm of `controller`.
 
         Args:
-            controller: Controller that computes the commands.
+            controller: Controller that computes the commands: an `ArmController` in mode "hold", or a
+                `GoalController`.
             traverse_time: Time in which a joint may cross its range [s].
             stopped: Function that returns whether to stop. It is called once per status.
             report: Function that is called with lines of text about the progress.
@@ -67,6 +68,7 @@ class ArmMover(ABC):
         self.problem: DvrkDrakeError | None = None
         self._arm = arm = controller.arm
         self._controller, self._stopped, self._report = controller, stopped, report
+        self._style = controller.style
         span = arm.position_upper - arm.position_lower
         self._speed, self._tracking_tolerance = span / traverse_time, MAX_TRACKING_ERROR * span
         self._time, self._status_time = 0.0, 0.0
@@ -74,11 +76,11 @@ class ArmMover(ABC):
         self._q = self._tau = np.zeros(arm.num_joints)
         self._desired = np.zeros(2 * arm.num_joints)
         self._motion_end = 0.0
-        self._stopping = self._in_control = False
+        self._stopping = self._in_control = self._halted = False
         self._activity = "waiting for the arm"
         self._steps = self._task()
 
-    def update(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
+    def update(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64] | None:
         """Processes a status and returns the desired state.
 
         The trajectory advances with the arm's clock, which may be slower than the controller's clock.
@@ -88,10 +90,10 @@ class ArmMover(ABC):
             time: Time of arrival on the controller's clock [s].
 
         Returns:
-            Desired state (2n,): q, then v.
+            Desired state (2n,): q, then v. None: the arm holds its pose.
         """
         measured = 1e-6 * status.utime
-        self._time += min(max(measured - self._status_time, 0.0), _MAX_STEP)
+        self._time += min(max(measured - self._status_time, 0.0), self._style.max_step)
         self._status_time = measured
         self._answers.add(time)
         # controller.acting refers to the previous status. This status may already report the problem.
@@ -99,7 +101,7 @@ class ArmMover(ABC):
             self._last_applied = status
         self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
         if self.finished:
-            return self._desired
+            return self._output()
         try:
             if self._in_control:
                 self._check(status)
@@ -111,7 +113,10 @@ class ArmMover(ABC):
             self.finished = True
         except DvrkDrakeError as error:
             self.problem, self.finished = error, True
-        return self._desired
+        return self._output()
+
+    def _output(self) -> NDArray[np.float64] | None:
+        return None if self._style.waits and (self.finished or self._halted) else self._desired
 
     @abstractmethod
     def close(self) -> None:
@@ -134,14 +139,16 @@ class ArmMover(ABC):
         if not self._controller.acting:
             reason = takeover_reason(status, self._last_applied, self._answers)
             raise CollectionError(f"the guard of {self._arm.name} holds the arm: {reason}")
-        error = self._tracking_error
-        if not error.max() <= 1:  # also for NaN
-            j = int(np.argmax(error))
-            unit = "m" if self._arm.prismatic[j] else "rad"
-            raise TrackingError(
-                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g} {unit}, its "
-                f"target is {self._desired[j]:.3g} {unit}. Check for an obstacle, then validate the model."
-            )
+        if not self._style.waits and not self._tracking_error.max() <= 1:  # also for NaN
+            raise self._does_not_follow()
+
+    def _does_not_follow(self) -> TrackingError:
+        j = int(np.argmax(self._tracking_error))
+        unit = "m" if self._arm.prismatic[j] else "rad"
+        return TrackingError(
+            f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g} {unit}, its "
+            f"target is {self._desired[j]:.3g} {unit}. Check for an obstacle, then validate the model."
+        )
 
     def _begin(self) -> Steps:
         """Waits until the efforts act and their ramp is complete. During the ramp, the target is constant."""
@@ -166,25 +173,42 @@ class ArmMover(ABC):
 
     def _follow(self, trajectory: CubicTrajectory) -> Steps:
         began, self._motion_end = self._time, self._time + trajectory.duration
+        before, waited, least = self._time, 0.0, np.inf
         while self._time < self._motion_end:
+            step, before = self._time - before, self._time
+            behind = float(self._tracking_error.max()) if self._style.waits else 0.0
+            if behind > 1:
+                began, self._motion_end = began + step, self._motion_end + step
+                waited, least = (0.0, behind) if behind < least - _PROGRESS else (waited + step, least)
+                if waited > STALL:
+                    raise self._does_not_follow()
+            else:
+                waited, least = 0.0, np.inf
             self._desired = trajectory.state(self._time - began)
             yield
         self._desired = trajectory.state(trajectory.duration)
 
-    def _settle(self) -> Generator[None, None, bool]:
-        """Waits until the arm is at rest. Returns False if it does not come to rest within `SETTLE`."""
-        tolerance = self._arm.per_joint(*REST) + 1.5 * self._arm.encoder_counts()
-        detector = RestDetector(tolerance, REST_TIME)
+    def _settle(self, duration: float = REST_TIME) -> Generator[None, None, bool]:
+        """Waits until the arm is at rest for `duration` [s]. Returns False if it does not settle within `SETTLE`.
+
+        Raises:
+            TrackingError: The arm is not near its target.
+        """
+        detector = RestDetector(self._arm.per_joint(*REST) + 1.5 * self._arm.encoder_counts(), duration)
         end = self._time + SETTLE
-        while not detector.is_at_rest(self._time, self._q):
+        while True:
+            is_at_rest, is_near = detector.is_at_rest(self._time, self._q), bool(self._tracking_error.max() <= 1)
+            if is_at_rest and is_near and not self._controller.is_busy():
+                return True
             if self._time > end:
+                if not is_near:
+                    raise self._does_not_follow()
                 return False
             yield
-        return True
 
     def _brake(self) -> Steps:
         """Brakes the arm to rest before the present trajectory would end, so that the arm stays inside the limits."""
         self._activity = "stopping"
-        if self._in_control:
+        if self._in_control and not self._style.waits:  # otherwise HOLD stops the arm
             duration = min(_BRAKE, max(self._motion_end - self._time, 1e-3))
             yield from self._follow(CubicTrajectory.braking(self._desired, duration))

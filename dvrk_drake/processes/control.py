@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.lcm_messages import describe_state
-from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.arm_controller import ArmController, GoalController
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
 from dvrk_drake.systems.lcm.arm_link import ArmLink
 
@@ -104,7 +104,7 @@ StatusHandler = Callable[[lcmt_dvrk_status, float], NDArray[np.float64] | None]
 
 def control(
     link: ArmLink,
-    controller: ArmController,
+    controller: ArmController | GoalController,
     stopped: Callable[[], bool],
     report: Callable[[LiveStatus], None],
     on_status: StatusHandler = lambda status, time: None,
@@ -150,8 +150,10 @@ def control(
     _release(link, controller, start)
 
 
-def _release(link: ArmLink, controller: ArmController, start: float) -> None:
+def _release(link: ArmLink, controller: ArmController | GoalController, start: float) -> None:
     """Commands HOLD until a status shows that the controller is not in control."""
+    if link.release():
+        return
     end = link.now() + _RELEASE
     while link.now() < end:
         status = link.next_status(SILENCE)

@@ -106,6 +106,10 @@ class ArmLink(ABC):
         data = command.encode()
         self._publish(data if self._key is None else self._key.sign(data))
 
+    def release(self) -> bool:
+        """Commands the arm to hold its pose without an answer to a status. Returns False if it needs an answer."""
+        return False
+
     def _receive(self, data: bytes) -> None:
         if self._replays:
             status = decode(lcmt_dvrk_status, data)
