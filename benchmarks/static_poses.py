@@ -28,7 +28,7 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, estimated_duration
+from dvrk_drake.processes.collector import CollectionSettings, estimated_duration
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from motions import true_dynamics
@@ -70,7 +70,7 @@ def compare(arm: Arm, arms: int, count: int) -> None:
             model = identify_static(dvrk.Recording(q=poses, tau=tau, source="simulated"), arm).model
             error = model.holding_torque(test) - expected
             errors[which].append(np.sqrt(np.mean(error**2, axis=0)) / scale)
-            duration[which].append(estimated_duration(arm, poses[0], poses, CrtkCollectionSettings()) / 60)
+            duration[which].append(estimated_duration(arm, poses[0], poses, CollectionSettings()) / 60)
         # Friction that the average does not cancel, for equal signs (first row) and for all other sign patterns.
         own = np.sum([abs(e.coefficient * joint_row(arm, e.coordinate)) for e in friction], axis=0)
         left = [averaged_friction(arm, friction, design.poses, pattern) for pattern in signs]

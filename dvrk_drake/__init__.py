@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from dvrk_drake.models.locked_joints import lock_joints
     from dvrk_drake.models.plant import add_arm, set_arm_positions
     from dvrk_drake.processes.calibration import calibrate
+    from dvrk_drake.processes.collector import CollectionSettings
+    from dvrk_drake.processes.connection import ArmConnection, Dialog, connect
     from dvrk_drake.recordings.periodic_motion import PeriodicMotion
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording
@@ -48,7 +50,10 @@ if TYPE_CHECKING:
 #: Mapping from a public name to the module that defines it.
 _MODULES = {
     "Arm": "models.arm",
+    "ArmConnection": "processes.connection",
     "ArmStation": "systems.arm_station",
+    "CollectionSettings": "processes.collector",
+    "Dialog": "processes.connection",
     "DvrkDrakeError": "errors",
     "Environment": "models.environment",
     "GravityPidController": "systems.gravity_pid_controller",
@@ -65,6 +70,7 @@ _MODULES = {
     "add_closed_loop": "systems.closed_loop",
     "calibrate": "processes.calibration",
     "check": "analysis.check.recording_check",
+    "connect": "processes.connection",
     "design_excitation": "analysis.excitation.design",
     "design_poses": "analysis.excitation.static_poses",
     "export_model": "export.model_export",
@@ -88,7 +94,10 @@ _MODULES = {
 
 __all__ = [
     "Arm",
+    "ArmConnection",
     "ArmStation",
+    "CollectionSettings",
+    "Dialog",
     "DvrkDrakeError",
     "Environment",
     "GravityPidController",
@@ -105,6 +114,7 @@ __all__ = [
     "add_closed_loop",
     "calibrate",
     "check",
+    "connect",
     "design_excitation",
     "design_poses",
     "export_model",

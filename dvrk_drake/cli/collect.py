@@ -4,33 +4,24 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
 from dvrk_drake.cli.app import HARDWARE, AnyArm, CollectedArm, ControlledArm, Seconds, app, one_of
-from dvrk_drake.cli.collect_motion import follow_motion
-from dvrk_drake.cli.lcm import checked_start, ready_controller
+from dvrk_drake.cli.lcm import connect_arm
 from dvrk_drake.cli.support import (
     check_output,
     interrupt_ends_process,
     load_key,
-    load_model,
     print_notes,
     print_written,
-    quiet_drake,
 )
 from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from dvrk_drake.models.arm import Arm as LoadedArm
-    from dvrk_drake.processes.collector import Collector
-    from dvrk_drake.processes.crtk_collector import CrtkCollector
-    from dvrk_drake.recordings.pose_file import CollectionFile
+    from dvrk_drake.processes.connection import ArmConnection
+    from dvrk_drake.processes.live_status import LiveLine
 
 collect = App(name="collect", group=HARDWARE, help="Measure an arm: teach poses, collect static poses or a motion.")
 app.command(collect)
@@ -97,36 +88,16 @@ def teach(
         poses: Pose file to write. The poses of an existing file are kept.
         at_rest: Also add each pose at which the arm is at rest for one second.
     """
-    from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.control import control
-    from dvrk_drake.processes.live_status import LiveLine
-    from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.processes.teacher import EnterKey, Teacher
-    from dvrk_drake.recordings.pose_file import load_poses_if_any
-
     check_output(poses, overwrite=True)
-    load_poses_if_any(poses, load_arm(controlled.arm))  # rejects an invalid file before the arm is connected
     with interrupt_ends_process():
-        controller, link, _ = ready_controller(controlled, "gravity")
-        stopped = stop_on_signals()
-    line = LiveLine(sys.stderr)
-    teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=line.report)
+        connection, line = _connect(controlled, keys=True)
     event = "Enter or one second of rest" if at_rest else "Enter"
-    print(
-        f"{controller.arm.name} compensates gravity; move the arm by hand; {event} adds a pose, Ctrl-C ends", flush=True
-    )
+    print(f"{event} adds a pose, Ctrl-C ends", flush=True)
     try:
-        control(
-            link(),
-            controller,
-            stopped,
-            lambda text: line.show(lambda: f"{len(teacher.poses)} poses; {text}"),
-            teacher.update,
-        )
+        count = connection.teach(poses, at_rest=at_rest)
     finally:
-        teacher.close()
         line.clear()
-    print_written(poses, f"{len(teacher.poses)} poses; the guard of {controller.arm.name} regulates the pose")
+    print_written(poses, f"{count} poses; the guard of {connection.arm.name} regulates the pose")
 
 
 @collect.command(name="poses")
@@ -159,10 +130,31 @@ def collect_poses(
     lcm_only = {"realtime": controlled.realtime, "reset": controlled.reset}
     controlled.check(lcm=lcm_only, ros={"max_effort": max_effort, "yes": yes})
     check_output(poses, overwrite=True)
-    if controlled.is_ros:
-        _visit_over_ros(controlled, poses, output, both_sides, traverse_time, max_effort, yes)
-    else:
-        _visit(controlled, poses, output, both_sides, traverse_time)
+    check_output(output, poses, controlled.model or "", overwrite=True)
+    given = {} if max_effort is None else {"max_effort": max_effort}
+    with interrupt_ends_process():
+        from dvrk_drake.processes.collector import CollectionSettings
+
+        settings = CollectionSettings(traverse_time, both_sides, **given)
+        connection, line = _connect(controlled, keys=controlled.is_ros, confirms=controlled.is_ros and not yes)
+    try:
+        collector = connection.collect_poses(poses, output, settings)
+    finally:
+        line.clear()
+    if collector is None:
+        if connection.dialog.stopped():
+            raise KeyboardInterrupt
+        return
+    print(f"{output}: {collector.done.sum()} of {len(collector.done)} poses; the arm holds its pose", flush=True)
+    if collector.problem is not None:
+        raise collector.problem
+    if connection.dialog.stopped():
+        raise KeyboardInterrupt
+    if collector.unsettled:
+        numbers = ", ".join(map(str, collector.unsettled))
+        raise CollectionError(
+            f"the arm did not come to rest at poses {numbers}. Run the command again to repeat these poses"
+        )
 
 
 @collect.command(name="motion")
@@ -184,138 +176,54 @@ def collect_motion(
         output: CSV file for the measurements.
         rehearse: Follow one period of the motion at a fifth of its speed. Required once before the first recording.
     """
-    follow_motion(controlled, motion, None if rehearse else output)
-
-
-def _visit(
-    controlled: ControlledArm,
-    poses_file: str,
-    output_file: str,
-    both_sides: bool,
-    traverse_time: float,
-) -> None:
-    import numpy as np
-
-    from dvrk_drake.models.approach import offset_pose
-    from dvrk_drake.processes.collector import CollectionSettings, Collector, short_approach_offset
-    from dvrk_drake.processes.control import control
-    from dvrk_drake.processes.live_status import LiveLine
-    from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.recordings.pose_file import pose_environment
-
-    settings = CollectionSettings(traverse_time, both_sides)
-    arm, poses, output = _files(controlled, poses_file, output_file, both_sides)
-    num_done = output.finished(poses).sum()
-    if num_done == len(poses):
-        print(f"{output_file}: contains all {len(poses)} poses already")
-        return
+    check_output(motion, overwrite=True)
+    if output is not None:
+        check_output(output, motion, controlled.model or "", overwrite=True)
     with interrupt_ends_process():
-        controller, link, _period = ready_controller(controlled, "hold")
-        first = poses[int(np.argmin(output.finished(poses)))]
-        if both_sides:
-            first = offset_pose(arm, first, -short_approach_offset(arm))
-        checked_start(load_model(controlled.model, controlled.arm), link, first, pose_environment(poses_file))
-        stopped = stop_on_signals()
-    line = LiveLine(sys.stderr)
-    collector = Collector(poses, controller, output, settings, stopped=stopped, report=line.report)
-    print(f"{len(poses) - num_done} poses of {arm.name} remain; after Ctrl-C, the same command continues", flush=True)
+        connection, line = _connect(controlled, keys=True)
     try:
-        control(
-            link(),
-            controller,
-            lambda: collector.finished,
-            lambda text: line.show(lambda: f"{collector.describe()}; {text}"),
-            collector.update,
-        )
+        played = connection.play(motion, output)
     finally:
-        collector.close()
         line.clear()
-        print(f"{output_file}: {collector.done.sum()} of {len(poses)} poses", flush=True)
-    _end(collector, stopped)
+    if played.path is not None:
+        what = f"{played.begin:.1f} to {played.end:.1f} s of {played.duration:g} s"
+        if output is None:
+            what = f"largest tracking error {100 * played.tracking_error:.1f} % of the range of a joint"
+        print_written(played.path, what)
+    if not played.is_complete:
+        if connection.dialog.stopped():
+            raise KeyboardInterrupt
+        raise CollectionError(f"{motion}: the motion ended early, at {played.end:.1f} s; run the command again")
+    if output is not None:
+        from dvrk_drake.recordings.motion_parts import recorded_parts, useful
+        from dvrk_drake.recordings.periodic_motion import PeriodicMotion
+
+        parts = recorded_parts(output, connection.arm, PeriodicMotion.load(motion, connection.arm))
+        files = " ".join(str(part.path) for part in useful(parts, played.duration))
+        print(f"Next: dvrk-drake identify {files} --arm {controlled.arm} --output model.yaml", flush=True)
 
 
-def _visit_over_ros(
-    controlled: CollectedArm,
-    poses_file: str,
-    output_file: str,
-    both_sides: bool,
-    traverse_time: float,
-    max_effort: float | None,
-    yes: bool,
-) -> None:
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.processes.crtk_collection import Dialog, bag_path, run_crtk_collection
-    from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings
+def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -> tuple[ArmConnection, LiveLine]:
+    """Returns the connection to the arm, with a dialog on the terminal, and its status line.
+
+    Args:
+        controlled: Options of the command.
+        keys: Whether the Enter key has an effect.
+        confirms: Whether the operator must confirm the first motion, if there is a terminal.
+    """
+    from dvrk_drake.processes.connection import Dialog
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey
-    from dvrk_drake.systems.ros.open_domain import domain_number
 
-    quiet_drake()
-    domain_number(controlled.domain)  # rejects an invalid number before any other step
-    settings = CrtkCollectionSettings(traverse_time, both_sides)
-    if max_effort is not None:
-        settings = CrtkCollectionSettings(traverse_time, both_sides, max_effort)
-    arm, poses, output = _files(controlled, poses_file, output_file, both_sides)
-    remaining = len(poses) - output.finished(poses).sum()
-    if not remaining:
-        print(f"{output_file}: contains all {len(poses)} poses already")
-        return
-    model = None if controlled.model is None else IdentifiedModel.load(controlled.model, arm)
-    line, bag = LiveLine(sys.stderr), bag_path(output_file)
-    with interrupt_ends_process():
-        stopped = stop_on_signals()
-    has_keys = sys.stdin is not None and sys.stdin.isatty()
-    enter = EnterKey(sys.stdin) if has_keys else lambda: False
+    stopped, line = stop_on_signals(), LiveLine(sys.stderr)
+    has_keys = keys and sys.stdin is not None and sys.stdin.isatty()
+    enter = EnterKey(sys.stdin) if has_keys else None
 
     def confirm() -> None:
-        if has_keys and not yes:
+        if confirms and enter is not None:
             print("Clear the workspace of the arm. Enter starts the motion, Ctrl-C ends the command.", flush=True)
             while not stopped() and not enter():
                 time.sleep(0.02)
 
-    print(f"{remaining} poses of {arm.name} remain; after Ctrl-C, the same command continues", flush=True)
-    dialog = Dialog(stopped, confirm, enter, line.report, line.show)
-    collector = None
-    try:
-        collector = run_crtk_collection(
-            arm, poses, output, bag, settings, dialog, model=model, topic=controlled.topic, domain=controlled.domain
-        )
-    finally:
-        line.clear()
-    if collector is None:
-        raise KeyboardInterrupt
-    print(
-        f"{output_file}: {collector.done.sum()} of {len(poses)} poses; messages: {bag}; hold was published", flush=True
-    )
-    _end(collector, stopped)
-
-
-def _files(
-    controlled: ControlledArm, poses_file: str, output_file: str, both_sides: bool
-) -> tuple[LoadedArm, NDArray[np.float64], CollectionFile]:
-    """Returns the arm, the poses, and the output file, which may contain some of the poses.
-
-    Raises:
-        CollectionError: A file is not valid, or the output file has other poses.
-    """
-    from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
-
-    arm = load_arm(controlled.arm)
-    poses = load_poses(poses_file, arm)
-    check_output(output_file, poses_file, controlled.model or "", overwrite=True)
-    return arm, poses, CollectionFile(output_file, arm, both_sides)
-
-
-def _end(collector: Collector | CrtkCollector, stopped: Callable[[], bool]) -> None:
-    """Raises the error that ended a collection early, if there is one."""
-    if collector.problem is not None:
-        raise collector.problem
-    if stopped():
-        raise KeyboardInterrupt
-    if collector.unsettled:
-        numbers = ", ".join(map(str, collector.unsettled))
-        raise CollectionError(
-            f"the arm did not come to rest at poses {numbers}. Run the command again to repeat these poses"
-        )
+    return connect_arm(controlled, Dialog(stopped, confirm, enter, line.report, line.show)), line

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import closing, contextmanager, suppress
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import Parameter
 
@@ -19,15 +19,10 @@ from dvrk_drake.cli.support import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_schema import Gains
-    from dvrk_drake.models.environment import Environment
-    from dvrk_drake.processes.arm_controller import ArmController
+    from dvrk_drake.processes.connection import ArmConnection, Dialog
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
@@ -68,21 +63,16 @@ def control(
         hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
         friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.
     """
-    from dvrk_drake.processes.control import control
+    from dvrk_drake.processes.connection import Dialog
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     with interrupt_ends_process():
         compensator = _friction_compensator(controlled, mode, friction_ratio, hysteresis_ratio, friction_model)
         checked_gains = None if gains is None else _gains(gains, mode, controlled.arm)
-        controller, link, period = ready_controller(controlled, mode, compensator, checked_gains)
         stopped = stop_on_signals()
-    name = controller.arm.name
-    print(
-        f"mode {mode} of {name} at {1 / period:.0f} Hz as sender {controller.sender_id}; after Ctrl-C, the guard "
-        "regulates the pose",
-        flush=True,
-    )
+        connection = connect_arm(controlled, Dialog(stopped, report=lambda line: print(line, flush=True)))
+    name = connection.arm.name
     line, printed = LiveLine(sys.stderr), [("", "")]
 
     def show(status: LiveStatus) -> None:
@@ -94,8 +84,7 @@ def control(
         print(status, flush=True)
 
     try:
-        # Messages that arrived during the creation of the controller are out of date, so a new link is opened.
-        control(link(), controller, stopped, show)
+        connection.run(mode, gains=checked_gains, friction=compensator, report=show)
     finally:
         line.clear()
     print(f"control ended; the guard of {name} regulates the pose", flush=True)
@@ -220,103 +209,26 @@ def _friction_compensator(
     return compensator
 
 
-def ready_controller(
-    controlled: ControlledArm,
-    mode: Mode,
-    friction: FrictionCompensator | None = None,
-    gains: Gains | None = None,
-) -> tuple[ArmController, Callable[[], LcmArmLink], float]:
-    """Returns a controller for the arm, a function that opens the link to the arm, and the status period [s].
-
-    With --reset, the function prints and clears a latched fault of the arm. It also resumes control of an arm that the
-    watchdog holds. The link accepts only the session of the arm that this function checked. It therefore rejects an arm
-    that was restarted in the meantime.
-
-    Args:
-        controlled: Options of the command.
-        mode: Control mode.
-        friction: Compensator of friction and hysteresis. None: friction is not compensated.
-        gains: Gains for damping and pose regulation. None: the gains of the arm file.
-
-    Raises:
-        ModelError: The model belongs to another arm.
-        KeyFileError: The key cannot be used.
-        ControllerError: No arm responds, or the arm cannot be controlled in its present state.
-    """
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
+    """Returns the connection to the arm that the options of a command define."""
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.arm_controller import ArmController
-    from dvrk_drake.processes.arm_operator import reset_fault
-    from dvrk_drake.processes.control import first_status
+    from dvrk_drake.processes.connection import connect
     from dvrk_drake.processes.pace import settle_memory
-    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
+
+    def ready() -> None:
+        settle_memory()
+        request_realtime(controlled.realtime)
 
     quiet_drake()
-    arm, key = load_arm(controlled.arm), load_key(controlled.key)
-    model = IdentifiedModel.from_arm(arm) if controlled.model is None else IdentifiedModel.load(controlled.model, arm)
-    if controlled.model is not None and (warning := model_warning(controlled.model, model)):
-        print_warning(warning)
-    url = open_lcm(controlled.lcm_url).get_lcm_url()
-    print(f"waiting for {arm.name} on LCM {url}", flush=True)
-    with closing(LcmArmLink(arm, url, key=key)) as link:
-        if controlled.reset:
-            reset_fault(link, print_warning)
-        status, period = first_status(link)
-    controller = ArmController(arm, model, mode, period, friction, gains)
-    settle_memory()
-    request_realtime(controlled.realtime)
-    return controller, lambda: LcmArmLink(arm, url, key=key, before=status), period
-
-
-def checked_start(
-    model: IdentifiedModel,
-    link: Callable[[], LcmArmLink],
-    q_end: NDArray[np.float64],
-    environment: Environment,
-) -> NDArray[np.float64]:
-    """Checks the straight path in joint space from the present pose of an arm to the first pose of a collection.
-
-    Args:
-        model: Model of the arm that predicts the efforts.
-        link: Function that opens the link to the arm.
-        q_end: First pose (n,) [rad, m].
-        environment: Fixed objects around the arm.
-
-    Returns:
-        Present pose (n,) [rad, m].
-
-    Raises:
-        CollectionError: The links would collide on the path, or the motors cannot hold the arm.
-        ControllerError: The arm sends no status.
-    """
-    import numpy as np
-
-    from dvrk_drake.analysis.excitation.motion_limits import path_obstacle
-    from dvrk_drake.errors import CollectionError
-    from dvrk_drake.processes.control import SILENCE
-
-    with closing(link()) as opened:
-        q = np.array(opened.next_status(SILENCE).position)
-    if obstacle := path_obstacle(model.arm, q, q_end, environment, model):
-        raise CollectionError(
-            f"{model.arm.name} cannot move from its present pose to the first pose: {obstacle}. Move the arm by hand "
-            "to another pose first (dvrk-drake control --mode gravity)"
-        )
-    return q
-
-
-def model_warning(path: str, model: IdentifiedModel) -> str:
-    """Returns a warning if the model was not validated or a joint failed the validation, otherwise ""."""
-    from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
-
-    if model.validation is None:
-        bad = unfit(cross_validated_verdicts(model), "usable")
-        verdict = f"; verdict by cross-validation: {', '.join(bad)}" if bad else ""
-        command = f"dvrk-drake validate OTHER.csv --model {path} --save"
-        return f"{path}: the model was not validated on another recording{verdict}; run: {command}"
-    verdicts = model.validation.verdicts
-    if not (bad := unfit({joint.name: verdicts[joint.name] for joint in model.joints}, "usable")):
-        return ""
-    recording = model.validation.recording
-    return f"{path}: failed validation on {recording}: {', '.join(bad)}; for these joints, zero torque may be better"
+    return connect(
+        load_arm(controlled.arm),
+        cast(Literal["lcm", "ros"], getattr(controlled, "transport", "lcm")),
+        model=controlled.model,
+        lcm_url=controlled.lcm_url,
+        key=controlled.key,
+        topic=getattr(controlled, "topic", None),
+        domain=getattr(controlled, "domain", None),
+        reset=controlled.reset,
+        dialog=dialog,
+        ready=ready,
+    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, System
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
@@ -22,7 +22,6 @@ from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.lcm.arm_link import ArmLink
 from dvrk_drake.systems.lcm.dvrk_command import draw_id, make_command
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-
 
 #: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
 #: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
@@ -136,6 +135,7 @@ class ArmController:
         arm: Controlled arm.
         sender_id: Identifier of this controller in its command messages.
         acting: True if the last status shows that the arm applies the efforts of this controller.
+        period: Period of the status messages [s].
         style: How this controller moves the arm in mode "hold".
     """
 
@@ -143,7 +143,7 @@ class ArmController:
         self,
         arm: Arm,
         model: IdentifiedModel,
-        mode: Mode,
+        mode: Mode | System,
         period: float,
         friction: FrictionCompensator | None = None,
         gains: Gains | None = None,
@@ -153,17 +153,24 @@ class ArmController:
         Args:
             arm: Arm to control.
             model: Model of the arm with its actual base orientation.
-            mode: Mode of the controller.
+            mode: Mode of the controller, or a System that replaces the GravityPidController. It has an input port
+                `state_estimated` (2n) and an output port `effort` (n).
             period: Period of the status messages [s].
             friction: Friction compensator for mode "gravity". It is added to the Diagram. None: friction is not
                 compensated.
             gains: Gains for the modes "hold" and "damped". None: the gains of `arm` are used.
         """
         builder = DiagramBuilder()
-        self.arm, self._mode, self._period = arm, mode, period
+        self.arm, self.period = arm, period
         self._link, self.style = _Exchange(arm), MotionStyle.of_efforts(arm)
         station = builder.AddSystem(HardwareArmStation(arm, driver=DvrkDriver(status_period=period), link=self._link))
-        self._controller = builder.AddSystem(GravityPidController(model, period=period, gains=gains, mode="gravity"))
+        self._mode = mode if isinstance(mode, str) else None
+        own = (
+            mode
+            if not isinstance(mode, str)
+            else GravityPidController(model, period=period, gains=gains, mode="gravity")
+        )
+        self._controller = builder.AddSystem(own)
         self._ramp = builder.AddSystem(EffortRamp(arm.num_joints, period=period))
         name, desired_effort = arm.name.lower(), self._controller.GetOutputPort("effort")
         state = station.GetOutputPort(f"{name}.state_estimated")
@@ -210,11 +217,12 @@ class ArmController:
         if acts != self.acting:
             self.acting = acts
             # The change of the mode from "gravity" to "hold" stores the pose to hold and resets the integrator.
-            self._controller.SetMode(self._controller_context, self._mode if acts else "gravity")
+            if self._mode is not None:
+                self._controller.SetMode(self._controller_context, self._mode if acts else "gravity")
         if desired_state is not None:
             self._controller.GetInputPort("desired_state").FixValue(self._controller_context, desired_state)
         self._link.status, self._link.time = status, time
         # At the start of this step, the station reads the status. At its end, the station sends the command.
         self._num_answers += 1
-        self._simulator.AdvanceTo(self._num_answers * self._period)
+        self._simulator.AdvanceTo(self._num_answers * self.period)
         return self._link.command

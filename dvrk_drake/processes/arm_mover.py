@@ -101,7 +101,7 @@ class ArmMover(ABC):
             self._last_applied = status
         self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
         if self.finished:
-            return self._output()
+            return self._desired_or_hold()
         try:
             if self._in_control:
                 self._check(status)
@@ -113,9 +113,9 @@ class ArmMover(ABC):
             self.finished = True
         except DvrkDrakeError as error:
             self.problem, self.finished = error, True
-        return self._output()
+        return self._desired_or_hold()
 
-    def _output(self) -> NDArray[np.float64] | None:
+    def _desired_or_hold(self) -> NDArray[np.float64] | None:
         return None if self._style.waits and (self.finished or self._halted) else self._desired
 
     @abstractmethod

@@ -40,6 +40,11 @@ class CollectionSettings:
         max_effort: Largest absolute difference between the measured effort and the gravity effort of the model, as a
             fraction of the effort limit of the joint. With the arm's own controller, a larger difference for 50 ms
             stops the collection. Other controllers have a command guard.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> dvrk.CollectionSettings(traverse_time=10.0).both_sides
+        True
     """
 
     traverse_time: float = field(default=5.0, metadata=within(1.0, 60.0, "s"))
@@ -209,7 +214,11 @@ def estimated_duration(
     arm: Arm, q: NDArray[np.float64], poses: NDArray[np.float64], settings: CollectionSettings
 ) -> float:
     """Returns the estimated duration [s] of a collection of poses (m, n) that begins at q (n,), over ROS 2."""
-    speed, style, total = (arm.position_upper - arm.position_lower) / settings.traverse_time, MotionStyle.of_goals(arm), 0.0
+    speed, style, total = (
+        (arm.position_upper - arm.position_lower) / settings.traverse_time,
+        MotionStyle.of_goals(arm),
+        0.0,
+    )
     for pose in poses:
         for begin in approaches(arm, pose, settings, style):
             for goal, rest, share in _motions(begin, pose, style):
@@ -219,9 +228,7 @@ def estimated_duration(
     return total
 
 
-def summary(
-    arm: Arm, q: NDArray[np.float64], poses: NDArray[np.float64], settings: CollectionSettings
-) -> list[str]:
+def summary(arm: Arm, q: NDArray[np.float64], poses: NDArray[np.float64], settings: CollectionSettings) -> list[str]:
     """Returns lines on the poses (m, n) of a collection that begins at q (n,): ranges of the goals, and duration."""
     width, style = max(map(len, arm.joint_names)), MotionStyle.of_goals(arm)
     begins = [begin for pose in poses for begin in approaches(arm, pose, settings, style) if begin is not None]

@@ -1,4 +1,4 @@
-"""Moves an arm along a designed motion over LCM and records it."""
+"""Moves an arm along a designed motion and records it."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class MotionPlayer(ArmMover):
         # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
 
-    def update(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
+    def update(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64] | None:
         """Processes a status and returns the desired state (2n,); see `ArmMover.update`."""
         desired = super().update(status, time)
         if self._is_recording:

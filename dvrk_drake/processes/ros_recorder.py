@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -20,6 +21,7 @@ from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
+    from dvrk_drake.systems.ros.domain import RosDomain
     from dvrk_drake.systems.ros.messages import JointState
     from dvrk_drake.systems.ros.topic import Subscription
 
@@ -33,6 +35,7 @@ class RosRecorder:
     """Writes the unmodified JointState messages of one arm to a new bag while they arrive, with its transforms.
 
     Attributes:
+        path: Path of the bag.
         source: Name of the ROS domain, for messages.
         num_rows: Number of recorded valid messages of the arm, without those on a separate topic, e.g. of the jaw.
     """
@@ -42,7 +45,7 @@ class RosRecorder:
         arm: Arm,
         path: str | Path,
         topic: str | None = None,
-        domain: int | None = None,
+        domain: int | RosDomain | None = None,
         report: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Creates a recorder. The file is created when the topic of the arm is found.
@@ -52,7 +55,8 @@ class RosRecorder:
             path: Path of the new bag, *.mcap.
             topic: JointState topic or its namespace. Default: the only topic `/<ARM>/measured_js`, in any namespace,
                 where ARM is the name of the arm, optionally followed by a number.
-            domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
+            domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0. A domain that is open already
+                must have received the topics of the arm.
             report: Function that is called with one line if the search for the arm takes longer than a second.
 
         Raises:
@@ -60,9 +64,9 @@ class RosRecorder:
             DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
         """
         check_stream_output(path, (".mcap",))
-        self._arm, self._path, self._topic = arm, path, topic
+        self._arm, self.path, self._topic = arm, path, topic
         self._report = report
-        self._domain = open_ros_domain(domain)
+        self._domain = open_ros_domain(domain) if domain is None or isinstance(domain, int) else domain
         self.source = self._domain.name
         self.num_rows = 0
         self._num_invalid = 0
@@ -88,7 +92,7 @@ class RosRecorder:
                 have other joints, or the file cannot be written.
         """
         with closing(self._domain):
-            self._subscribe(stopped)
+            self.subscribe(stopped)
             self._record_until(duration, stopped, show)
         if self._bag is None:
             raise RecordingError(self._no_message_reason(stopped()))
@@ -101,15 +105,27 @@ class RosRecorder:
             while not stopped() and time.monotonic() < end:
                 self._domain.wait(_POLL)
                 before = self._bag
-                for subscription in self._subscriptions:
-                    for message, published in subscription.take():
-                        self._record(subscription, message, published)
+                self.update()
                 if before is None and self._bag is not None:
                     end = time.monotonic() + duration
                 show(self.describe)
         finally:
-            if self._bag is not None:
-                self._bag.close()
+            self.close()
+
+    def update(self) -> None:
+        """Records the messages that have arrived.
+
+        Raises:
+            RecordingError: The messages have other joints, or the file cannot be written.
+        """
+        for subscription in self._subscriptions:
+            for message, published in subscription.take():
+                self._record(subscription, message, published)
+
+    def close(self) -> None:
+        """Ends the file."""
+        if self._bag is not None:
+            self._bag.close()
 
     def describe(self) -> str:
         """Returns the text of the status line: the number of messages, the rate, and missing messages."""
@@ -133,8 +149,12 @@ class RosRecorder:
         silent = [f"no message on {topic}; commands of dvrk-drake need this topic" for topic in sorted(self._silent)]
         return [*lines, *silent]
 
-    def _subscribe(self, stopped: Callable[[], bool]) -> None:
-        """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one."""
+    def subscribe(self, stopped: Callable[[], bool]) -> None:
+        """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one.
+
+        Raises:
+            RecordingError: The arm was not found, see `find_topic`.
+        """
         from dvrk_drake.systems.ros.messages import JointState
 
         main = find_topic(self._domain, self._arm, self._topic, stopped=stopped, report=self._report)
@@ -155,7 +175,7 @@ class RosRecorder:
                 self._check_joints(message)
                 self._frames = FrameMessages(self._arm, subscription.topic.rpartition("/")[0])
                 measured = [Topic(each.topic, JOINT_STATE) for each in self._subscriptions]
-                self._bag = GrowingMcap(self._path, [*measured, *self._frames.topics])
+                self._bag = GrowingMcap(self.path, [*measured, *self._frames.topics])
         if self._bag is None:
             return
         # ROS 2 uses version 1 of the CDR encoding.
@@ -191,8 +211,16 @@ class RosRecorder:
         if self._num_invalid:
             return f"{topic}: all {self._num_invalid} messages have header stamp 0 (invalid data). Home the arm first."
         if stopped:
-            return f"{self._path} was not written: the recording ended before the first message on {topic}"
+            return f"{self.path} was not written: the recording ended before the first message on {topic}"
         return f"no message within {FIRST_STATUS:.0f} s on {topic}"
 
     def _num_missing(self) -> int:
         return sum(missing.count for missing in self._missing.values())
+
+
+def bag_path(output: str | Path) -> Path:
+    """Returns the path of the first bag of an output that does not exist: poses_1.mcap, poses_2.mcap for poses.csv."""
+    output, number = Path(output), 1
+    while os.path.lexists(path := output.with_name(f"{output.stem}_{number}.mcap")):
+        number += 1
+    return path

@@ -22,11 +22,11 @@ def simulated(monkeypatch):
     arm = load_arm("mtml")
     what = SimpleNamespace(stopped=lambda sticky: False, off_at=None, arms=[])
 
-    def ready(options, mode):
+    def start(connection, mode):
         controller = ArmController(arm, IdentifiedModel.from_arm(arm), mode, PERIOD)
         what.arms.append(StickyArm(arm, IdentifiedModel.from_arm(arm), np.zeros(7), near_poses()[0]))
         opened = SimpleNamespace(next_status=lambda _: what.arms[-1].status(), close=lambda: None)
-        return controller, lambda: opened, PERIOD
+        return controller, opened
 
     def control(link, controller, stopped, report, on_status):
         sticky = what.arms[-1]
@@ -35,8 +35,8 @@ def simulated(monkeypatch):
             sticky.off = sticky.ticks == what.off_at
             sticky.step(controller.answer(status, time, on_status(status, time)))
 
-    monkeypatch.setattr("dvrk_drake.cli.collect.ready_controller", ready)
-    monkeypatch.setattr("dvrk_drake.processes.control.control", control)
+    monkeypatch.setattr("dvrk_drake.processes.connection.ArmConnection._start", start)
+    monkeypatch.setattr("dvrk_drake.processes.connection.control", control)
     monkeypatch.setattr(
         "dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: lambda: what.stopped(what.arms[-1])
     )

@@ -199,7 +199,7 @@ def test_live_status_describes_new_refusals():
 
 
 def test_run_prints_each_change_once(controller, monkeypatch, capsys):
-    def control(link, controller, stopped, report):
+    def control(link, controller, stopped, report, on_status):
         for state, pace, problem in [
             ("hold", "1 Hz", ""),
             ("hold", "2 Hz", ""),
@@ -207,11 +207,9 @@ def test_run_prints_each_change_once(controller, monkeypatch, capsys):
         ] * 2:
             report(LiveStatus(state, pace, problem))
 
-    monkeypatch.setattr(
-        "dvrk_drake.cli.lcm.ready_controller",
-        lambda options, mode, friction, gains: (controller, lambda: None, 1e-3),
-    )
-    monkeypatch.setattr("dvrk_drake.processes.control.control", control)
+    link = SimpleNamespace(close=lambda: None)
+    monkeypatch.setattr("dvrk_drake.processes.connection.ArmConnection._start", lambda *_: (controller, link))
+    monkeypatch.setattr("dvrk_drake.processes.connection.control", control)
     monkeypatch.setattr("dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: None)
     assert main(["control", "--arm", "mtml", "--reset"]) == 0
     output = capsys.readouterr()

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from sticky_arm import Disk
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector, approaches, estimated_duration
+from dvrk_drake.processes.arm_controller import GoalController, MotionStyle
+from dvrk_drake.processes.collector import CollectionSettings, Collector, approaches, estimated_duration
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
+from dvrk_drake.systems.ros.crtk_move_link import CrtkMoveLink
 from dvrk_drake.systems.ros.sim_crtk_driver import SimCrtkDriver
 
 pytestmark = pytest.mark.slow
@@ -70,10 +73,18 @@ class SimulatedClient:
         )
         stamp = round(1e9 * self.time)
         self.measurement = SimpleNamespace(
-            q=state[: self.arm.num_joints], effort=effort.copy(), stamp=stamp, arrival=stamp, problem=""
+            q=state[: self.arm.num_joints],
+            v=state[self.arm.num_joints :],
+            effort=effort.copy(),
+            stamp=stamp,
+            arrival=stamp,
+            problem="",
         )
         self.num_received += 1
         return True
+
+    def hold(self):
+        self._driver.Receive(CrtkCommand("hold"))
 
     def move_jp(self, q):
         assert not self.arm.limit_violations(q, 1e-9)
@@ -97,7 +108,7 @@ def remaining_friction(arm, q, settings):
     then contains up to F (1 - d / 2 s), where d is the length of the approach. An element that slides in one direction
     only adds the mean F / 2.
     """
-    ends = approaches(arm, q, settings)
+    ends = approaches(arm, q, settings, MotionStyle.of_goals(arm))
     bound = np.zeros(arm.num_joints)
     for effect in arm.effects.friction:
         if effect.kind != "viscous":
@@ -111,13 +122,16 @@ def remaining_friction(arm, q, settings):
 def test_friction_cancels_in_both_approach_directions(tmp_path):
     poses = MTML.sample_poses(4, np.random.default_rng(4), margin=0.1)
     client, model = SimulatedClient(MTML), IdentifiedModel.from_arm(MTML)
-    settings = CrtkCollectionSettings()
+    settings = CollectionSettings()
     output = CollectionFile(tmp_path / "p.csv", MTML, both_sides=True)
-    collector = CrtkCollector(poses, client, output, settings, ControlModel(model))
+    link = CrtkMoveLink(client, ControlModel(model), settings.max_effort)
+    controller = GoalController(MTML, lambda: link.is_busy)
+    collector = Collector(poses, controller, output, settings, writer=Disk())
     start, estimate = client.time, estimated_duration(MTML, np.zeros(7), poses, settings)
     while not collector.finished:
         assert client.time - start < 2 * estimate
-        collector.update(client.time)
+        status = link.update(client.time)
+        link.send(controller.answer(status, client.time, collector.update(status, client.time)))
     output.close()
     assert collector.problem is None and collector.done.all()
     # A real arm may need more or less time to come to rest.

@@ -1,4 +1,4 @@
-"""CrtkCollector with a substitute for the arm, without DDS."""
+"""Collector over ROS 2 with a substitute for the arm, without DDS."""
 
 from types import SimpleNamespace
 
@@ -8,17 +8,14 @@ from substitute_crtk_arm import PERIOD, Collection, SubstituteArm
 
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.processes.crtk_collection import bag_path, summary
-from dvrk_drake.processes.crtk_collector import (
-    DELAY,
-    GOAL_PERIOD,
-    CrtkCollectionSettings,
-    approaches,
-    estimated_duration,
-)
+from dvrk_drake.processes.arm_controller import MotionStyle
+from dvrk_drake.processes.collector import DELAY, CollectionSettings, approaches, estimated_duration, summary
+from dvrk_drake.processes.ros_recorder import bag_path
 from dvrk_drake.recordings.reading import read_recording
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
+
+from dvrk_drake.systems.ros.crtk_move_link import GOAL_PERIOD
 
 MTML = load_arm("mtml")
 POSES = MTML.sample_poses(2, np.random.default_rng(0), margin=0.1)
@@ -45,7 +42,7 @@ def test_friction_cancels_in_rows(collection, tmp_path):
     cells = (tmp_path / "p.csv").read_text().splitlines()
     friction = np.array([row.split(",")[-7:] for row in cells[1:]], float)
     np.testing.assert_allclose(friction, [0.1 * MTML.effort_limits] * 2, rtol=0, atol=1e-12)
-    assert collection.arm.commands == ["move_jp"]
+    assert collection.arm.commands == ["move_jp", "hold"]
 
 
 def test_goals_advance_slowly_on_a_line(collection):
@@ -72,7 +69,7 @@ def test_pause_holds_and_repeats_the_pose(collection):
     assert len(arm.goals) == goals and collection.collector.paused
     collection.keys = 1
     assert collection.run().done.all() and not collection.collector.paused
-    assert arm.commands == ["move_jp", "hold", "move_jp"]
+    assert arm.commands == ["move_jp", "hold", "move_jp", "hold"]
     assert collection.lines[:2] == ["paused: the arm holds its pose; Enter continues", "continued"]
 
 
@@ -113,7 +110,7 @@ def jump(arm):
             lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.75 * MTML.effort_limits),
             "of shoulder_pitch differs from the",
         ),
-        (lambda arm: disturb(arm, is_blocked=True), "it does not follow. "),
+        (lambda arm: disturb(arm, is_blocked=True), "does not follow: "),
         (lambda arm: disturb(arm, is_silent=True), "no message on /MTML/measured_js for 1 s"),
         (lambda arm: disturb(arm, problem="/MTML/measured_js: a position is not finite"), "is not finite"),
         (jump, "elbow_pitch jumped by 0.1"),
@@ -133,7 +130,7 @@ def test_soft_stops(collection, fault, message):
     fault(collection.arm)
     goals, start = len(collection.arm.goals), collection.arm.time
     problem = collection.run().problem
-    assert isinstance(problem, CollectionError) and str(problem).startswith("MTML stopped: ")
+    assert isinstance(problem, CollectionError) and str(problem).startswith(("MTML stopped: ", "MTML does not follow: "))
     assert message in str(problem) and "\n" not in str(problem)
     is_slow = "follow" in message or "1 s" in message
     assert collection.arm.time - start < (3.0 if is_slow else 0.1)
@@ -148,13 +145,13 @@ def test_slow_arm_is_waited_for(collection, speed, is_accepted):
     """The speed is given in ranges of the joints per second. The goals move by up to one range per second."""
     collection.arm._speed = speed * (MTML.position_upper - MTML.position_lower)
     problem = collection.run().problem
-    assert problem is None if is_accepted else "it does not follow. " in str(problem)
+    assert problem is None if is_accepted else "does not follow: " in str(problem)
 
 
 def test_goals_of_the_summary_contain_the_approaches():
-    settings = CrtkCollectionSettings(1.0)
+    settings = CollectionSettings(1.0)
     pose = np.zeros(7)
-    ends = np.array(approaches(MTML, pose, settings))
+    ends = np.array(approaches(MTML, pose, settings, MotionStyle.of_goals(MTML)))
     line = summary(MTML, pose, pose[None], settings)[1]
     assert ends[0, 0] < 0 < ends[1, 0] and line.endswith(f"{ends[0, 0]:.3f} to {ends[1, 0]:.3f}")
     assert np.all(MTML.position_lower <= ends) and np.all(ends <= MTML.position_upper)
@@ -191,7 +188,7 @@ def test_start_outside_the_limits_is_refused(collection):
 
 
 def test_estimated_duration(collection):
-    settings = CrtkCollectionSettings(1.0)
+    settings = CollectionSettings(1.0)
     estimate = estimated_duration(MTML, np.zeros(7), POSES, settings)
     start = collection.arm.time
     collection.run()
@@ -206,7 +203,7 @@ def test_estimated_duration(collection):
 @pytest.mark.parametrize("value", [0.0, 2.5, float("nan")])
 def test_settings_are_checked(value):
     with pytest.raises(CollectionError, match="max_effort"):
-        CrtkCollectionSettings(max_effort=value)
+        CollectionSettings(max_effort=value)
 
 
 def test_bag_path(tmp_path):

@@ -3,10 +3,14 @@
 from types import SimpleNamespace
 
 import numpy as np
+from sticky_arm import Disk
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
-from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, CrtkCollector
+from dvrk_drake.errors import CollectionError
+from dvrk_drake.processes.arm_controller import GoalController
+from dvrk_drake.processes.collector import CollectionSettings, Collector
 from dvrk_drake.recordings.pose_file import CollectionFile
+from dvrk_drake.systems.ros.crtk_move_link import CrtkMoveLink
 
 #: Interval of the measurements [s].
 PERIOD = 0.01
@@ -68,7 +72,7 @@ class SubstituteArm:
         effort = self.model.gravity_effort(self.q) + self._direction * self.friction + self.extra
         stamp = _STAMP + round(1e9 * PERIOD * self.ticks) + self.stamp_offset
         self.measurement = SimpleNamespace(
-            q=self.q, effort=effort, stamp=stamp, arrival=round(1e9 * self.time), problem=self.problem
+            q=self.q, v=0.0 * self.q, effort=effort, stamp=stamp, arrival=round(1e9 * self.time), problem=self.problem
         )
         self.num_received += 1
         return True
@@ -106,20 +110,36 @@ class Collection:
 
     def __init__(self, arm, poses, path, stopped=lambda: False, **settings):
         self.arm, self.lines, self.keys = arm, [], 0
-        checked = CrtkCollectionSettings(**({"traverse_time": 1.0} | settings))
+        checked = CollectionSettings(**({"traverse_time": 1.0} | settings))
         self.output = CollectionFile(path, arm.arm, checked.both_sides)
-        self.collector = CrtkCollector(
-            poses, arm, self.output, checked, arm.model, stopped=stopped, enter=self._enter, report=self.lines.append
+        self.link = CrtkMoveLink(arm, arm.model, checked.max_effort)
+        self.controller = GoalController(arm.arm, lambda: self.link.is_busy)
+        self.collector = Collector(
+            poses,
+            self.controller,
+            self.output,
+            checked,
+            stopped=stopped,
+            enter=self._enter,
+            report=self.lines.append,
+            writer=Disk(),
         )
 
     def run(self, until=lambda: False, seconds=600.0):
         """Runs the collection until it has finished, or until a condition is true."""
-        end = self.arm.time + seconds
-        while not self.collector.finished and not until():
+        end, collector = self.arm.time + seconds, self.collector
+        while not collector.finished and not until():
             assert self.arm.time < end, "the collection did not end"
             self.arm.step()
-            self.collector.update(self.arm.time)
-        return self.collector
+            try:
+                status = self.link.update(self.arm.time)
+            except CollectionError as error:
+                collector.problem, collector.finished = error, True
+                break
+            if status is not None:
+                desired = collector.update(status, self.arm.time)
+                self.link.send(self.controller.answer(status, self.arm.time, desired))
+        return collector
 
     def _enter(self):
         self.keys, pressed = max(self.keys - 1, 0), self.keys > 0

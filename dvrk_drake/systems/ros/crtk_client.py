@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS, find_topic, wait_unless_stopped
@@ -368,3 +369,64 @@ def connect_client(
         if text := problem():
             raise ControllerError(text)
     return client
+
+
+def publish_hold(domain: RosDomain, namespace: str, seconds: float) -> bool:
+    """Publishes `hold` of an arm until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
+
+    Raises:
+        DvrkDrakeError: DDS cannot send the message.
+    """
+    hold = domain.advertise(f"{namespace}/hold", Empty)
+    state = domain.subscribe(f"{namespace}/operating_state", OperatingState, latched=True)
+    end = time.monotonic() + seconds
+
+    def attempt(longest: float) -> bool:
+        hold.publish(Empty())
+        is_received = hold.wait_until_received(longest)
+        return is_received and bool(state.publisher_participants() & hold.subscriber_participants())
+
+    return repeat_until_confirmed(attempt, lambda: time.monotonic() >= end)
+
+
+class CrtkObserver:
+    """Receives the measurements of one arm without publishing anything. Other processes may control the arm."""
+
+    def __init__(
+        self,
+        domain: RosDomain,
+        arm: Arm,
+        topic: str | None = None,
+        report: Callable[[str], None] = lambda line: None,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Finds the arm and subscribes to its measurements; see `find_arm` for the arguments."""
+        namespace = find_arm(domain, arm, topic, report=report, stopped=stopped)
+        self._domain, self._arm = domain, arm
+        self._reader = JointStateReader(arm, f"{namespace}/measured_js")
+        self._measured = domain.subscribe(f"{namespace}/measured_js", JointState)
+        jaw = f"{namespace}/{arm.separate_joint}/measured_js"
+        self._jaw = domain.subscribe(jaw, JointState) if arm.separate_joint else None
+
+    def next_status(self, seconds: float) -> lcmt_dvrk_status:
+        """Returns the next measurement as a status with the measured values only.
+
+        Raises:
+            ControllerError: No valid measurement arrives within `seconds`.
+        """
+        end, problem = time.monotonic() + seconds, f"no message on {self._measured.topic} for {seconds:g} s"
+        while (left := end - time.monotonic()) > 0:
+            self._domain.wait(left)
+            for message, _ in self._jaw.take() if self._jaw else ():
+                self._reader.read_jaw(message, time.monotonic_ns())
+            for message, _ in self._measured.take():
+                measured = self._reader.read(message, time.monotonic_ns())
+                problem = measured.problem
+                if not problem:
+                    status = lcmt_dvrk_status()
+                    status.arm_name, status.num_joints = self._arm.name, self._arm.num_joints
+                    status.utime = measured.stamp // 1000
+                    status.position, status.velocity = measured.q.tolist(), measured.v.tolist()
+                    status.effort_measured = measured.effort.tolist()
+                    return status
+        raise ControllerError(problem)

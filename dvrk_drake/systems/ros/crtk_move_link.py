@@ -190,9 +190,10 @@ class CrtkMoveLink(ArmLink):
         ratio = np.abs(change) / (self._span * (_JUMP + _JUMP_SPEED * interval))
         j = int(np.argmax(ratio))
         if ratio[j] > 1:
+            unit = "m" if self.arm.prismatic[j] else "rad"
             raise CollectionError(
-                f"{self.arm.joint_names[j]} jumped by {change[j]:.3g} {'m' if self.arm.prismatic[j] else 'rad'} between "
-                "two messages. Check the encoder of the joint"
+                f"{self.arm.joint_names[j]} jumped by {change[j]:.3g} {unit} between two messages. Check the encoder "
+                "of the joint"
             )
 
     def _check_effort(self, q: NDArray[np.float64], effort: NDArray[np.float64], now: float) -> None:

@@ -22,7 +22,8 @@ from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.processes.crtk_collector import CrtkCollectionSettings, approaches
+from dvrk_drake.processes.arm_controller import MotionStyle
+from dvrk_drake.processes.collector import CollectionSettings, approaches
 from dvrk_drake.recordings.pose_file import load_poses
 
 
@@ -108,7 +109,7 @@ def test_path_above_a_table_has_no_collision():
     design = dvrk.design_poses(arm, 10, limits=limits)
     points = []
     for pose in design.poses:
-        for begin in approaches(arm, pose, CrtkCollectionSettings()):
+        for begin in approaches(arm, pose, CollectionSettings(), MotionStyle.of_goals(arm)):
             points += [begin, pose]
     assert np.min(points, axis=0)[2] >= 0.05 and np.max(points, axis=0)[2] <= 0.2
     path = [a + s * (b - a) for a, b in pairwise(points) for s in np.linspace(0, 1, 23)]

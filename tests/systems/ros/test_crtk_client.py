@@ -8,8 +8,8 @@ pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.processes.crtk_collection import Dialog, _connect
 from dvrk_drake.systems.ros.crtk_client import connect_client
+from dvrk_drake.systems.ros.crtk_move_link import connect_move_link
 
 ARM = load_arm("mtml")
 #: Longest time between Ctrl-C and the end of a wait [s].
@@ -65,7 +65,7 @@ def test_ctrl_c_ends_the_wait_for_an_arm_that_is_not_ready(stop, monkeypatch):
     """`collect poses --transport ros` waits 2 s for an arm that is enabled and homed."""
     domain = SubstituteDomain()
     client = SimpleNamespace(namespace="/MTML", not_ready_reason="operating_state is DISABLED", receive=lambda: None)
-    monkeypatch.setattr("dvrk_drake.systems.ros.crtk_client.connect_client", lambda *arguments, **options: client)
+    monkeypatch.setattr("dvrk_drake.systems.ros.crtk_move_link.connect_client", lambda *arguments, **options: client)
     with pytest.raises(DvrkDrakeError, match="the connection to /MTML was stopped; no command was sent to the arm"):
-        _connect(domain, ARM, None, Dialog(stopped=lambda: domain.time >= stop))
+        connect_move_link(domain, ARM, None, None, 0.6, stopped=lambda: domain.time >= stop)
     assert domain.time <= stop + LONGEST
