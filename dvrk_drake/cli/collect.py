@@ -13,7 +13,6 @@ from dvrk_drake.cli.lcm import connect_arm
 from dvrk_drake.cli.support import (
     check_output,
     interrupt_ends_process,
-    load_key,
     print_notes,
     print_written,
 )
@@ -45,30 +44,26 @@ def record(
         duration: Duration [s], counted from the first message. Default: until Ctrl-C.
     """
     from dvrk_drake.models.arm_files import load_arm
+    from dvrk_drake.processes.connection import Dialog, connect
     from dvrk_drake.processes.live_status import LiveLine
-    from dvrk_drake.processes.recorder import Recorder
-    from dvrk_drake.processes.ros_recorder import RosRecorder
     from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.recordings.writer_stream import check_stream_output
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
     connected.check()
-    recorded, line = load_arm(connected.arm), LiveLine(sys.stderr)
-    recorder: Recorder | RosRecorder
-    if connected.is_ros:
-        recorder = RosRecorder(recorded, file, connected.topic, connected.domain, line.report)
-    else:
-        check_stream_output(file)
-        url, key = open_lcm(connected.lcm_url).get_lcm_url(), load_key(connected.key)
-        recorder = Recorder(recorded, file, url, key)
-    stopped = stop_on_signals()
-    print(f"recording {recorded.name} on {recorder.source}; Ctrl-C ends the recording", flush=True)
+    stopped, line = stop_on_signals(), LiveLine(sys.stderr)
+    connection = connect(
+        load_arm(connected.arm),
+        connected.transport,
+        lcm_url=connected.lcm_url,
+        key=connected.key,
+        topic=connected.topic,
+        domain=connected.domain,
+        dialog=Dialog(stopped, report=line.report, show=line.show),
+    )
     try:
-        recorder.run(float("inf") if duration is None else duration, stopped, line.show)
+        notes = connection.record(file, float("inf") if duration is None else duration)
     finally:
         line.clear()
-    print_written(file, f"{recorder.num_rows} rows")
-    print_notes(file, recorder.notes())
+    print_notes(file, notes)
 
 
 @collect.command

@@ -211,8 +211,9 @@ def _friction_compensator(
 
 def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
     """Returns the connection to the arm that the options of a command define."""
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.connection import connect
+    from dvrk_drake.processes.connection import connect, model_warning
     from dvrk_drake.processes.pace import settle_memory
 
     def ready() -> None:
@@ -220,10 +221,15 @@ def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
         request_realtime(controlled.realtime)
 
     quiet_drake()
+    arm, model = load_arm(controlled.arm), None
+    if controlled.model is not None:
+        model = IdentifiedModel.load(controlled.model, arm)
+        if warning := model_warning(controlled.model, model):
+            print_warning(warning)
     return connect(
-        load_arm(controlled.arm),
+        arm,
         cast(Literal["lcm", "ros"], getattr(controlled, "transport", "lcm")),
-        model=controlled.model,
+        model=model,
         lcm_url=controlled.lcm_url,
         key=controlled.key,
         topic=getattr(controlled, "topic", None),

@@ -28,11 +28,13 @@ from dvrk_drake.processes.collector import CollectionSettings, Collector, approa
 from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, StatusHandler, control, first_status
 from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.processes.motion_player import REHEARSAL_SPEED, MotionPlayer
+from dvrk_drake.processes.recorder import Recorder
 from dvrk_drake.processes.ros_recorder import RosRecorder, bag_path
 from dvrk_drake.processes.teacher import Teacher
 from dvrk_drake.recordings import motion_parts
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, pose_environment
+from dvrk_drake.recordings.writer_stream import check_stream_output
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.lcm.arm_link import ArmLink, LcmArmLink
@@ -127,7 +129,7 @@ class ArmConnection:
     Example:
         >>> import dvrk_drake as dvrk
         >>> connection = dvrk.connect(dvrk.load_arm("mtml"), lcm_url="memq://")
-        >>> connection.collect_poses("missing.yaml", "poses.csv")
+        >>> connection.collect_poses("missing.yaml", "poses.csv")  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         dvrk_drake.errors.CollectionError: missing.yaml: the pose file does not exist. ...
     """
@@ -231,6 +233,31 @@ class ArmConnection:
         finally:
             teacher.close()
         return len(teacher.poses)
+
+    def record(self, path: str | Path, duration: float = float("inf")) -> list[str]:
+        """Records the measurements of the arm until `dialog.stopped` returns true. The arm gets no command.
+
+        Args:
+            path: New file: *.mcap, or over LCM also *.csv or *.log.
+            duration: Duration since the first measurement [s].
+
+        Returns:
+            Notes on the recording, one line each.
+
+        Raises:
+            RecordingError: The file cannot be written, or no measurement arrives.
+            DvrkDrakeError: The arm is not found on ROS 2.
+        """
+        recorder: Recorder | RosRecorder
+        if self.transport == "ros":
+            recorder = RosRecorder(self.arm, path, self.topic, self.domain, self.dialog.report)
+        else:
+            check_stream_output(path)
+            recorder = Recorder(self.arm, path, open_lcm(self.lcm_url).get_lcm_url(), self.key)
+        self.dialog.report(f"recording {self.arm.name} on {recorder.source}")
+        recorder.run(duration, self.dialog.stopped, self.dialog.show)
+        self.dialog.report(f"wrote {path}: {recorder.num_rows} rows")
+        return recorder.notes()
 
     def collect_poses(
         self, poses: str | Path, output: str | Path, settings: CollectionSettings | None = None

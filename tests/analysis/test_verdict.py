@@ -31,12 +31,12 @@ from dvrk_drake.analysis.verdict import (
     worst,
 )
 from dvrk_drake.cli import main
-from dvrk_drake.cli.lcm import model_warning
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
+from dvrk_drake.processes.connection import Dialog, model_warning
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
@@ -265,22 +265,16 @@ def test_saved_verdicts_include_all_joints(truth, tmp_path):
         dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", verdicts)).check()
 
 
-def test_run_warns_before_connecting_to_the_arm(files, monkeypatch, capsys):
-    """Runs `ready_controller`, shared by run and collect, until it would open the network."""
+def test_commands_warn_before_connecting_to_the_arm(files, capsys):
+    """`connect_arm` is shared by control and collect. It does not open the network."""
     from dvrk_drake.cli import lcm
 
-    def stop(_):
-        raise ModelError("no network here")
-
-    monkeypatch.setattr("dvrk_drake.systems.lcm.lcm_network.open_lcm", stop)
     model, _, bad = files
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     capsys.readouterr()
     for path, warnings in ((model, 1), (None, 0)):
-        with pytest.raises(ModelError, match="no network"):
-            lcm.ready_controller(
-                SimpleNamespace(arm="mtmr", model=path, lcm_url="", realtime=False, key=None), "gravity"
-            )
+        options = SimpleNamespace(arm="mtmr", model=path, lcm_url="", realtime=False, key=None, reset=False)
+        assert lcm.connect_arm(options, Dialog()).arm.name == "MTMR"
         assert capsys.readouterr().err.count("shoulder_pitch (do not use)") == warnings
 
 

@@ -373,7 +373,7 @@ def test_control_ignores_spoofed_statuses_until_a_restart(controller, mode):
         linked.link._lcm.publish(status_channel(ARM), message)
         return LcmArmLink.next_status(linked.link, 0.05)
 
-    runner = SimpleNamespace(arm=ARM, lost=0, now=arm.now, next_status=next_status, send=arm.send)
+    runner = SimpleNamespace(arm=ARM, lost=0, now=arm.now, next_status=next_status, send=arm.send, release=arm.release)
     if mode == "restarted":
         with pytest.raises(ControllerError, match="MTML was restarted: look at it, then start again"):
             control(runner, controller, lambda: False, lambda status: None)

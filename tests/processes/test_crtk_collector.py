@@ -130,7 +130,9 @@ def test_soft_stops(collection, fault, message):
     fault(collection.arm)
     goals, start = len(collection.arm.goals), collection.arm.time
     problem = collection.run().problem
-    assert isinstance(problem, CollectionError) and str(problem).startswith(("MTML stopped: ", "MTML does not follow: "))
+    assert isinstance(problem, CollectionError) and str(problem).startswith(
+        ("MTML stopped: ", "MTML does not follow: ")
+    )
     assert message in str(problem) and "\n" not in str(problem)
     is_slow = "follow" in message or "1 s" in message
     assert collection.arm.time - start < (3.0 if is_slow else 0.1)

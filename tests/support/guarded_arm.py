@@ -31,6 +31,9 @@ class GuardedArm:
         self.status = status
         return status
 
+    def release(self):
+        return False
+
     def send(self, command):
         self.commands.append(command)
         self.guard.receive(command, self.utime)

@@ -89,7 +89,7 @@ class CrtkMoveLink(ArmLink):
 
     @property
     def is_busy(self) -> bool:
-        """Whether the arm moves to a goal, as it states itself."""
+        """True if the arm states that it moves to a goal."""
         state = self._client.operating_state
         return state is None or state.is_busy
 
