@@ -115,7 +115,9 @@ class ActuatorEffect:
         """
         kind = EFFECT_KINDS[self.kind]
         shape = _run_effect(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
-        return np.asarray(shape * (load if kind.loaded else 1.0) * np.abs(x) ** kind.position_power)
+        if kind.loaded:
+            shape *= load
+        return shape * np.abs(x) ** kind.position_power if kind.position_power else shape
 
 
 @compiled

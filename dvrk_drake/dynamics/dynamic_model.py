@@ -45,9 +45,14 @@ def effect_shapes(
     rows = arm.effect_coordinates
     if transmitted is None:
         transmitted = nominal_weight(regressor, q) if is_loaded(effects) else np.zeros_like(a)
+    motion: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
     for effect in effects:
         h = rows[effect.coordinate]
-        yield effect.column(a @ h, a_dot @ h, np.abs(transmitted @ h) / (h @ h))
+        if effect.coordinate not in motion:
+            # Effects of one coordinate follow each other, so only the motion of the last one is kept.
+            motion = {effect.coordinate: (a @ h, a_dot @ h)}
+        load = np.abs(transmitted @ h) / (h @ h) if is_loaded([effect]) else 0.0
+        yield effect.column(*motion[effect.coordinate], load)
 
 
 def is_loaded(effects: Iterable[ActuatorEffect]) -> bool:

@@ -25,7 +25,7 @@ from dvrk_drake.analysis.dynamic.estimates import (
     parameter_covariance,
 )
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
-from dvrk_drake.analysis.observations.motion_grid import MAX_ROWS, MotionGrid
+from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import (
     FOLDS,
@@ -33,6 +33,7 @@ from dvrk_drake.analysis.observations.repetition import (
     motion_floor,
     phase_folds,
 )
+from dvrk_drake.analysis.observations.true_time import MAX_ROWS
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor

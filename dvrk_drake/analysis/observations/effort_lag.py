@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.observations.low_pass import low_pass
-from dvrk_drake.analysis.observations.motion_grid import MAX_ROWS, MotionSignals, ends_of
+from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
+from dvrk_drake.analysis.observations.true_time import MAX_ROWS
 
 #: Cut-off of the low-pass filter for accelerations, efforts and regressor columns [Hz]. It is above the cut-offs of the
 #: efforts of the public motions (5.65 and 16.96 Hz). Half or twice the value changes only notes on delays of the public
@@ -67,12 +68,13 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
     inner = slice(start, len(signals.t) - start, -(-len(signals.t) // MAX_ROWS))
     tau = low_pass(signals.tau, rate, CUT_OFF)
     angles = signals.q[:, moving]
-    shared = np.hstack([signals.vd[:, moving], np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
+    columns_of_all = (signals.vd[:, moving], np.sin(angles), np.cos(angles), np.ones((len(angles), 1)))
+    shared = np.hstack([low_pass(columns, rate, CUT_OFF)[inner] for columns in columns_of_all])
     result = np.full((tau.shape[1], 5), np.nan)
     for j in np.flatnonzero(moving & np.any(tau != 0, axis=0)):
         v = signals.v[:, j]
         coulomb = np.tanh(v / (DIRECTION_WIDTH * np.sqrt(np.mean(v**2))))
-        columns = low_pass(np.column_stack([coulomb, v, shared]), rate, CUT_OFF)[inner]
+        columns = np.hstack([low_pass(np.column_stack([coulomb, v]), rate, CUT_OFF)[inner], shared])
         Q, _ = np.linalg.qr(columns / (np.sqrt(np.mean(columns**2, axis=0)) + np.finfo(float).tiny))
         result[j] = *_fit(tau[:, j], Q, inner, rate), *_coulomb(columns, tau[inner, j])
     lag, error, gain, size, size_error = result.T

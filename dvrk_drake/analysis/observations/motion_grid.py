@@ -25,9 +25,6 @@ ENDS, ENDS_SHARE = 1.0, 0.05
 #: Smallest accepted duration of a motion, and of each of its segments between gaps [s]. At the cut-off frequency of
 #: 10 Hz that is the default for efforts, it has 40 independent values of each effort.
 MIN_DURATION = 2.0
-#: Largest number of rows in a fit. A motion with more rows is thinned out after low-pass filtering. It limits the time
-#: and the memory for a long motion (benchmarks/long_recording.py).
-MAX_ROWS = 40_000
 #: Number of rows in one part of `MotionGrid.parts`. It limits the memory of a long motion. Half or twice the number
 #: changes no result of the public motions `mtm_one` and `psm_one`.
 PART_ROWS = 10_000

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 
-from dvrk_drake.analysis.observations.low_pass import correlation, low_pass, resample
+from dvrk_drake.analysis.observations.low_pass import low_pass, resample
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid, ends_of
 from dvrk_drake.recordings.recording import SAME_POSE
 
@@ -40,7 +41,9 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     count = len(x)
     squares = np.cumsum(np.sum(x**2, axis=1))
     lags = np.arange(count)
-    product = sum(correlation(column, column)[count - 1 :] for column in x.T)
+    # Autocorrelation sum_j sum_t x_j(t) x_j(t + T), with zeros after the end so that the ends do not overlap.
+    size = next_fast_len(2 * count, real=True)
+    product = irfft(sum(np.abs(rfft(column, size)) ** 2 for column in x.T), size)[:count]
     # Sum over t of (x(t) - x(t + T))^2, from running sums of squares and the autocorrelation.
     first, last = squares[count - 1 - lags], squares[-1] - np.concatenate([[0.0], squares[:-1]])[lags]
     difference = np.maximum(first + last - 2 * product, 0) / (count - lags) / (2 * x.shape[1])

@@ -24,6 +24,9 @@ GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
 MIN_SPEED = 1e-3
 #: Duration that is omitted at each end because of filter transients [s], at most a tenth of the motion.
 ENDS = 0.5
+#: Largest number of rows in a fit. A motion with more rows is thinned out after low-pass filtering. It limits the time
+#: and the memory for a long motion (benchmarks/long_recording.py).
+MAX_ROWS = 40_000
 #: Number of iterations of a fit. Twice as many change the printed lags on the public recordings by at most 0.1 ms.
 _ITERATIONS = 8
 
@@ -56,7 +59,8 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
     """
     v, qd = (low_pass(x, rate, min(CUT_OFF, 0.2 * rate), ORDER) for x in (central_difference(q, rate), qd))
     ends = min(int(ENDS * rate), len(q) // 10)
-    fits = np.array([_fit(v[:, j], qd[:, j], slice(ends, len(q) - ends)) for j in range(q.shape[1])])
+    inner = slice(ends, len(q) - ends, -(-len(q) // MAX_ROWS))
+    fits = np.array([_fit(v[:, j], qd[:, j], inner) for j in range(q.shape[1])])
     gain, samples, mismatch = fits.T
     lag = samples / rate
     return VelocityAgreement(gain, lag, mismatch, (np.abs(gain - 1) < GAIN_TOLERANCE) & (np.abs(lag) < LAG_TOLERANCE))
@@ -69,16 +73,16 @@ def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple
         return np.nan, np.nan, np.nan
     if size < MIN_SPEED:
         return 0.0, 0.0, 1.0
-    index = np.arange(len(v), dtype=float)
+    index, slopes = np.arange(len(v), dtype=float), np.gradient(v)
+    rows, measured = index[inner], qd[inner]
     gain, lag = 1.0, 0.0
     for _ in range(_ITERATIONS):
-        shifted = np.interp(index - lag, index, v)
-        columns = np.column_stack([shifted, -np.gradient(shifted)])
-        (gain, slope), *_ = np.linalg.lstsq(columns[inner], qd[inner], rcond=None)
+        columns = np.column_stack([np.interp(rows - lag, index, x) for x in (v, -slopes)])
+        (gain, slope), *_ = np.linalg.lstsq(columns, measured, rcond=None)
         if gain == 0.0:
             break
         lag += float(np.clip(slope / gain, -3, 3))
-    residual = (qd - gain * np.interp(index - lag, index, v))[inner]
+    residual = measured - gain * np.interp(rows - lag, index, v)
     return float(gain), lag, float(np.sqrt(np.mean(residual**2))) / size
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dvrk_drake.analysis.observations import low_pass as module
 from dvrk_drake.analysis.observations.low_pass import ORDER, central_difference, correlation, low_pass, resample
 
 pytestmark = pytest.mark.numeric
@@ -66,3 +67,14 @@ def test_resampling_does_not_overshoot_and_holds_the_ends():
     assert np.all(np.diff(y[100:151]) >= 0)
     np.testing.assert_allclose(resample(t, x, np.array([-1.0, 9.0])), [0.0, 0.5], atol=1e-12)
     np.testing.assert_allclose(resample(t, np.outer(t, [2.0, -1.0]), fine), np.outer(fine, [2.0, -1.0]), atol=1e-12)
+
+
+def test_parts_of_a_long_signal_give_the_result_of_the_whole(monkeypatch):
+    generator = np.random.default_rng(0)
+    t, x = np.cumsum(generator.uniform(0.5, 2.0, 300)), generator.normal(size=(300, 5))
+    times = np.concatenate([np.linspace(t[0] - 1, t[-1] + 1, 700), t[[40, 3]]])
+    whole = resample(t, x, times), low_pass(x, RATE, [10.0, 10.0, 10.0, 300.0, 20.0])
+    monkeypatch.setattr(module, "MAX_VALUES", 40)
+    parts = resample(t, x, times), low_pass(x, RATE, [10.0, 10.0, 10.0, 300.0, 20.0])
+    for expected, found in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
