@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from typing import Literal, get_args
+from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,8 +94,10 @@ class Recording:
     file_coordinates: Coordinates | Literal[""] = ""
     arm_name: str = ""
     times_from: Literal["column", "array", "messages", "rate"] = "array"
-    # Cache: mapping from a transmission to this recording in the other coordinates.
-    _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
+    # Caches: mapping from a transmission to this recording in the other coordinates, as long as that one is in use, and
+    # to the recording from which this one was converted. Strong references in both directions would keep both.
+    _converted: dict[LinearMap, ref[Recording]] = field(default_factory=dict, init=False, repr=False)
+    _originals: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         where = self.source or "recording"
@@ -275,24 +278,31 @@ class Recording:
         self._check_joint_count(arm)
         if self.coordinates == coordinates:
             return self
+        if arm.transmission in self._originals:
+            return self._originals[arm.transmission]
         is_wpi = self.coordinates == "wpi"
         # The same arm with another gravity vector has the same transmission.
-        if arm.transmission not in self._converted:
+        known = self._converted.get(arm.transmission)
+        converted = known() if known is not None else None
+        if converted is None:
             to_other = arm.transmission if coordinates == "actuator" else arm.transmission.inverse
             if is_wpi:
                 to_other = file_transmission(arm, "wpi").inverse
-            converted = self._converted[arm.transmission] = replace(
+            converted = replace(
                 self,
                 q=to_other.position(self.q),
                 qd=None if self.qd is None else to_other.velocity(self.qd),
                 tau=None if self.tau is None else to_other.inverse.pull_back_effort(self.tau),
                 coordinates="joint" if is_wpi else coordinates,
             )
+            self._converted[arm.transmission] = ref(converted)
             if not is_wpi:
-                converted._converted[arm.transmission] = self
-        if is_wpi:
-            return self._converted[arm.transmission]._in_coordinates(coordinates, arm)
-        return self._converted[arm.transmission]
+                converted._originals[arm.transmission] = self
+        return converted._in_coordinates(coordinates, arm) if is_wpi else converted
+
+    def __getstate__(self) -> dict[str, object]:
+        # Another process converts again, because weak references cannot be sent to it.
+        return {**self.__dict__, "_converted": {}}
 
     def check_fits(self, arm: Arm) -> None:
         """Checks that `arm` can reach the poses.
@@ -333,8 +343,7 @@ class Recording:
 
     def _coordinates_within_limits(self, arm: Arm) -> list[str]:
         """Returns other values of `--coordinates` that move all poses of the file within the limits."""
-        # A recording with a cached conversion may come from other coordinates.
-        if self.coordinates != "joint" or self._converted or self.file_coordinates:
+        if self.coordinates != "joint" or self._originals or self.file_coordinates:
             return []
         transmissions = {"wpi": file_transmission(arm, "wpi"), "actuator": arm.transmission}
         if np.array_equal(transmissions["wpi"].matrix, arm.transmission.matrix):

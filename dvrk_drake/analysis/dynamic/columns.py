@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -116,7 +116,7 @@ class DynamicColumns:
             tau=np.concatenate([own.tau for own in columns]),
             rigid=np.concatenate([own.rigid for own in columns]),
             tilts=np.concatenate([own.tilts for own in columns], axis=1),
-            shapes=tuple(map(np.concatenate, zip(*(own.shapes for own in columns), strict=True))),
+            shapes=_of_distinct(lambda *own: np.concatenate(own), *(own.shapes for own in columns)),
         )
 
     @property
@@ -131,7 +131,7 @@ class DynamicColumns:
     def with_effects(self, kept: NDArray[np.bool_]) -> DynamicColumns:
         """Returns the columns of the effects in the mask `kept` (e,)."""
         effects = tuple(effect for effect, keep in zip(self.effects, kept, strict=True) if keep)
-        shapes = tuple(shape[:, kept] for shape in self.shapes)
+        shapes = _of_distinct(lambda shape: shape[:, kept], self.shapes)
         return replace(self, effects=effects, shapes=shapes, rows=self.rows[kept])
 
     def with_load(
@@ -152,11 +152,25 @@ class DynamicColumns:
         loaded = [k for k, effect in enumerate(self.effects) if is_loaded([effect])]
         effects = [self.effects[k] for k in loaded]
         changed = [_effect_columns(grid, regressor, effects, tau) for grid, tau in zip(grids, transmitted, strict=True)]
-        shapes = []
-        for shape, *own in zip(self.shapes, *changed, strict=True):
-            shapes.append(shape.copy())
-            shapes[-1][:, loaded] = np.concatenate(own)[kept]
-        return replace(self, shapes=tuple(shapes))
+
+        def with_changed(shape: NDArray[np.float64], *own: NDArray[np.float64]) -> NDArray[np.float64]:
+            shape = shape.copy()
+            shape[:, loaded] = np.concatenate(own)[kept]
+            return shape
+
+        return replace(self, shapes=_of_distinct(with_changed, self.shapes, *changed))
+
+
+def _of_distinct(
+    function: Callable[..., NDArray[np.float64]], *shapes: Sequence[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], ...]:
+    """Applies a function to the shapes of each actuator. Actuators with the same delay keep sharing one array."""
+    results: dict[tuple[int, ...], NDArray[np.float64]] = {}
+    keys = [tuple(map(id, own)) for own in zip(*shapes, strict=True)]
+    for key, own in zip(keys, zip(*shapes, strict=True), strict=True):
+        if key not in results:
+            results[key] = function(*own)
+    return tuple(results[key] for key in keys)
 
 
 def drive_effects(arm: Arm, grids: Sequence[MotionGrid]) -> list[ActuatorEffect]:
@@ -368,14 +382,17 @@ def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
 
 def _filtered(grid: MotionGrid, regressor: DynamicRegressor, columns: BaseColumns) -> NDArray[np.float64]:
     """Returns the filtered independent columns (r, n, b) of the regressor of the actuators."""
-    arm, filtered = grid.arm, []
+    arm, shape = grid.arm, (grid.arm.num_joints, len(regressor.names))
+    efforts = np.zeros((len(grid.inner_rows), arm.num_joints, len(columns.independent)))
+    start, buffer = 0, np.empty((0, *shape))
     for part, rows in grid.parts():
-        Y = regressor.regressor(part.q, part.v, part.vd)
-        filtered.append(np.zeros((len(rows), arm.num_joints, len(columns.independent))))
+        if len(part.t) > len(buffer):
+            buffer = np.empty((len(part.t), *shape))
+        Y = regressor.regressor(part.q, part.v, part.vd, buffer[: len(part.t)])
         for i, drives in enumerate(arm.transmission.inverse.matrix.T):
             own, of_actuator = columns.of_actuator(Y, drives)
-            filtered[-1][:, i, own] = part.filter_rows(part.at_rows(of_actuator, i), rows)
-    efforts = np.concatenate(filtered)
+            efforts[start : start + len(rows), i, own] = part.filter_rows(part.at_rows(of_actuator, i), rows)
+        start += len(rows)
     return efforts if np.array_equal(grid.channels, np.eye(arm.num_joints)) else grid.channels @ efforts
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import RecordingEffect
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
-from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns
+from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.observations.low_pass import correlation
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import (
@@ -157,14 +157,15 @@ def parameter_covariance(
     A = _inverse(fit.information + fit.prior_precision)
     to_base = problem.to_base(len(fit.effects))
     middle = np.zeros((len(to_base),) * 2)
-    columns = [problem.actuator_columns(i, fit.effects) for i in range(residuals.shape[1])]
-    held_out = _held_out_residuals(problem, fit, residuals, columns, to_base)
-    for motion in series:
-        step = max(1, int(motion.rate / (2 * cut_off * _OVERSAMPLING)))
-        rows = slice(motion.rows.start, motion.rows.stop, step)
-        weights = fit.weights[problem.recording[motion.rows.start]]
-        for i, (weight, (own, X)) in enumerate(zip(weights, columns, strict=True)):
-            covariance = error_covariance(residuals[rows, i], held_out[rows, i], motion.rate / step, motion.period)
+    steps = _steps_without_folds(problem, fit, residuals, to_base)
+    for i, own_residuals in enumerate(residuals.T):
+        own, X = problem.actuator_columns(i, fit.effects)
+        held_out = own_residuals + np.einsum("rc,rc->r", X, steps[:, own][problem.fold])
+        for motion in series:
+            step = max(1, int(motion.rate / (2 * cut_off * _OVERSAMPLING)))
+            rows = slice(motion.rows.start, motion.rows.stop, step)
+            weight = fit.weights[problem.recording[motion.rows.start], i]
+            covariance = error_covariance(own_residuals[rows], held_out[rows], motion.rate / step, motion.period)
             middle[own[:, None], own] += (weight * step) ** 2 * (X[rows].T @ toeplitz_product(covariance, X[rows]))
     noise = to_base.T @ middle @ to_base
     factor = np.ones(len(A))
@@ -206,29 +207,25 @@ def _deviation_scale(fit: ConsistentFit, mean: NDArray[np.float64], noise: NDArr
     return max(float(scale), _MIN_SCALE)
 
 
-def _held_out_residuals(
-    problem: DynamicProblem,
-    fit: ConsistentFit,
-    residuals: NDArray[np.float64],
-    columns: Sequence[OwnColumns],
-    to_base: NDArray[np.float64],
+def _steps_without_folds(
+    problem: DynamicProblem, fit: ConsistentFit, residuals: NDArray[np.float64], to_base: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns the held-out residuals (r, n). The rows of each fold are predicted by a fit to the other folds.
+    """Returns the changes (folds, b + e) of the unknowns with which a fit without one fold predicts this fold.
 
-    The fit to the other folds is one Newton step from `fit`. It does not change parameters that are at their lower
-    bounds.
+    A held-out residual is the residual of `fit` plus the effort of this change. The fit without the fold is one Newton
+    step from `fit`. It does not change parameters that are at their lower bounds.
     """
-    held_out = residuals.copy()
     free = np.flatnonzero(fit.x > fit.lower)
     to_free = to_base[:, free]
     known = (fit.information + fit.prior_precision)[np.ix_(free, free)]
-    for fold in range(int(problem.fold.max()) + 1):
-        rows = np.flatnonzero(problem.fold == fold)
-        sums = NormalEquations.of(((own, X[rows]) for own, X in columns), len(to_base), residuals[rows]).total
-        own_sums = sums.weighted(fit.weights[problem.recording[rows[0]]])
-        step = to_free @ (_inverse(known - to_free.T @ own_sums[:-1, :-1] @ to_free) @ (to_free.T @ own_sums[:-1, -1]))
-        held_out[rows] += np.column_stack([X[rows] @ step[own] for own, X in columns])
-    return held_out
+    columns = (problem.actuator_columns(i, fit.effects) for i in range(residuals.shape[1]))
+    equations = NormalEquations.of(columns, len(to_base), residuals, problem.fold, recording=problem.recording)
+    steps = []
+    for fold in range(equations.folds):
+        sums = equations.of_fold(fold).weighted(fit.weights)
+        step = _inverse(known - to_free.T @ sums[:-1, :-1] @ to_free) @ (to_free.T @ sums[:-1, -1])
+        steps.append(to_free @ step)
+    return np.array(steps)
 
 
 def error_covariance(

@@ -101,7 +101,9 @@ class DynamicProblem:
     def rigid(self) -> NDArray[np.float64]:
         """Regressor columns (r, n, b) of the base parameters for gravity including the change `tilt`."""
         tilts = self.columns.tilts
-        return self.columns.rigid + np.tensordot(self.tilt[: len(tilts)], tilts, axes=(0, 0))
+        if not len(tilts):
+            return self.columns.rigid
+        return self.columns.rigid + np.tensordot(self.tilt, tilts, axes=(0, 0))
 
     @cached_property
     def prior(self) -> NDArray[np.float64]:
