@@ -13,12 +13,23 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from dvrk_drake.dynamics.compiled import entry_point
 from dvrk_drake.dynamics.holding_torque import HoldingArrays
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.slip_effort import MAX_SLIP_SHARE, slip_effort
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.gravity_pid_step import controller_step
+from dvrk_drake.systems.virtual_friction import NUM_STATES
 
-#: "hold" regulates a pose, "gravity" compensates gravity and leaves the arm free to move, "damped" adds damping.
-Mode = Literal["hold", "gravity", "damped"]
+#: "hold" regulates a pose, "gravity" compensates gravity and leaves the arm free to move, "damped" adds damping, and
+#: "guide" adds virtual dry friction, so the arm stays where a hand leaves it.
+Mode = Literal["hold", "gravity", "damped", "guide"]
+
+#: Distance within which a joint is at rest [rad], [m], in addition to 1.5 encoder counts. A hand that rests moves a
+#: joint less within `virtual_friction.REST_TIME`.
+_REST = 0.002, 0.0002
+
+#: Distance that a joint cannot move in one period, in addition to three encoder counts and to the measured motion
+#: [rad], [m]. The tolerances are those of the guard for a jump of the position.
+_JUMP = 0.01, 0.001
 
 _MODES: tuple[Mode, ...] = get_args(Mode)
 
@@ -31,6 +42,14 @@ class GravityPidController(LeafSystem):
     cables, springs and offsets. The holding torque of each joint is multiplied by its feedforward scale. The gain
     matrices are diagonal. In "gravity" mode tau = G(q). In "damped" mode tau = G(q) - Kd v, so an error of G causes a
     slow motion that does not accelerate.
+
+    **Guide.** In "guide" mode, virtual dry friction is added to G(q), so the arm stays where a hand leaves it, although
+    G(q) has an error and the friction of the arm relaxes. When a joint has rested for 0.25 s, a spring with the
+    stiffness Kp attaches at its position, without a step of the effort. The spring holds the joint up to its slip
+    effort. A larger effort of a hand breaks it away, and the joint is free until it rests again. Each spring is
+    passive: it returns at most the energy with which the hand deflected it, and dissipates this energy when it breaks
+    away. The damping Kd acts below about 0.1 rad/s, up to the slip effort. All springs detach if a measurement is not
+    valid, if the position jumps, and in all other modes. Their efforts then decay with a time constant of 20 ms.
 
     .. pydrake_system::
 
@@ -90,6 +109,7 @@ class GravityPidController(LeafSystem):
         gains: Gains | None = None,
         mode: Mode = "hold",
         effort_limits: ArrayLike | None = None,
+        slip_efforts: ArrayLike | None = None,
     ) -> None:
         """Creates the controller for the model's arm.
 
@@ -97,13 +117,15 @@ class GravityPidController(LeafSystem):
             model: Model that defines G(q). Its parameters are copied.
             period: Period of the update [s].
             gains: Gains with n numbers each. None: the gains of the arm.
-            mode: Initial mode: "hold", "gravity" or "damped".
+            mode: Initial mode: "hold", "gravity", "damped" or "guide".
             effort_limits: Largest magnitude (n,) [N m, N] of each joint's effort. None: the limits of the arm.
+            slip_efforts: Efforts (n,) [N m, N] up to which the virtual friction of mode "guide" holds the joints, at
+                most `MAX_SLIP_SHARE` times the effort limits of the arm. None: `slip_effort` of the model.
 
         Raises:
             ModelError: The model is not valid for its arm.
             ArmError: The arm of the model has locked joints.
-            ControllerError: A period, gain, mode or limit is invalid.
+            ControllerError: A period, gain, mode, limit or slip effort is invalid.
         """
         super().__init__()
         model.check()
@@ -117,26 +139,41 @@ class GravityPidController(LeafSystem):
         if not (np.isfinite(period) and period > 0):
             raise ControllerError(f"period must be a positive number of seconds; got {period}")
         self._period = float(period)
+        slip = np.asarray(slip_effort(model) if slip_efforts is None else slip_efforts, float)
+        if slip.shape != (n,) or not np.all((slip >= 0) & (slip <= MAX_SLIP_SHARE * arm.effort_limits)):
+            allowed = f"0 to {MAX_SLIP_SHARE:g} times the effort limits {(MAX_SLIP_SHARE * arm.effort_limits).tolist()}"
+            raise ControllerError(f"slip_efforts must be {n} numbers; allowed: {allowed}; got {slip.tolist()}")
 
         self.DeclareVectorInputPort(name="state_estimated", size=2 * n)
         self.DeclareVectorInputPort(name="desired_state", size=2 * n)
         gains = gains or arm.gains
         self._check_gains(gains)
         self._gains = [self.DeclareNumericParameter(BasicVector(k)) for k in (gains.kp, gains.kd, gains.ki)]
+        self._slip = self.DeclareNumericParameter(BasicVector(slip))
         self._mode = self.DeclareNumericParameter(BasicVector([self._mode_number(mode)]))
         # The states have the order of the arguments of the compiled step. NaN means that there is no pose yet.
         effort, gravity_effort, fault, *_ = (
             self.DeclareDiscreteState(BasicVector(np.full(size, value)))
-            for size, value in [(n, 0.0), (n, 0.0), (1, 0.0), (n, 0.0), (n, np.nan), (n, np.nan)]
+            for size, value in [
+                (n, 0.0),
+                (n, 0.0),
+                (1, 0.0),
+                (n, 0.0),
+                (n, np.nan),
+                (n, np.nan),
+                (NUM_STATES * n, 0.0),
+            ]
         )
         self.DeclareStateOutputPort(name="effort", state_index=effort)
         self.DeclareStateOutputPort(name="gravity_effort", state_index=gravity_effort)
         self.DeclareStateOutputPort(name="fault", state_index=fault)
-        self._scales_and_limits = np.array([model.feedforward_scale, limits])
+        counts = arm.encoder_counts()
+        tolerances = arm.per_joint(*_REST) + 1.5 * counts, arm.per_joint(*_JUMP) + 3.0 * counts
+        self._constants = np.array([model.feedforward_scale, limits, *tolerances])
         # Reading one cache entry at each update is faster than reading each parameter.
         self._settings = self.DeclareCacheEntry(
             "settings",
-            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((5, n)), 0)), calc=self._calc_settings),
+            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((8, n)), 0)), calc=self._calc_settings),
             {self.all_parameters_ticket()},
         )
         holding = model.static_model.with_parameters(model.theta)
@@ -188,9 +225,9 @@ class GravityPidController(LeafSystem):
         return float(_MODES.index(mode))
 
     def _calc_settings(self, context: Context, settings: AbstractValue) -> None:
-        gains = [context.get_numeric_parameter(index).get_value() for index in self._gains]
+        per_joint = [context.get_numeric_parameter(index).get_value() for index in (*self._gains, self._slip)]
         mode = int(context.get_numeric_parameter(self._mode).GetAtIndex(0))
-        settings.set_value((np.vstack([gains, self._scales_and_limits]), mode))
+        settings.set_value((np.vstack([per_joint, self._constants]), mode))
 
     def _make_update(self, holding: HoldingArrays, restart: bool) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.
@@ -224,6 +261,7 @@ class GravityPidController(LeafSystem):
                 group(3),
                 group(4),
                 group(5),
+                group(6),
             )
 
         return update

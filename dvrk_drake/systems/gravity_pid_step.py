@@ -8,13 +8,14 @@ import numpy as np
 from dvrk_drake.dynamics.compiled import compiled_for, read_only
 from dvrk_drake.dynamics.holding_torque import HOLDING, holding_torque_into
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
+from dvrk_drake.systems.virtual_friction import detach, virtual_friction
 
 #: Values of `mode`: indices into `gravity_pid_controller.Mode`.
-HOLD, GRAVITY, DAMPED = 0, 1, 2
+HOLD, GRAVITY, DAMPED, GUIDE = 0, 1, 2, 3
 
 
 _array = numba.float64[::1]
-_memory = (_array,) * 6
+_memory = (_array,) * 7
 _flag = numba.boolean
 
 
@@ -36,6 +37,7 @@ def controller_step(
     integral,
     latched_q,
     last_q,
+    springs,
 ):  # pragma: no cover - compiled
     """Performs one update of the controller. Vectors have n numbers unless another size is stated.
 
@@ -45,22 +47,31 @@ def controller_step(
         restart: True for the update at initialization.
         period: Period of the update [s].
         mode: Index into `Mode`.
-        per_joint: Rows (5, n): kp, kd, ki, feedforward scale, effort limits.
+        per_joint: Rows (8, n): kp, kd, ki, slip effort, feedforward scale, effort limits, and the tolerances of the
+            rest and of a jump, see `virtual_friction`.
         model: Model of the holding torque.
         effort, gravity, fault, integral: Results, which the function writes into these arrays. `fault` has one number.
         latched_q: Pose that is regulated if `has_desired` is False; NaN before the first pose.
         last_q: Last valid pose; NaN before the first pose.
+        springs: State (4n) of the virtual friction.
     """
     n = effort.size
-    kp, kd, ki, feedforward_scale, limit = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
-    hold, damped = mode == HOLD, mode == DAMPED
+    kp, kd, ki, slip, feedforward_scale = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
+    limit, tolerance, jump = per_joint[5], per_joint[6], per_joint[7]
+    hold, damped, guide = mode == HOLD, mode == DAMPED, mode == GUIDE
 
     if restart:
         for i in range(n):
             latched_q[i], last_q[i], integral[i] = np.nan, np.nan, 0.0
+        springs[:] = 0.0
     faulty = False
     for i in range(2 * n):
         faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true for NaN
+    effort[:] = 0.0
+    if guide and not faulty:
+        virtual_friction(state[:n], state[n:], last_q, period, kp, kd, slip, tolerance, jump, springs, effort)
+    else:
+        detach(period, springs, effort)
     if not faulty:
         for i in range(n):
             last_q[i] = state[i]
@@ -79,7 +90,7 @@ def controller_step(
         for i in range(n):
             latched_q[i], integral[i] = np.nan, 0.0
             braking = kd[i] * state[n + i] if damped and not faulty else 0.0
-            effort[i] = min(max(gravity[i] - braking, -limit[i]), limit[i])
+            effort[i] = min(max(gravity[i] - braking + effort[i], -limit[i]), limit[i])
         return
 
     if np.isnan(latched_q[0]):
@@ -88,7 +99,7 @@ def controller_step(
     for i in range(n):
         e = (desired[i] if has_desired else latched_q[i]) - state[i]
         de = (desired[n + i] if has_desired else 0.0) - state[n + i]
-        without_integral = gravity[i] + kp[i] * e + kd[i] * de
+        without_integral = gravity[i] + kp[i] * e + kd[i] * de + effort[i]
         increment = 0.0 if restart else ki[i] * e * period
         if ki[i] == 0.0:
             integral[i] = 0.0

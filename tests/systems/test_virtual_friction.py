@@ -1,0 +1,187 @@
+"""Virtual dry friction of mode "guide": it holds a joint at rest, breaks away, and never creates energy."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.slip_effort import MAX_SLIP_SHARE, is_cross_validated, slip_effort
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.virtual_friction import DECAY_TIME, NUM_STATES, REST_TIME, virtual_friction
+
+pytestmark = pytest.mark.numeric
+
+ARM = load_arm("mtml")
+MODEL = IdentifiedModel.from_arm(ARM)
+N = ARM.num_joints
+SLIP = 0.05 * ARM.effort_limits
+KP, KD = SLIP / 0.004, np.full(N, 0.01)  # a spring breaks away after 4 mrad
+PERIOD = 1e-3
+Q = 0.5 * (ARM.position_lower + ARM.position_upper)
+
+
+class Guided:
+    """Controller in mode "guide" and the effort that it adds to gravity."""
+
+    def __init__(self, **arguments):
+        gains = Gains(kp=KP.tolist(), kd=KD.tolist(), ki=[0.0] * N)
+        self.controller = GravityPidController(MODEL, mode="guide", gains=gains, slip_efforts=SLIP, **arguments)
+        self.context = self.controller.CreateDefaultContext()
+        self.added = np.zeros(N)
+        self.measure(Q)
+        self.controller.ExecuteInitializationEvents(self.context)
+
+    def measure(self, q, v=0.0):
+        state = np.concatenate([q, np.broadcast_to(v, N)])
+        self.controller.GetInputPort("state_estimated").FixValue(self.context, state)
+
+    def step(self, q, v=0.0):
+        """Makes one update. Returns the effort (n,) in addition to gravity."""
+        self.measure(q, v)
+        self.context.SetDiscreteState(self.controller.EvalUniquePeriodicDiscreteUpdate(self.context))
+        effort, gravity = (self.controller.GetOutputPort(p).Eval(self.context) for p in ("effort", "gravity_effort"))
+        self.added = effort - gravity
+        return self.added
+
+    def rest(self, q=Q, seconds=REST_TIME + 2 * PERIOD):
+        for _ in range(round(seconds / PERIOD)):
+            self.step(q)
+        return self
+
+
+def assert_no_effort(added):
+    np.testing.assert_allclose(added, np.zeros(N), atol=1e-12)
+
+
+def test_spring_attaches_after_a_rest_without_a_step():
+    guided, moved = Guided(), 0.5 * SLIP / KP
+    guided.rest(seconds=REST_TIME - 10 * PERIOD)
+    assert_no_effort(guided.step(Q + 1e-3))  # not yet attached
+    guided.rest(Q + 1e-3)
+    assert_no_effort(guided.added)
+    np.testing.assert_allclose(guided.step(Q + 1e-3 + moved), -0.5 * SLIP, atol=1e-12)
+    np.testing.assert_allclose(guided.step(Q + 1e-3 - moved), 0.5 * SLIP, atol=1e-12)
+    assert_no_effort(guided.step(Q + 1e-3))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_spring_breaks_away_at_the_slip_effort(side):
+    guided = Guided().rest()
+    efforts = [guided.step(Q + side * share * SLIP / KP, v=0.0) for share in np.arange(0.0, 1.3, 0.05)]
+    assert np.all(np.abs(efforts) <= SLIP * (1 + 1e-12))
+    np.testing.assert_allclose(efforts[19], -0.95 * side * SLIP, atol=1e-12)
+    for _ in range(round(10 * DECAY_TIME / PERIOD)):
+        guided.step(Q + side * 1.25 * SLIP / KP)
+    assert np.all(np.abs(guided.added) < 1e-3 * SLIP)  # free
+    guided.rest(Q + side * 1.25 * SLIP / KP)
+    np.testing.assert_allclose(guided.step(Q + side * 1.5 * SLIP / KP), -0.25 * side * SLIP, atol=1e-3 * SLIP.max())
+
+
+def test_each_joint_breaks_away_alone():
+    guided = Guided().rest()
+    moved = 0.5 * SLIP / KP
+    moved[2] *= 3.0
+    for _ in range(200):
+        guided.step(Q + moved)
+    others = np.arange(N) != 2
+    np.testing.assert_allclose(guided.added[others], -0.5 * SLIP[others], atol=1e-12)
+    assert abs(guided.added[2]) < 1e-3 * SLIP[2]
+
+
+def test_spring_does_not_attach_to_a_slow_hand():
+    guided, speed = Guided(), 0.05
+    for k in range(1000):
+        added = guided.step(Q + k * PERIOD * speed)
+    assert_no_effort(added)
+    end = Q + 1.0 * speed
+    guided.rest(end)
+    np.testing.assert_allclose(guided.step(end + 0.1 * SLIP / KP), -0.1 * SLIP, atol=1e-12)  # at the end of the motion
+
+
+def largest_step(guided, q, steps=100):
+    """Returns the largest change of the added effort per period and slip effort during `steps` updates at q."""
+    last, changes = guided.added, []
+    for _ in range(steps):
+        added = guided.step(q)
+        changes.append(np.abs(added - last).max(where=np.isfinite(q), initial=0.0) / SLIP.max())
+        last = added
+    assert np.all(np.abs(last) < 0.01 * SLIP)
+    return max(changes)
+
+
+@pytest.mark.parametrize("cause", ["lost measurement", "jump", "mode"])
+def test_springs_detach_without_a_step(cause):
+    guided = Guided().rest()
+    deflected = Q + 0.8 * SLIP / KP
+    guided.step(deflected)
+    if cause == "mode":
+        guided.controller.SetMode(guided.context, "gravity")
+    after = {"lost measurement": np.full(N, np.nan), "jump": deflected + 0.03}.get(cause, deflected)
+    assert largest_step(guided, after) <= 0.8 * PERIOD / DECAY_TIME + 1e-9
+
+
+def test_springs_attach_anew_after_a_fault():
+    guided = Guided().rest()
+    guided.step(Q * np.nan)
+    guided.rest(Q + 1e-3)
+    assert_no_effort(guided.step(Q + 1e-3))
+
+
+def test_damping_is_at_most_the_slip_effort_and_ends_with_speed():
+    guided = Guided()
+    slow, fast = 0.01 * np.ones(N), 2.0 * np.ones(N)
+    np.testing.assert_array_less(guided.step(Q, slow), 0.0)
+    np.testing.assert_array_less(-SLIP, guided.added)
+    assert_no_effort(guided.step(Q, fast))
+    np.testing.assert_array_less(0.0, guided.step(Q, -slow))
+
+
+def test_energy_is_never_created():
+    # 10,000 random motions of one joint each, with pauses in which springs attach. The stored energy of a spring is
+    # S^2 / (2 kp). It may grow only by the work of the motion against the spring. The bound of a sampled effort is
+    # kp dq^2 / 8 per period in which the spring passes through zero.
+    n, period = 10_000, 8e-3
+    random = np.random.default_rng(0)
+    kp, slip = random.uniform(0.1, 100.0, n), random.uniform(0.01, 1.0, n)
+    amplitude = slip / kp * random.uniform(0.2, 5.0, n)
+    frequency, pauses = random.uniform(0.5, 8.0, (2, n)), random.integers(0, 180, n)
+    memory, effort = np.zeros(NUM_STATES * n), np.zeros(n)
+    tolerance, jump, zeros = 0.05 * slip / kp, np.full(n, np.inf), np.zeros(n)
+    last, q, time, stored, attached = np.full(n, np.nan), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n, bool)
+    last_effort = np.zeros(n)
+    for k in range(250):
+        effort[:] = 0.0
+        virtual_friction(q, zeros, last, period, kp, zeros, slip, tolerance, jump, memory, effort)
+        energy = effort**2 / (2 * kp)
+        if k:
+            step = q - last
+            work = -0.5 * (effort + last_effort) * step
+            assert np.all(energy - stored <= work + kp * step**2 / 8 + 1e-12 * slip**2 / kp)
+        last_effort, stored, last = effort.copy(), energy, q
+        attached |= ~np.isnan(memory[:n])
+        time = time + period * ((k < pauses) | (k > pauses + 50))
+        q = amplitude * (np.sin(2 * np.pi * frequency[0] * time) + np.sin(2 * np.pi * frequency[1] * time))
+    assert attached.mean() > 0.9
+
+
+def test_default_slip_effort_covers_the_error_and_the_friction():
+    dry, error = ARM.dry_friction(), 0.01 * ARM.effort_limits
+    np.testing.assert_allclose(slip_effort(MODEL), dry, atol=1e-12)
+    assert not is_cross_validated(MODEL)
+    statistics = zip(MODEL.joints, error, strict=True)
+    joints = [dataclasses.replace(joint, rms_cross_validation_included=e) for joint, e in statistics]
+    model = dataclasses.replace(MODEL, joints=joints)
+    assert is_cross_validated(model)
+    np.testing.assert_allclose(slip_effort(model), dry + 1.96 * error, atol=1e-12)
+    joints[0] = dataclasses.replace(joints[0], rms_cross_validation_included=10.0)
+    assert slip_effort(dataclasses.replace(MODEL, joints=joints))[0] == MAX_SLIP_SHARE * ARM.effort_limits[0]
+
+
+@pytest.mark.parametrize("slip", [-1.0, np.nan, 0.5 * ARM.effort_limits[0]])
+def test_slip_effort_out_of_range_is_refused(slip):
+    with pytest.raises(ControllerError, match=r"slip_efforts must be 7 numbers; allowed: 0 to 0\.4 times"):
+        GravityPidController(MODEL, slip_efforts=np.r_[slip, SLIP[1:]])
