@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row, position_along
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.holding_torque import HoldingArrays, holding_torques_into
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
@@ -36,6 +37,11 @@ class PredictedEffort:
     def _known(self) -> IdentifiedModel:
         """The model, or a model without dynamics of the arm's files."""
         return self.model or IdentifiedModel.from_arm(self.arm, self.arm.effects.position_dependent)
+
+    @cached_property
+    def _holding_arrays(self) -> HoldingArrays:
+        """Static model with its parameters. An optimisation computes holding efforts thousands of times."""
+        return self._known.static_model.with_parameters(self._known.theta)
 
     @cached_property
     def regressor(self) -> DynamicRegressor:
@@ -71,7 +77,10 @@ class PredictedEffort:
 
     def holding(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the joint efforts (m, n) that hold the arm at poses q (m, n) [N m, N], without dry friction."""
-        return np.asarray(self._known.static_model.torque(q, self._known.theta))
+        poses = np.ascontiguousarray(q, dtype=np.float64)
+        tau = np.empty(poses.shape)
+        holding_torques_into(poses, self._holding_arrays, tau)
+        return tau
 
     def by_drake(self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the same efforts as `without_dry_friction`, computed with Drake's inverse dynamics."""
@@ -92,7 +101,7 @@ class PredictedEffort:
         if model.dynamics is None:
             rest = np.zeros_like(q)
             of_sdf = self.regressor.torque(q, rest, rest, self.parameters)
-            return model.static_model.torque(q, model.theta) - of_sdf
+            return self.holding(q) - of_sdf
         tau = np.zeros(q.shape)
         for effect in self._effects:
             if EFFECT_KINDS[effect.kind].role != "dry":
