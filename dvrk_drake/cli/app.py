@@ -233,7 +233,7 @@ class AnyArm(LcmArm):
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class CollectedArm(AnyArm, ControlledArm):
-    """Options of the arm of `collect poses`."""
+    """Options of the commands that control an arm over LCM or ROS 2."""
 
 
 _FILE = Group("Options for the file (docs/recordings.md)", sort_key=2)

@@ -71,7 +71,7 @@ def teach(
     poses: Annotated[str, Parameter(metavar="POSES.yaml")],
     /,
     *,
-    controlled: ControlledArm,
+    controlled: CollectedArm,
     at_rest: Annotated[bool, Parameter(show_default=False)] = False,
 ) -> None:
     """Add poses to a pose file while you move the arm by hand.
@@ -83,6 +83,7 @@ def teach(
         poses: Pose file to write. The poses of an existing file are kept.
         at_rest: Also add each pose at which the arm is at rest for one second.
     """
+    _check_transport(controlled)
     check_output(poses, overwrite=True)
     with interrupt_ends_process():
         connection, line = _connect(controlled, keys=True)
@@ -157,11 +158,11 @@ def collect_motion(
     motion: Annotated[str, Parameter(metavar="MOTION.yaml")],
     /,
     *,
-    controlled: ControlledArm,
+    controlled: CollectedArm,
     output: Annotated[str | None, Parameter(metavar="FILE.csv", group=_TASK)] = None,
     rehearse: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
 ) -> None:
-    """Move an arm along a motion and record its efforts. Requires LCM.
+    """Move an arm along a motion and record its efforts.
 
     After an interruption, run the same command again to continue. Enter pauses the motion. Ctrl-C ends it, and the arm
     holds its pose.
@@ -171,6 +172,7 @@ def collect_motion(
         output: CSV file for the measurements.
         rehearse: Follow one period of the motion at a fifth of its speed. Required once before the first recording.
     """
+    _check_transport(controlled)
     check_output(motion, overwrite=True)
     if output is not None:
         check_output(output, motion, controlled.model or "", overwrite=True)
@@ -196,6 +198,11 @@ def collect_motion(
         parts = recorded_parts(output, connection.arm, PeriodicMotion.load(motion, connection.arm))
         files = " ".join(str(part.path) for part in useful(parts, played.duration))
         print(f"Next: dvrk-drake identify {files} --arm {controlled.arm} --output model.yaml", flush=True)
+
+
+def _check_transport(controlled: CollectedArm) -> None:
+    """Rejects options of the other transport for a command in which this process controls the arm."""
+    controlled.check(lcm={"reset": controlled.reset})
 
 
 def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -> tuple[ArmConnection, LiveLine]:

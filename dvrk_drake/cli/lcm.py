@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, ControlledArm, LcmArm, app
+from dvrk_drake.cli.app import HARDWARE, CollectedArm, ControlledArm, LcmArm, app
 from dvrk_drake.cli.support import (
     interrupt_ends_process,
     load_key,
@@ -47,14 +47,14 @@ def keygen(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
 @app.command(group=HARDWARE)
 def control(
     *,
-    controlled: ControlledArm,
+    controlled: CollectedArm,
     mode: Literal["gravity", "damped", "hold"] = "gravity",
     gains: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
     friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     hysteresis_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     friction_model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
 ) -> None:
-    """Control an arm over LCM: gravity compensation, damping or pose regulation.
+    """Control an arm: gravity compensation, damping or pose regulation.
 
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
@@ -67,6 +67,7 @@ def control(
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
+    controlled.check(lcm={"reset": controlled.reset})
     with interrupt_ends_process():
         compensator = _friction_compensator(controlled, mode, friction_ratio, hysteresis_ratio, friction_model)
         checked_gains = None if gains is None else _gains(gains, mode, controlled.arm)

@@ -33,10 +33,11 @@ from dvrk_drake.processes.ros_recorder import RosRecorder, bag_path
 from dvrk_drake.processes.teacher import Teacher
 from dvrk_drake.recordings import motion_parts
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
-from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, pose_environment
+from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, load_poses_if_any, pose_environment
 from dvrk_drake.recordings.writer_stream import check_stream_output
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
+from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_link import ArmLink, LcmArmLink
 from dvrk_drake.systems.lcm.lcm_network import open_lcm
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
@@ -143,6 +144,7 @@ class ArmConnection:
     topic: str | None = None
     domain: int | None = None
     reset: bool = False
+    guard: GuardSettings = field(default_factory=GuardSettings)
     ready: Callable[[], None] = field(default=lambda: None)
 
     def measure(self, seconds: float = 0.25) -> Measured:
@@ -223,6 +225,7 @@ class ArmConnection:
             CollectionError: The file exists and does not contain poses of this arm.
             DvrkDrakeError: See `run`.
         """
+        load_poses_if_any(path, self.arm)  # rejects an invalid file before the arm is connected
         controller, link = self._start("gravity")
         enter = self.dialog.enter or (lambda: False)
         teacher = Teacher(controller, path, at_rest=at_rest, requested=enter, report=self.dialog.report)
@@ -418,11 +421,11 @@ class ArmConnection:
     ) -> tuple[ArmController, ArmLink]:
         """Checks that the arm may be controlled. Returns a controller, and a link that accepts only this session."""
         if self.transport == "ros":
+            self.ready()  # the threads of DDS inherit the scheduling of this thread
             link: ArmLink = self._ros_link()
             try:
                 _, period = first_status(link)
                 made = ArmController(self.arm, self.model, mode, period, friction, gains)
-                self.ready()
             except BaseException:
                 link.close()
                 raise
@@ -445,7 +448,7 @@ class ArmConnection:
         require_cyclonedds()
         from dvrk_drake.systems.ros.crtk_link import CrtkArmLink
 
-        driver = CrtkDriver(domain=self.domain, namespace=self.topic or "")
+        driver = CrtkDriver(domain=self.domain, namespace=self.topic or "", guard=self.guard)
         link = CrtkArmLink(self.arm, driver, report=self.dialog.report, stopped=self.dialog.stopped)
         end = time.monotonic() + _RATE_WAIT
         while link.next_status(FIRST_WAIT).fault_text and time.monotonic() < end:
@@ -509,6 +512,7 @@ def connect(
     topic: str | None = None,
     domain: int | None = None,
     reset: bool = False,
+    guard: GuardSettings | None = None,
     dialog: Dialog | None = None,
     ready: Callable[[], None] = lambda: None,
 ) -> ArmConnection:
@@ -526,6 +530,8 @@ def connect(
         topic: Topic measured_js of the arm on ROS 2, or its namespace. None: the only topic of this arm.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         reset: Whether to clear a fault over LCM, or to resume after a watchdog hold, before the arm is controlled.
+        guard: Settings of the command guard over ROS 2. None: the defaults. Over LCM, the process of the arm has the
+            guard.
         dialog: Functions for the communication with the operator. None: there is none, and a motion runs to its end.
         ready: Function that is called before the control begins, e.g. to request real-time scheduling.
 
@@ -552,7 +558,9 @@ def connect(
         if warning := model_warning(str(model), used):
             dialog.report(f"warning: {warning}")
     loaded = None if key is None else MessageKey.load(key)
-    return ArmConnection(arm, used, transport, dialog, lcm_url, loaded, topic, domain, reset, ready)
+    return ArmConnection(
+        arm, used, transport, dialog, lcm_url, loaded, topic, domain, reset, guard or GuardSettings(), ready
+    )
 
 
 def model_warning(path: str, model: IdentifiedModel) -> str:

@@ -1,0 +1,41 @@
+"""`dvrk.connect` over ROS 2: measurement, a motion with the guard in this process, and hold."""
+
+import numpy as np
+import pytest
+from arm_processes import dvrk_drake
+from crtk_conformance import start_simulated_arm
+from ros_publisher import DOMAIN_FILE
+
+import dvrk_drake as dvrk
+from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
+
+ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
+
+pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
+
+ARM = dvrk.load_arm("mtml")
+
+
+@pytest.mark.watchdog
+def test_motion_over_ros(tmp_path, monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
+    from dvrk_drake.systems.ros.messages import Empty
+
+    with start_simulated_arm("mtml", "MTML", 500.0) as arm:
+        for word, homed in (("enable", False), ("home", True)):
+            arm.state_command(word)
+            assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)
+        connection = dvrk.connect(ARM, "ros")
+        before = connection.measure(0.1)
+        np.testing.assert_allclose(before.q, arm.latest().position, atol=1e-3)
+        basis, span = FourierBasis.of(1.0, 2), ARM.position_upper - ARM.position_lower
+        coefficients = np.column_stack([before.q, np.outer(0.01 * span, np.ones(2))])
+        path = tmp_path / "m.yaml"
+        PeriodicMotion.of_coefficients(ARM, basis, coefficients, 2).save(path)
+        command = ("collect", "motion", path, "--arm", "mtml", "--transport", "ros", "--rehearse", "--realtime")
+        process = dvrk_drake(*command)
+        assert process.wait() == 0, process.output()
+        assert (tmp_path / "m_rehearsal.yaml").exists()
+        holds = arm.domain.subscribe("/MTML/hold", Empty, depth=10)
+        connection.hold()
+        assert arm.domain.wait_until(lambda: bool(holds.take()), 20.0)
