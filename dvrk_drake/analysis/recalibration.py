@@ -87,7 +87,7 @@ class Recalibration(ModelResult):
 
 
 def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Recalibration:
-    """Checks a short motion and refits a model's friction and offsets to it, as `dvrk-drake recalibrate` does.
+    """Checks a short motion and refits a model's friction and offsets to it, as `dvrk-drake identify recalibrate` does.
 
     The model error decreases for motions similar to the recording. For other positions and speeds, the model error can
     decrease much less.

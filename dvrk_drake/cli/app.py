@@ -30,9 +30,16 @@ app = App(
     group_parameters=Group("Options", sort_key=1),
     default_parameter=Parameter(negative=()),
 )
-MODEL, IDENTIFY, SIMULATE, HARDWARE, PAPER, OPTIONS = (
-    Group.create_ordered(name) for name in ("Model", "Identify", "Simulate", "Hardware", "Paper", "Options")
+MODEL, IDENTIFY, SIMULATE, HARDWARE, OPTIONS = (
+    Group.create_ordered(name) for name in ("Model", "Identify", "Simulate", "Hardware", "Options")
 )
+simulate = App(name="simulate", group=SIMULATE)
+export = App(name="export", group=MODEL)
+identify = App(name="identify", group=IDENTIFY)
+bridge = App(name="bridge", group=HARDWARE)
+collect = App(name="collect", group=HARDWARE, help="Measure an arm: teach poses, collect static poses or a motion.")
+for _group in (simulate, export, identify, bridge, collect):
+    app.command(_group)
 app["--help"].group = app["--version"].group = OPTIONS
 app.register_install_completion_command(
     name="--install-completion", group=OPTIONS, help="Install command completion for the current shell."

@@ -40,10 +40,11 @@ def calibrate(
     reset: Annotated[bool, Parameter(show_default=False)] = False,
     yes: Annotated[bool, Parameter(show_default=False)] = False,
 ) -> None:
-    """Calibrate a connected arm: design, collect, identify, validate and export.
+    """Calibrate a connected arm, from designed poses to a report.
 
-    The command runs other commands of dvrk-drake and prints them. Ctrl-C ends the calibration, and the arm holds its
-    pose. The same command continues the calibration. Enter pauses a motion.
+    The steps are: design, collect, identify, validate and export. The command runs other commands of dvrk-drake and
+    prints them. Ctrl-C ends the calibration, and the arm holds its pose. The same command continues the calibration.
+    Enter pauses a motion.
 
     Args:
         output: Folder for all files. An existing calibration in this folder is continued.

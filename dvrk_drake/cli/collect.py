@@ -6,9 +6,9 @@ import sys
 import time
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, AnyArm, CollectedArm, ControlledArm, Seconds, app, one_of
+from dvrk_drake.cli.app import HARDWARE, AnyArm, CollectedArm, ControlledArm, Seconds, app, collect, one_of
 from dvrk_drake.cli.lcm import connect_arm
 from dvrk_drake.cli.support import (
     check_output,
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from dvrk_drake.processes.connection import ArmConnection
     from dvrk_drake.processes.live_status import LiveLine
 
-collect = App(name="collect", group=HARDWARE, help="Measure an arm: teach poses, collect static poses or a motion.")
-app.command(collect)
 _TASK = one_of("Task (one is required)")
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import PAPER, SIMULATE, Overwrite, Port, Seed, Verbose, app
+from dvrk_drake.cli.app import SIMULATE, Overwrite, Port, Seed, Verbose, app
 from dvrk_drake.cli.support import Steps, check_output, command_words, new_folder, print_written, quiet_drake
 from dvrk_drake.progress import step_progress
 
@@ -23,7 +23,7 @@ def demo(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Collect poses of a simulated arm, identify a model, and test the model.
+    """Identify a model of a simulated arm, and test it.
 
     Args:
         arm: Arm to simulate.
@@ -89,7 +89,7 @@ def teleop(
     print_written(output)
 
 
-@app.command(group=PAPER)
+@app.command(group=SIMULATE)
 def reproduce(
     what: Literal["table1", "fig4", "fig5", "fig6", "fig7", "psm", "transparency", "all"] = "all",
     /,
@@ -99,7 +99,7 @@ def reproduce(
     seed: Seed = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Reproduce the figures and tables of the paper (Rutfield et al., 2015).
+    """Reproduce the results of the paper (Rutfield et al., 2015).
 
     The command writes an HTML page that compares published and reproduced numbers.
     Without the recording of the paper, Fig. 4 is omitted and a different MTM is simulated.

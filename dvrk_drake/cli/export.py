@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from dvrk_drake.cli.app import MODEL, Arm, Json, Model, Overwrite, Plots, Verbose, app, one_of
+from dvrk_drake.cli.app import Arm, Json, Model, Overwrite, Plots, Verbose, export, one_of
 from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import Steps, check_output, load_model, plots_folder, print_written, write_json
 from dvrk_drake.errors import DvrkDrakeError, ModelError
@@ -28,8 +28,8 @@ PerJoint = Annotated[
 ]
 
 
-@app.command(group=MODEL)
-def export(
+@export.default
+def export_model(
     *,
     model: SourceModel = None,
     arm: SourceArm = None,
@@ -49,7 +49,7 @@ def export(
     dead_band: PerJoint = None,
     saturation: PerJoint = None,
 ) -> None:
-    """Export a model as SDF, URDF or gravity-compensation file of the dVRK.
+    """Export a model as SDF, URDF or file of the dVRK.
 
     One call can write several files. Export an identified model, because the masses in the SDF are only estimates.
 
@@ -129,8 +129,8 @@ def export(
         sys.stdout.write(sdf_difference(loaded.arm, bodies.links, bodies.rotors))
 
 
-@app.command(group=MODEL)
-def compare_gc(
+@export.command(name="compare")
+def compare(
     file: str,
     /,
     *,

@@ -21,6 +21,7 @@ from dvrk_drake.cli.app import (
     Recording,
     Verbose,
     app,
+    identify,
     one_of,
 )
 from dvrk_drake.cli.report import Report, check_report, write_page
@@ -74,8 +75,8 @@ _STEPS = "reading", "checking the recording"
 _SOURCE = one_of("Source of the model (one is required)")
 
 
-@app.command(group=IDENTIFY)
-def identify(
+@identify.default
+def identify_model(
     recording: Recording,
     /,
     *others: str,
@@ -291,7 +292,7 @@ def predict(
         print(loaded.interval_scope, flush=True)
 
 
-@app.command(group=IDENTIFY)
+@identify.command
 def recalibrate(
     recording: Recording,
     /,

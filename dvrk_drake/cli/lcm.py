@@ -54,11 +54,11 @@ def control(
     hysteresis_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     friction_model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
 ) -> None:
-    """Control an arm: gravity compensation, damping or pose regulation.
+    """Control an arm: compensate gravity, damp it or hold a pose.
 
     Args:
         mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
-        gains: Gains file written by dvrk-drake tune, for the modes damped and hold. Default: the gains of the arm file.
+        gains: Gains file written by simulate tune, for the modes damped and hold. Default: the gains of the arm file.
         friction_ratio: Share of friction to compensate in mode gravity, 0 to 0.6. It is reduced if the arm could creep.
         hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
         friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.
@@ -93,7 +93,7 @@ def control(
 
 @app.command(group=HARDWARE)
 def status(*, connected: LcmArm, watch: bool = False) -> None:
-    """Print the state of an arm over LCM, its reason, and what to do next.
+    """Print the state of an arm, its reason, and what to do next.
 
     Args:
         watch: Repeat until Ctrl-C.
@@ -116,7 +116,7 @@ def status(*, connected: LcmArm, watch: bool = False) -> None:
 
 @app.command(group=HARDWARE)
 def stop(*, connected: LcmArm, power_off: bool = False) -> None:
-    """Stop an arm over LCM: its guard holds the pose until an operator resumes.
+    """Stop an arm. Its guard holds it until an operator resumes.
 
     The guard obeys every sender with the key, also while a controller acts. This does not replace the emergency stop
     button.

@@ -68,9 +68,10 @@ def arm_file(
     output: Annotated[str, Parameter(metavar="FILE.yaml")],
     overwrite: Overwrite = False,
 ) -> None:
-    """Write an arm file with everything that is derived from a model file, to change it.
+    """Write an arm file that describes a model file.
 
-    Commands also accept the model file itself as --arm.
+    It contains everything that is derived from the model file, so that you can change it. Commands also accept the
+    model file itself as --arm.
 
     Args:
         model_file: URDF, SDF, MJCF (.xml), or Drake's model directives (.dmd.yaml).

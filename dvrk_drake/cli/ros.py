@@ -8,13 +8,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, app
+from dvrk_drake.cli.app import Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, bridge
 from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, quiet_drake, request_realtime
 from dvrk_drake.errors import ControllerError
 
 
-@app.command(group=HARDWARE)
-def bridge(
+@bridge.default
+def bridge_arm(
     *,
     arm: Arm,
     topic: RosTopic = None,
@@ -29,7 +29,7 @@ def bridge(
     realtime: Realtime = False,
     poll: Annotated[bool, Parameter(negative="")] = False,
 ) -> None:
-    """Connect a dVRK arm on ROS 2 to LCM, with the command guard in between.
+    """Connect a dVRK arm on ROS 2 to LCM, behind a command guard.
 
     Enable and home the arm at its console first. The bridge starts a deadman process, which holds the arm if the bridge
     is killed.
@@ -79,7 +79,7 @@ def bridge(
     print("bridge ended; the arm has confirmed hold", flush=True)
 
 
-@app.command(group=HARDWARE)
+@bridge.command
 def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> None:
     """Hold a dVRK arm on ROS 2 when its commands stop for 50 ms.
 

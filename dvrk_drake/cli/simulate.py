@@ -1,4 +1,4 @@
-"""Commands that simulate an arm: simulate, study, tune and transparency."""
+"""Commands that simulate an arm: simulate, with its subcommands study, tune and transparency."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import SIMULATE, Arm, FileOptions, Overwrite, Plots, Set, Verbose, app, one_of, whole_number
+from dvrk_drake.cli.app import Arm, FileOptions, Overwrite, Plots, Set, Verbose, one_of, simulate, whole_number
 from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_written, quiet_drake, until_stopped
 from dvrk_drake.errors import ModelError, ScenarioError, StudyError
@@ -22,8 +22,8 @@ _SCENARIO = one_of("Source (one is required)")
 _EXECUTOR = one_of("Computers (at most one option)", least=0)
 
 
-@app.command(group=SIMULATE)
-def simulate(
+@simulate.default
+def simulate_scenario(
     scenario: Annotated[str | None, Parameter(group=_SCENARIO)] = None,
     /,
     *,
@@ -82,7 +82,7 @@ def _check_workers(_: object, value: int | None) -> None:
         raise ValueError("must be a number of processes from 1 to 1024")
 
 
-@app.command(group=SIMULATE)
+@simulate.command
 def study(
     study: str,
     /,
@@ -137,7 +137,7 @@ def study(
     write_page(page, folder, report, study, output)
 
 
-@app.command(group=SIMULATE)
+@simulate.command
 def tune(
     *,
     arm: Arm,
@@ -179,7 +179,7 @@ def tune(
         tuning = tune_arm(arm, methods, step_progress(steps, step))
     best = tuning.comparison.best(tuning.found)
     if output is not None:
-        save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake tune --arm {arm}, method {best}.")
+        save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake simulate tune --arm {arm}, method {best}.")
     page = tuning_page(tuning, gains_path=output)
     print_page(make_console(), page, verbose=verbose)
     if output is not None:
@@ -187,7 +187,7 @@ def tune(
     write_page(page, folder, report)
 
 
-@app.command(group=SIMULATE)
+@simulate.command
 def transparency(
     *,
     arm: Arm,

@@ -31,7 +31,9 @@ def sim_arm(
     model: Model | None = None,
     enabled: Annotated[bool, Parameter(show_default=False)] = False,
 ) -> None:
-    """Simulate an arm with its driver: on LCM with the command guard, or on ROS 2 as a dVRK.
+    """Simulate an arm with its driver, over LCM or ROS 2.
+
+    On LCM, the driver has the command guard. On ROS 2, it has the topics of a dVRK.
 
     Args:
         pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.

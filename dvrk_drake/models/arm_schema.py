@@ -170,7 +170,7 @@ class Mechanism:
     sensor effects of the real arm. A simulation includes only those that are named in `simulated_effects`.
     `console_gravity_compensation` states whether the dVRK's controller can compensate the gravity of this arm. It then
     publishes the efforts on the ROS topic gravity_compensation/setpoint_js. `view` are the parts that a 3D view shows.
-    `published_gains` are gains of a publication, with which `dvrk-drake tune` compares its gains.
+    `published_gains` are gains of a publication, with which `dvrk-drake simulate tune` compares its gains.
     """
 
     format: str = "dvrk_drake mechanism 1.0"

@@ -93,7 +93,7 @@ def _after_validation(validation: Validation, model_path: str, file_options: str
         # Errors above 100 % are due to wrong signs, units or coordinates, which a refit of friction does not correct.
         plausible = all(error is None or error <= 1 for error in validation.relative_errors.values())
         if isinstance(validation, DynamicValidation) and plausible:
-            command = f"dvrk-drake recalibrate {source} --model {model_path} --output NEW.yaml"
+            command = f"dvrk-drake identify recalibrate {source} --model {model_path} --output NEW.yaml"
             return command, "Refit the friction and the offsets of the model to this recording."
         return _check(validation.recording, arm, file_options)
     if not saved:

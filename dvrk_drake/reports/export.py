@@ -127,7 +127,7 @@ def _compensation_page(path: str, export: ModelExport, file: GravityCompensation
     usual = f"gc-{arm.name}-"
     if not name.startswith(usual):
         blocks.append(Text(f"The usual name of the file is {usual}<serial number>.json."))
-    command = f"dvrk-drake compare-gc {path} {_source(export.model, export.origin)}"
+    command = f"dvrk-drake export compare {path} {_source(export.model, export.origin)}"
     return Page(f"Exported file {path}", _loss_text(loss), [Section("Torques", blocks)], "good", command)
 
 

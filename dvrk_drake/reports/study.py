@@ -63,7 +63,7 @@ def study_page(study: Study, rows: Mapping[int, Row], *, study_path: str | None 
             Section("Distributions", [Plot("study", caption, panels, columns=min(2, len(panels)))]),
         ],
         "warning" if failed else "good",
-        f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER" if study_path else "",
+        f"dvrk-drake simulate study {study_path} --output RESULTS.csv --plots FOLDER" if study_path else "",
     )
 
 

@@ -35,7 +35,7 @@ def transparency_page(arm: Arm, forces: Sequence[OperatorForces]) -> Page:
         answer,
         [Section("Interaction force and torque", [forces_table(arm, forces), note, forces_plot(forces)])],
         "good",
-        f"dvrk-drake transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER",
+        f"dvrk-drake simulate transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER",
     )
 
 

@@ -48,7 +48,7 @@ def tuning_page(tuning: Tuning, *, gains_path: str | None = None) -> Page:
             Section("Tuning methods, joints and poses", details, folded=True),
         ],
         "good" if is_better else "warning",
-        f"dvrk-drake tune --arm {name} --output GAINS.yaml"
+        f"dvrk-drake simulate tune --arm {name} --output GAINS.yaml"
         if gains_path is None
         else f"dvrk-drake control --arm {name} --mode hold --gains {gains_path}",
     )

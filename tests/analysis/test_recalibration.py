@@ -220,13 +220,26 @@ def test_recalibrate_command(tmp_path, capsys):
     model.save(paths["model.yaml"])
     IdentifiedModel.from_arm(load_arm("psm")).save(paths["static.yaml"])
     write_recording(motion(truth, generator), paths["short.csv"])
-    assert main(["recalibrate", paths["short.csv"], "--model", paths["model.yaml"], "--output", paths["new.yaml"]]) == 0
+    assert (
+        main(
+            [
+                "identify",
+                "recalibrate",
+                paths["short.csv"],
+                "--model",
+                paths["model.yaml"],
+                "--output",
+                paths["new.yaml"],
+            ]
+        )
+        == 0
+    )
     assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
     table = capsys.readouterr().out
     assert all(name in table for name in ("before", "after the refit", "wrist_yaw", "valid for similar motions"))
     again = ["--output", paths["new.yaml"], "--overwrite"]
-    assert main(["recalibrate", paths["short.csv"], "--model", paths["static.yaml"], *again]) == 2
-    command = ["recalibrate", paths["short.csv"], "--model", paths["model.yaml"]]
+    assert main(["identify", "recalibrate", paths["short.csv"], "--model", paths["static.yaml"], *again]) == 2
+    command = ["identify", "recalibrate", paths["short.csv"], "--model", paths["model.yaml"]]
     assert main([*command, "--output", paths["model.yaml"]]) == 2
     lines = messages(capsys.readouterr().err)
     assert len(lines) == 2 and "has no dynamics" in lines[0] and "is an input" in lines[1]

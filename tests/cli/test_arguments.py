@@ -40,11 +40,17 @@ def refused(capsys, *arguments):
         (["equations", "--arm", __file__], f"{__file__} is not the file of an arm; known arms"),
         (["identify", "a.csv", "--arm", "psm"], "--output is required; see dvrk-drake identify --help"),
         (["validate", "a.csv", "b.csv", "--model", "m.yaml"], "Unexpected argument: b.csv; see"),
-        (["tune", "--arm", "psm", "--method", "guess"], 'Invalid value "guess" for --method. Choose from: "paper"'),
+        (
+            ["simulate", "tune", "--arm", "psm", "--method", "guess"],
+            'Invalid value "guess" for --method. Choose from: "paper"',
+        ),
         (["demo", "--seed", "-1"], 'Invalid value "-1" for --seed: must be a whole number, 0 or larger; see'),
         (["demo", "--seed", "1.5"], 'Invalid value for --seed: must be a whole number, not "1.5"; see'),
         (["view", "--arm", "psm", "--port", "web"], '--port: must be a whole number, not "web"; see'),
-        (["study", "s.yaml", "--output", "r.csv", "--workers", "0"], "--workers: must be a number of processes"),
+        (
+            ["simulate", "study", "s.yaml", "--output", "r.csv", "--workers", "0"],
+            "--workers: must be a number of processes",
+        ),
         (
             ["record", "r.csv", "--arm", "psm", "--duration", "nan"],
             "must be a number of seconds greater than 0",
@@ -55,7 +61,10 @@ def refused(capsys, *arguments):
             ["collect", "motion", "m.yaml", "--arm", "psm"],
             "give exactly one of --output, --rehearse; see dvrk-drake collect motion --help",
         ),
-        (["study", "s.yaml", "--output", "r.csv", "--workers", "1", "--scheduler", "x"], "give at most one of"),
+        (
+            ["simulate", "study", "s.yaml", "--output", "r.csv", "--workers", "1", "--scheduler", "x"],
+            "give at most one of",
+        ),
         (["simulate", "psm"], "psm is an arm, not a scenario; use --arm psm"),
         (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; use --arm psm"),
         (["check", "a.csv", "--model", "mtmr"], "mtmr is an arm, not a model; use --arm mtmr"),
@@ -118,8 +127,10 @@ def test_commands_are_in_groups(capsys):
     assert main(["--help"]) == 0
     printed = capsys.readouterr().out
     headings = [line.strip("╭╮─ ") for line in printed.splitlines() if line.startswith("╭")]
-    assert headings == ["Model", "Identify", "Simulate", "Hardware", "Paper", "Options"]
+    assert headings == ["Model", "Identify", "Simulate", "Hardware", "Options"]
     assert all(f"│ {command} " in printed for command in COMMANDS)
+    assert len(COMMANDS) <= 25 and len(printed.splitlines()) <= 50  # one page
+    assert max(map(len, printed.splitlines())) <= 80
     assert main([]) == 0
     assert capsys.readouterr().out == printed
 
@@ -129,6 +140,7 @@ def test_shared_options_have_one_name():
     names = {
         command: {name for argument in app[command].assemble_argument_collection() for name in argument.names}
         for command in COMMANDS
+        if app[command].default_command
     }
     for command, options in names.items():
         assert not options & {"--plot", "--tables", "--html", "--out", "--save-to", "--force", "--quiet"}, command
@@ -150,7 +162,9 @@ def test_completion_is_installed(shell, tmp_path, monkeypatch, capsys):
 
 
 def test_transparency_rejects_a_folder_as_output(capsys):
-    assert "figures are written to --plots" in refused(capsys, "transparency", "--arm", "mtml", "--output", "folder")
+    assert "figures are written to --plots" in refused(
+        capsys, "simulate", "transparency", "--arm", "mtml", "--output", "folder"
+    )
 
 
 def test_effort_scale_is_one_number_or_some_of_joints():

@@ -15,9 +15,12 @@ from dvrk_drake.models.arm_files import load_arm
 
 
 def commands(group):
-    """Returns the commands of an app, those of a group of commands with both names, e.g. "collect poses"."""
-    names = [name for name in group if not name.startswith("-")]
-    return [" ".join([name, sub]).strip() for name in names for sub in commands(group[name]) or [""]]
+    """Returns the commands of an app, also subcommands, e.g. "collect poses"."""
+    found = []
+    for name in [name for name in group if not name.startswith("-")]:
+        found += [name] * (group[name].default_command is not None)
+        found += [f"{name} {sub}" for sub in commands(group[name])]
+    return found
 
 
 NAMES = commands(app)
@@ -83,7 +86,9 @@ def test_commands_with_samples_run(page, tmp_path, monkeypatch):
 def test_printed_commands_have_valid_options():
     """Checks commands in messages, docstrings and suggested next steps."""
     for path in (ROOT / "dvrk_drake").rglob("*.py"):
-        for found in re.finditer(rf"dvrk-drake ({'|'.join(NAMES)})\b([^\"`;,\n]*)", path.read_text()):
+        for found in re.finditer(
+            rf"dvrk-drake ({'|'.join(sorted(NAMES, key=len, reverse=True))})\b([^\"`;,\n]*)", path.read_text()
+        ):
             unknown = set(re.findall(r"(?<!\S)(--[a-z][a-z-]*)", found[2])) - options_of(found[1])
             assert not unknown, f"{path.name}: {found[0]}"
 

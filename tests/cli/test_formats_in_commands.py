@@ -144,7 +144,7 @@ def results(folder, first, second, model):
     identified, again, payload = (str(folder / name) for name in ("model.yaml", "again.yaml", "payload.json"))
     model = model or identified
     assert main(["identify", first, "--arm", "psm", "--output", identified]) == 0
-    assert main(["recalibrate", first, "--model", model, "--output", again]) == 0
+    assert main(["identify", "recalibrate", first, "--model", model, "--output", again]) == 0
     assert main(["payload", first, second, "--model", model, "--json", payload]) == 0
     return folder
 

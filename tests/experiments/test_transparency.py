@@ -90,7 +90,7 @@ def test_command_writes_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("dvrk_drake.experiments.transparency.random_path", lambda arm: constant_pose(1.2))
     model, table = tmp_path / "ours.yaml", tmp_path / "table.csv"
     MODEL.save(model)
-    arguments = ["transparency", "--arm", "mtml", "--model", str(model), "--simulated-effects", "friction"]
+    arguments = ["simulate", "transparency", "--arm", "mtml", "--model", str(model), "--simulated-effects", "friction"]
     assert main([*arguments, "--output", str(table), "--plots", str(tmp_path / "plots")]) == 0
     with open(table) as stream:
         rows = list(csv.DictReader(stream))
@@ -112,5 +112,5 @@ def test_command_writes_table(tmp_path, capsys, monkeypatch):
     ],
 )
 def test_invalid_input_gives_one_line_and_exit_code_2(arguments, message, capsys):
-    assert main(["transparency", "--arm", "mtml", *arguments]) == 2
+    assert main(["simulate", "transparency", "--arm", "mtml", *arguments]) == 2
     assert message in refusal(capsys.readouterr().err)

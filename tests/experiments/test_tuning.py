@@ -366,10 +366,12 @@ def error_line(capsys, *arguments):
 
 
 def test_commands_reject_invalid_options(tmp_path, capsys):
-    assert 'unknown arm "mtm"' in error_line(capsys, "tune", "--arm", "mtm")
-    assert 'Invalid value "guess" for --method' in error_line(capsys, "tune", "--arm", "psm", "--method", "guess")
+    assert 'unknown arm "mtm"' in error_line(capsys, "simulate", "tune", "--arm", "mtm")
+    assert 'Invalid value "guess" for --method' in error_line(
+        capsys, "simulate", "tune", "--arm", "psm", "--method", "guess"
+    )
     assert "its folder does not exist" in error_line(
-        capsys, "tune", "--arm", "psm", "--output", str(tmp_path / "no" / "g")
+        capsys, "simulate", "tune", "--arm", "psm", "--output", str(tmp_path / "no" / "g")
     )
     assert "no such file" in error_line(capsys, "simulate", "--arm", "mtml", "--set", "controller.gains=none.yaml")
     few = tmp_path / "few.yaml"

@@ -340,7 +340,7 @@ def test_invalid_file_is_rejected_in_one_line(change, message, tmp_path, capsys)
     content = json.loads(path.read_text())
     change(content["GC_controller"])
     path.write_text(json.dumps(content))
-    assert main(["compare-gc", str(path), "--arm", "mtml"]) == 2
+    assert main(["export", "compare", str(path), "--arm", "mtml"]) == 2
     error = refusal(capsys.readouterr().err)
     assert message in error and str(path) in error
 
@@ -421,7 +421,7 @@ def test_export_and_compare_commands(tmp_path, capsys):
     assert main(["export", "--model", str(model), "--dvrk-gc", str(out), "--coulomb", *["0.01"] * 7]) == 0
     assert "shoulder_pitch" in capsys.readouterr().out
     report = tmp_path / "report.json"
-    assert main(["compare-gc", str(out), "--model", str(model), "--json", str(report)]) == 0
+    assert main(["export", "compare", str(out), "--model", str(model), "--json", str(report)]) == 0
     joints = json.loads(report.read_text())["joints"]
     assert [j["clipped"] for j in joints] == [0.0] * 7 and joints[0]["rms_inside"] is None
     out.unlink()

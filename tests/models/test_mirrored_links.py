@@ -95,16 +95,16 @@ def test_compare_gc_refuses_a_file_of_another_arm(tmp_path, capsys):
     path = tmp_path / "gc.json"
     file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
     file.save(path, "MTML", "test")
-    assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 2
+    assert main(["export", "compare", str(path), "--arm", "mtmr"]) == 2
     error = refusal(capsys.readouterr().err)
     assert error.startswith(f"dvrk-drake: error: {path}: the file belongs to MTML") and "model belongs to MTMR" in error
     # A file with a wrong arm name is compared. A warning shows that the name is wrong.
     file.save(path, "MTMR", "test")
-    assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 0
+    assert main(["export", "compare", str(path), "--arm", "mtmr"]) == 0
     (warning,) = messages(capsys.readouterr().err)
     assert "the mirror image of the model fits better" in warning
     file.save(path, "MTML", "test")
-    assert main(["compare-gc", str(path), "--arm", "mtml"]) == 0
+    assert main(["export", "compare", str(path), "--arm", "mtml"]) == 0
     assert not messages(capsys.readouterr().err)
 
 

@@ -112,7 +112,7 @@ def test_tuning_plot_shows_each_response_and_the_goal():
 def test_write_report_selects_the_page_by_type(tmp_path):
     dvrk.write_report(tuning_result(), tmp_path / "report.html", command=["tune", "--arm", "psm"])
     html = (tmp_path / "report.html").read_text()
-    assert "Controller gains of PSM" in html and "dvrk-drake tune --arm psm" in html
+    assert "Controller gains of PSM" in html and "dvrk-drake simulate tune --arm psm" in html
     with pytest.raises(DvrkDrakeError, match=r"there is no report for int; allowed: .*Tuning"):
         dvrk.write_report(1, tmp_path / "other.html")
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
@@ -158,7 +158,7 @@ def gc_file(tmp_path, monkeypatch):
 
 
 def test_command_writes_report_with_provenance(gc_file, capsys):
-    words = ["compare-gc", gc_file, "--arm", "mtml", "--report", "report.html"]
+    words = ["export", "compare", gc_file, "--arm", "mtml", "--report", "report.html"]
     assert main(words) == 0
     assert capsys.readouterr().out.endswith("wrote report.html: report\n")
     html = Path("report.html").read_text()
@@ -176,7 +176,7 @@ def test_command_writes_report_with_provenance(gc_file, capsys):
 )
 def test_report_path_is_checked_before_the_work(gc_file, path, message, capsys):
     Path("old.html").write_text("old")
-    assert main(["compare-gc", gc_file, "--arm", "mtml", "--report", path]) == 2
+    assert main(["export", "compare", gc_file, "--arm", "mtml", "--report", path]) == 2
     output = capsys.readouterr()
     assert not output.out and message in refusal(output.err)
     assert sorted(file.name for file in Path().iterdir()) == [gc_file, "old.html"]

@@ -131,6 +131,6 @@ _NEXT_DATA = Command(
     "Computes all results. FOLDER contains the recording of the paper (docs/reproduction.md).",
 )
 _NEXT_STUDY = Command(
-    "dvrk-drake study examples/release_study.yaml --output release.csv --report release.html",
+    "dvrk-drake simulate study examples/release_study.yaml --output release.csv --report release.html",
     "Repeats releases with your own poses, seeds and variations.",
 )

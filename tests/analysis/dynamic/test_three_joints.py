@@ -123,7 +123,7 @@ def test_controller_file_contains_the_held_instrument(folder):
     [
         (["control", "--arm", "psm", "--model", "MODEL"], "valid only with locked joints (roll = 0.5"),
         (["control", "--arm", "psm", "--model", "MODEL", "--friction-ratio", "0.3"], "valid only with locked joints"),
-        (["transparency", "--arm", "psm", "--model", "MODEL"], "valid only with locked joints"),
+        (["simulate", "transparency", "--arm", "psm", "--model", "MODEL"], "valid only with locked joints"),
         (["export", "--model", "MODEL", "--sdf", "OUT.sdf"], "but the format sdf requires all joints"),
         (["export", "--model", "MODEL", "--urdf", "OUT.urdf"], "but the format urdf requires all joints"),
         (["export", "--model", "MODEL", "--diff"], "but --diff requires all joints"),

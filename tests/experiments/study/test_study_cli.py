@@ -1,4 +1,4 @@
-"""`dvrk-drake study`: invalid input gives a one-line error before any simulation."""
+"""`dvrk-drake simulate study`: invalid input gives a one-line error before any simulation."""
 
 import subprocess
 import sys
@@ -29,7 +29,7 @@ def study(tmp_path):
 
 def study_refusal(capsys, path, *options):
     output = path.parent / "results.csv"
-    assert main(["study", str(path), "--output", str(output), *options]) == 2
+    assert main(["simulate", "study", str(path), "--output", str(output), *options]) == 2
     assert not output.exists()
     return refusal(capsys.readouterr().err)
 
@@ -97,7 +97,7 @@ def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
         (tmp_path / "folder.csv", "is not a regular file"),
         (tmp_path / "r.txt", "must end in .csv or .parquet"),
     ):
-        assert main(["study", str(study), "--output", str(output)]) == 2
+        assert main(["simulate", "study", str(study), "--output", str(output)]) == 2
         assert message in refusal(capsys.readouterr().err)
     assert study.read_text() == STUDY
 
@@ -117,7 +117,17 @@ def test_rejects_invalid_schedulers(study, capsys):
         "import sys, dvrk_drake.cli, dvrk_drake.experiments.study.study as study; study.TIMEOUT = 0.3;"
         "sys.exit(dvrk_drake.cli.main(sys.argv[1:]))"
     )
-    command = [sys.executable, "-c", code, "study", str(study), "--scheduler", "tcp://127.0.0.1:1", "--output"]
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "simulate",
+        "study",
+        str(study),
+        "--scheduler",
+        "tcp://127.0.0.1:1",
+        "--output",
+    ]
     done = subprocess.run([*command, str(study.parent / "new.csv")], check=False, capture_output=True, text=True)
     assert done.returncode == 2 and "no Dask scheduler answers at this address" in refusal(done.stderr)
 

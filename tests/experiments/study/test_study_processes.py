@@ -95,7 +95,7 @@ def children_of(process):
 def test_study_survives_killed_process_and_worker(study, started, release_simulations, tmp_path, monkeypatch):
     monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
     path = tmp_path / "killed.csv"
-    command = [FORMULA, "study", study, "--output", path, "--workers", 2]
+    command = [FORMULA, "simulate", "study", study, "--output", path, "--workers", 2]
     release_simulations(3)
     first = started(*command)
     wait_until(lambda: rows_in(path) == 3, "three rows", first)
@@ -128,7 +128,7 @@ def test_dask_cluster_survives_lost_worker(study, started, release_simulations, 
     worker = ["-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", "--preload", FORMULA, *options]
     workers = [started(*worker), started(*worker)]
     release_simulations(3)
-    run = started(FORMULA, "study", study, "--output", path, "--scheduler", url)
+    run = started(FORMULA, "simulate", "study", study, "--output", path, "--scheduler", url)
     wait_until(lambda: rows_in(path) == 3, "three rows", run)
     workers[0].kill()
     release_simulations(20)
@@ -144,7 +144,7 @@ def test_dask_cluster_survives_lost_worker(study, started, release_simulations, 
 def test_ctrl_c_prints_one_line_and_ends_workers(study, started, release_simulations, tmp_path):
     path = tmp_path / "interrupted.csv"
     release_simulations(1)
-    run = started(FORMULA, "study", study, "--output", path, "--workers", 2)
+    run = started(FORMULA, "simulate", "study", study, "--output", path, "--workers", 2)
     wait_until(lambda: rows_in(path) == 1, "a row", run)
     workers = children_of(run)
     run.send_signal(signal.SIGINT)

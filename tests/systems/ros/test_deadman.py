@@ -278,7 +278,7 @@ def test_stand_alone_command_requests_priority_before_dds(monkeypatch, capsys):
     monkeypatch.setattr(open_domain, "open_ros_domain", lambda domain: calls.append("domain"))
     monkeypatch.setattr(crtk_client, "find_arm", lambda *_, **__: ARM)
     monkeypatch.setattr(deadman, "Deadman", lambda *_: SimpleNamespace(run=lambda stopped: calls.append("run")))
-    assert main(["deadman", "--arm", "mtml"]) == 0
+    assert main(["bridge", "deadman", "--arm", "mtml"]) == 0
     assert calls == ["priority", "domain", "run"]
     assert capsys.readouterr().out == f"deadman of {ARM}; Ctrl-C ends it; it has {requested}\n"
 
