@@ -72,7 +72,7 @@ def export_model(
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import configuration_beside, prepare_export
-    from dvrk_drake.export.sdf import mesh_folder, refuse_existing_meshes, sdf_difference
+    from dvrk_drake.export.model_writer import mesh_folder, refuse_existing_meshes, sdf_difference
     from dvrk_drake.reports.export import export_page
     from dvrk_drake.reports.terminal import make_console, print_page
 

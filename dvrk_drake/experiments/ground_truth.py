@@ -24,7 +24,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
-from dvrk_drake.export.sdf import to_text, with_inertias
+from dvrk_drake.export.model_writer import to_text, with_inertias
 from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm

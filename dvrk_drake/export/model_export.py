@@ -19,8 +19,8 @@ from dvrk_drake.export.dvrk_psm_gravity_compensation import (
     is_psm,
     kinematic_compensation,
 )
-from dvrk_drake.export.sdf import MeshFormat, refuse_existing_meshes, write_sdf
-from dvrk_drake.export.urdf import touching_shapes, write_urdf
+from dvrk_drake.export.model_writer import MeshFormat, refuse_existing_meshes, write_model
+from dvrk_drake.export.touching_shapes import touching_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import refuse_existing
 
@@ -67,8 +67,8 @@ class ModelExport:
         """
         arm = self.model.arm
         if self.bodies is not None:
-            write = write_sdf if self.format == "sdf" else write_urdf
-            write(arm, self.bodies.links, path, self.origin, self.bodies.rotors, self.meshes)
+            assert self.format in ("sdf", "urdf")
+            write_model(arm, self.bodies.links, path, self.origin, self.bodies.rotors, self.meshes, self.format)
         elif isinstance(self.compensation, GravityCompensationFile):
             self.compensation.save(path, arm.name, f"dvrk-drake export of {self.origin}")
         elif self.compensation is not None:

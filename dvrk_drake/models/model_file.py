@@ -8,39 +8,21 @@ import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Capsule, Role, SceneGraph, Sphere
+from pydrake.geometry import Capsule, SceneGraph, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import LoadModelDirectives, PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Joint,
-    PrismaticJoint,
-    RevoluteJoint,
-    RigidBody,
-    RotationalInertia,
-    SpatialInertia,
-    UnitInertia,
-    WeldJoint,
-)
+from pydrake.multibody.tree import BodyIndex, RevoluteJoint, RotationalInertia, SpatialInertia, UnitInertia
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.sdf_elements import (
-    BASE_LINK,
-    DRAKE,
-    add_element,
-    add_pose,
-    inertial_element,
-    numbers_text,
-    read_xml,
-    shape_element,
-)
+from dvrk_drake.models.plant_tree import Mimic, PlantTree
+from dvrk_drake.models.sdf_elements import DRAKE, add_pose, read_xml, shape_element
 
 #: Endings of the names of model files.
 MODEL_SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml", ".dmd.yml")
@@ -56,33 +38,11 @@ _MIN_GYRATION = 0.02
 _STICK = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class _Link:
-    """A body with all bodies that are welded to it.
-
-    Attributes:
-        name: Name of the link.
-        members: Body -> its pose X_LB in the frame of the link.
-    """
-
-    name: str
-    members: dict[BodyIndex, RigidTransform]
-
-
-@dataclass(frozen=True, eq=False)
-class _MovingLink(_Link):
-    """Link with the joint that moves it."""
-
-    joint: RevoluteJoint | PrismaticJoint
-
-
 def convert_model(path: Path) -> ElementTree.Element:
     """Returns the root element `<sdf>` of the arm in a model file.
 
-    The links are `base_link`, which is the world and all that is welded to it, and one link per moving joint. Bodies
-    that are welded to a link become a part of it, and their frames become frames of the link. The origin of a link is
-    on the axis of its joint. Joints, mimic joints, limits, rotors, frames and shapes are those of the file. Shapes are
-    omitted if a mesh is missing. Without shapes, sticks show the links.
+    The links are those of `PlantTree`. Joints, mimic joints, limits, rotors, frames and shapes are those of the file.
+    Shapes are omitted if a mesh is missing. Without shapes, sticks show the links.
 
     Raises:
         ArmError: Drake cannot read the file, or the model is not an arm: it has a floating body, a joint with several
@@ -120,15 +80,12 @@ class _Model:
     """Model that Drake has read.
 
     Attributes:
-        plant: Finalized plant of the model.
-        scene_graph: Shapes of the model, None without shapes.
+        tree: Links of the model.
         documents: Root elements of the XML files of the model.
     """
 
-    plant: MultibodyPlant
-    scene_graph: SceneGraph | None
+    tree: PlantTree
     documents: list[ElementTree.Element]
-    _names: set[str] = field(default_factory=set)
 
     @classmethod
     def of(cls, path: Path) -> _Model:
@@ -163,102 +120,36 @@ class _Model:
         documents = [read_xml(file) for file in _files(path, parser)]
         _weld_base(plant)
         plant.Finalize()
-        return cls(plant, scene_graph, documents)
-
-    @property
-    def joints(self) -> list[Joint]:
-        """All joints."""
-        return [self.plant.get_joint(index) for index in self.plant.GetJointIndices()]
-
-    @cached_property
-    def links(self) -> tuple[_Link, ...]:
-        """Base, and all other links, each after its parent."""
-        children: dict[BodyIndex, list[Joint]] = {}
-        for joint in self.joints:
-            children.setdefault(joint.parent_body().index(), []).append(joint)
-        links: list[_Link] = []
-        open_links = [_Link(BASE_LINK, {self.plant.world_body().index(): RigidTransform()})]
-        while open_links:
-            link = open_links.pop(0)
-            links.append(link)
-            todo = list(link.members)
-            while todo:
-                body = todo.pop()
-                for joint in children.get(body, ()):
-                    X_LP = link.members[body] @ joint.frame_on_parent().GetFixedPoseInBodyFrame()
-                    X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-                    child = joint.child_body().index()
-                    if isinstance(joint, WeldJoint):
-                        link.members[child] = X_LP @ joint.X_FM() @ X_MB
-                        todo.append(child)
-                    elif isinstance(joint, RevoluteJoint | PrismaticJoint):
-                        open_links.append(_MovingLink(self._name(joint.child_body()), {child: X_MB}, joint))
-                    else:
-                        raise ArmError(
-                            f"joint {joint.name()} is of type {joint.type_name()}; allowed: revolute, continuous, "
-                            "prismatic and fixed joints"
-                        )
-        return tuple(links)
-
-    @property
-    def moving(self) -> list[_MovingLink]:
-        """Links without the base."""
-        return [link for link in self.links if isinstance(link, _MovingLink)]
-
-    def _name(self, body: RigidBody) -> str:
-        """Returns the name of a body, with the name of its model if another body has the same name."""
-        name = body.name()
-        if name in self._names or name in (BASE_LINK, "world"):
-            name = f"{self.plant.GetModelInstanceName(body.model_instance())}_{name}"
-        self._names.add(name)
-        return name
+        return cls(PlantTree(plant, scene_graph), documents)
 
     def to_sdf(self) -> ElementTree.Element:
         """Returns the root element of the SDF."""
-        moving = self.moving
-        names = [link.joint.name() for link in moving]
-        if not moving:
+        names = [link.joint.name() for link in self.tree.moving]
+        if not names:
             raise ArmError("the model has no moving joint")
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise ArmError(f"several joints have the name {repeated[0]}")
         mimics = self._mimics()
-        if self.plant.num_constraints() > len(mimics):
+        if self.tree.plant.num_constraints() > len(mimics):
             raise ArmError("the model has a closed loop; allowed: loops whose dependent joints are mimic joints")
-        root = ElementTree.Element("sdf", version="1.9")
-        instance = self.plant.get_body(next(iter(moving[0].members))).model_instance()
-        model = ElementTree.SubElement(root, "model", name=self.plant.GetModelInstanceName(instance))
-        context = self.plant.CreateDefaultContext()
-        self.plant.SetPositions(context, np.zeros(self.plant.num_positions()))
-        efforts = self._effort_limits()
-        for link, inertia in zip(self.links, [None, *self._inertias()], strict=True):
-            body, X_LB = next(iter(link.members.items()))
-            X_WL = self.plant.get_body(body).EvalPoseInWorld(context) @ X_LB.inverse()
-            element = ElementTree.SubElement(model, "link", name=link.name)
-            add_pose(element, X_WL)
-            if inertia is not None:
-                element.append(inertial_element(inertia))
-            for body, X_LB in link.members.items():
-                self._add_shapes(element, body, X_LB)
-        parents = {body: link.name for link in self.links for body in link.members}
-        for link in moving:
-            parent = parents[link.joint.parent_body().index()]
-            self._add_joint(model, link, parent, efforts.get(link.joint.name()), mimics.get(link.joint.name()))
-        self._add_frames(model)
-        if model.find("link/visual") is None:
-            self._add_sticks(model)
+        for link in self.tree.moving:
+            lower, upper = float(link.joint.position_lower_limits()[0]), float(link.joint.position_upper_limits()[0])
+            if not lower < upper:
+                raise ArmError(
+                    f"joint {link.joint.name()}: the position limits are {lower:g}, {upper:g}; allowed: lower < upper"
+                )
+            if isinstance(link.joint, RevoluteJoint) and math.isinf(lower) and math.isinf(upper):
+                link.joint.set_position_limits([-CONTINUOUS], [CONTINUOUS])
+        root = self.tree.to_sdf(self._inertias(), mimics, self._effort_limits())
+        if root.find("model/link/visual") is None:
+            self._add_sticks(root)
         return root
 
     def _inertias(self) -> list[SpatialInertia]:
         """Returns the inertia of each moving link about its origin, with `_MIN_GYRATION`."""
-        found, sizes = [], [0.0]
-        for link in self.moving:
-            M_LLo_L = SpatialInertia.Zero()
-            for index, X_LB in link.members.items():
-                body = self.plant.get_body(index)
-                M_BBo_B = body.default_spatial_inertia()
-                if M_BBo_B.get_mass() > 0 and body.name() not in self._massless:
-                    M_LLo_L += M_BBo_B.ReExpress(X_LB.rotation()).Shift(-X_LB.translation())
-            found.append(M_LLo_L)
+        found = self.tree.inertias(dict.fromkeys(self._massless, SpatialInertia.Zero()))
+        sizes = [0.0]
+        for link in self.tree.moving:
             sizes += [float(np.linalg.norm(X_LB.translation())) for X_LB in link.members.values()]
             sizes.append(float(np.linalg.norm(link.joint.frame_on_parent().GetFixedPoseInBodyFrame().translation())))
         masses = [M.get_mass() for M in found]
@@ -292,8 +183,8 @@ class _Model:
                 found.add(link.get("name", ""))
         return found
 
-    def _mimics(self) -> dict[str, dict[str, str]]:
-        """Returns the attributes of `drake:mimic` for each dependent joint."""
+    def _mimics(self) -> dict[str, Mimic]:
+        """Returns the leading joint, the multiplier and the offset of each dependent joint."""
         found = {}
         for document in self.documents:
             for joint in document.iter("joint"):
@@ -301,14 +192,12 @@ class _Model:
                     if mimic is not None:
                         multiplier = mimic.findtext("multiplier", mimic.get("multiplier", "1"))
                         offset = mimic.findtext("offset", mimic.get("offset", "0"))
-                        leader = mimic.get("joint", "")
-                        found[joint.get("name", "")] = {"joint": leader, "multiplier": multiplier, "offset": offset}
+                        found[joint.get("name", "")] = mimic.get("joint", ""), float(multiplier), float(offset)
             for equality in document.iterfind("equality/joint"):
                 constant, linear, *higher = [*map(float, equality.get("polycoef", "0 1 0 0 0").split()), 0.0]
                 second = equality.get("joint2")
                 if second is not None and not any(higher):
-                    values = {"joint": second, "multiplier": repr(linear), "offset": repr(constant)}
-                    found[equality.get("joint1", "")] = values
+                    found[equality.get("joint1", "")] = second, linear, constant
         return found
 
     def _effort_limits(self) -> dict[str, float]:
@@ -320,81 +209,25 @@ class _Model:
             for joint in document.iter("joint")
             if (limit := joint.find("limit")) is not None
         }
-        for index in self.plant.GetJointActuatorIndices():
-            actuator = self.plant.get_joint_actuator(index)
+        for index in self.tree.plant.GetJointActuatorIndices():
+            actuator = self.tree.plant.get_joint_actuator(index)
             limits.setdefault(actuator.joint().name(), actuator.effort_limit())
         return {name: limit for name, limit in limits.items() if 0 < limit < math.inf}
 
-    def _add_joint(
-        self,
-        model: ElementTree.Element,
-        link: _MovingLink,
-        parent: str,
-        effort: float | None,
-        mimic: dict[str, str] | None,
-    ) -> None:
-        joint = link.joint
-        slides = isinstance(joint, PrismaticJoint)
-        element = ElementTree.SubElement(model, "joint", name=joint.name(), type="prismatic" if slides else "revolute")
-        add_element(element, "parent", parent)
-        add_element(element, "child", link.name)
-        axis = ElementTree.SubElement(element, "axis")
-        add_element(axis, "xyz", numbers_text(joint.translation_axis() if slides else joint.revolute_axis()))
-        limit = ElementTree.SubElement(axis, "limit")
-        lower, upper = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
-        if not lower < upper:
-            raise ArmError(
-                f"joint {joint.name()}: the position limits are {lower:g}, {upper:g}; allowed: lower < upper"
-            )
-        if not slides and math.isinf(lower) and math.isinf(upper):
-            lower, upper = -CONTINUOUS, CONTINUOUS
-        values = {"lower": lower, "upper": upper, "effort": effort}
-        if math.isfinite(speed := float(joint.velocity_upper_limits()[0])) and speed > 0:
-            values["velocity"] = speed
-        for tag, value in values.items():
-            if value is not None:
-                add_element(limit, tag, repr(value))
-        if damping := float(joint.default_damping_vector()[0]):
-            add_element(ElementTree.SubElement(axis, "dynamics"), "damping", repr(damping))
-        if mimic is not None:
-            ElementTree.SubElement(element, f"{DRAKE}mimic", mimic)
-        for index in self.plant.GetJointActuatorIndices():
-            actuator = self.plant.get_joint_actuator(index)
-            if actuator.joint() is joint and actuator.default_rotor_inertia() > 0:
-                add_element(element, f"{DRAKE}rotor_inertia", repr(actuator.default_rotor_inertia()))
-                add_element(element, f"{DRAKE}gear_ratio", repr(actuator.default_gear_ratio()))
-
-    def _add_frames(self, model: ElementTree.Element) -> None:
-        """Adds the frames of the bodies that are a part of a link, and the other frames of the file."""
-        names = {"world", *(link.name for link in self.links)}
-        of_joints = {f.index() for joint in self.joints for f in (joint.frame_on_parent(), joint.frame_on_child())}
-        for link in self.links:
-            for body, X_LB in link.members.items():
-                own = self.plant.get_body(body)
-                others = map(self.plant.get_frame, self.plant.GetFrameIndices(own.model_instance()))
-                frames = [own.body_frame(), *(f for f in others if f.body() is own and not f.is_body_frame())]
-                for frame in frames:
-                    name = frame.name()
-                    is_own = frame.is_body_frame() or frame.index() not in of_joints
-                    if name and is_own and name not in names and not name.startswith("__"):
-                        names.add(name)
-                        element = ElementTree.SubElement(model, "frame", name=name, attached_to=link.name)
-                        add_pose(element, X_LB @ frame.GetFixedPoseInBodyFrame())
-
-    def _add_sticks(self, model: ElementTree.Element) -> None:
+    def _add_sticks(self, root: ElementTree.Element) -> None:
         """Adds visual shapes from the joint of each link to the next joints, to show a model without shapes."""
-        ends: dict[str, list[NDArray[np.float64]]] = {link.name: [] for link in self.links}
-        for link in self.moving:
+        ends: dict[str, list[NDArray[np.float64]]] = {link.name: [] for link in self.tree.links}
+        for link in self.tree.moving:
             body = link.joint.parent_body().index()
-            parent = next(other for other in self.links if body in other.members)
+            parent = next(other for other in self.tree.links if body in other.members)
             X_LF = parent.members[body] @ link.joint.frame_on_parent().GetFixedPoseInBodyFrame()
             ends[parent.name].append(X_LF.translation())
-        for link in self.moving:
+        for link in self.tree.moving:
             # The last link ends at its farthest part, e.g. the frame of a tool.
             parts = [X_LB.translation() for X_LB in link.members.values()]
             ends[link.name] = ends[link.name] or [max(parts, key=np.linalg.norm)]
         radius = _STICK * max(float(np.linalg.norm(p)) for points in ends.values() for p in points)
-        for element in model.findall("link"):
+        for element in root.iterfind("model/link"):
             for p_LE in ends[element.get("name", "")]:
                 length = float(np.linalg.norm(p_LE))
                 visual = ElementTree.SubElement(element, "visual", name=f"stick_{len(element)}")
@@ -403,26 +236,6 @@ class _Model:
                 shape = shape_element(Capsule(radius, length) if length > radius else Sphere(1.5 * radius))
                 assert shape is not None
                 ElementTree.SubElement(visual, "geometry").append(shape)
-
-    def _add_shapes(self, element: ElementTree.Element, body: BodyIndex, X_LB: RigidTransform) -> None:
-        if self.scene_graph is None:
-            return
-        inspector = self.scene_graph.model_inspector()
-        frame = self.plant.GetBodyFrameIdOrThrow(body)
-        for tag, role in (("visual", Role.kIllustration), ("collision", Role.kProximity)):
-            for geometry in inspector.GetGeometries(frame, role):
-                shape = shape_element(inspector.GetShape(geometry))
-                if shape is None:
-                    continue
-                name = f"{inspector.GetName(geometry).rpartition('::')[2]}_{len(element)}"
-                part = ElementTree.SubElement(element, tag, name=name)
-                add_pose(part, X_LB @ inspector.GetPoseInFrame(geometry))
-                ElementTree.SubElement(part, "geometry").append(shape)
-                properties = inspector.GetIllustrationProperties(geometry) if tag == "visual" else None
-                if properties is not None and properties.HasProperty("phong", "diffuse"):
-                    color = properties.GetProperty("phong", "diffuse")
-                    material = ElementTree.SubElement(part, "material")
-                    add_element(material, "diffuse", numbers_text([color.r(), color.g(), color.b(), color.a()]))
 
 
 def add_packages(packages: PackageMap, folder: Path) -> None:

@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -27,8 +28,9 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
+from dvrk_drake.models.plant_tree import PlantTree
 from dvrk_drake.models.sdf_elements import BASE_LINK
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf, read_sdf_facts
 
 #: Bandwidth [rad/s] of derived gains, and ratio ki / kp [1/s]: within the 16 to 30 rad/s and 1.2 to 1.5 1/s of the
 #: gains of the MTM, which were tuned in simulation.
@@ -112,11 +114,13 @@ def add_arm(
                 pin_loop(plant, instance, loop)
         base = base_body(plant, instance).body_frame()
         plant.WeldFrames(parent_frame or plant.world_frame(), base, X_PB or RigidTransform())
-        for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
-            plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
-        home = arm.linkage.position(np.clip(0.0, arm.position_lower, arm.position_upper))
-        for name, position in zip(arm.tree_joint_names, home, strict=True):
-            plant.GetJointByName(name, instance).set_default_positions([position])
+        lower, upper = arm.position_lower, arm.position_upper
+        positions = map(arm.linkage.position, (lower, np.clip(0.0, lower, upper), upper))
+        for name, low, home, high in zip(arm.tree_joint_names, *positions, strict=True):
+            joint = plant.GetJointByName(name, instance)
+            if name in arm.joint_names:
+                joint.set_position_limits([low], [high])
+            joint.set_default_positions([home])
     except RuntimeError as error:
         raise ArmError(f"{', '.join(arm.sdf)}: Drake cannot load this model: {error}") from error
     return instance
@@ -189,6 +193,31 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
 def shared_plant(arm: Arm) -> MultibodyPlant:
     """Returns the finalized plant of an arm, which is created once per Arm object. Do not modify the plant."""
     return make_arm_plant(arm)
+
+
+def arm_sdf(arm: Arm, inertias: Mapping[str, SpatialInertia] | None = None) -> ElementTree.Element:
+    """Returns an arm with its linkage and instrument as SDF, see `plant_tree`.
+
+    Args:
+        arm: The arm.
+        inertias: Body -> spatial inertia about its origin, which replaces that of the arm's model.
+
+    Raises:
+        ArmError: Drake cannot load the model, e.g. because a mesh is missing.
+    """
+    plant, scene_graph = MultibodyPlant(1e-3), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    add_arm(plant, arm)
+    plant.Finalize()
+    efforts = dict.fromkeys(arm.tree_joint_names, 0.0)
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        efforts[actuator.joint().name()] = actuator.effort_limit()
+    for name in arm.locked_joints:
+        position = arm.linkage.offset[arm.tree_joint_names.index(name)]
+        plant.GetJointByName(name).set_position_limits([position], [position])
+    tree = PlantTree(plant, scene_graph)
+    return tree.to_sdf(tree.inertias(inertias or {}), read_sdf_facts(compose_sdf(arm.sdf)).mimics, efforts)
 
 
 def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> None:

@@ -74,7 +74,7 @@ def shape_element(shape: Shape) -> ElementTree.Element | None:
             values = {"radii": [shape.a(), shape.b(), shape.c()]}
         case Mesh() | Convex() if shape.source().is_path():
             element = ElementTree.Element("mesh")
-            add_element(element, "uri", str(shape.source().path()))
+            add_element(element, "uri", f"file://{shape.source().path()}")
             add_element(element, "scale", numbers_text(shape.scale3()))
             if isinstance(shape, Convex):
                 ElementTree.SubElement(element, f"{DRAKE}declare_convex")

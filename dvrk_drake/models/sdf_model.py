@@ -202,9 +202,9 @@ def _read(path: Path, may_convert: bool) -> ElementTree.Element:
                 link.remove(inertial)
     _check_numbers(path, root)
     for uri in root.iter("uri"):
-        # A composed model has no folder, so Drake cannot resolve relative paths.
+        # A composed model has no folder, so Drake can resolve neither relative nor absolute paths.
         if uri.text and "://" not in uri.text:
-            uri.text = str(path.resolve().parent / uri.text)
+            uri.text = f"file://{path.resolve().parent / uri.text}"
     return root
 
 

@@ -94,7 +94,7 @@ def drawable_urdf(arm: Arm) -> str:
             shape.tag = "visual"
             link.append(shape)
     try:
-        robot = to_urdf(root, arm)
+        robot = to_urdf(root)
     except ModelError:
         return ""
     robot.set("name", arm.name)

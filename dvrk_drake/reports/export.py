@@ -17,7 +17,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensa
 from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, KinematicCompensation
 from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLoss
 from dvrk_drake.export.model_export import ModelExport
-from dvrk_drake.export.sdf import LinkChange, changed_links
+from dvrk_drake.export.model_writer import LinkChange, changed_links
 from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE, SERIES
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, Style

@@ -16,7 +16,7 @@ from dvrk_drake.dynamics.dynamic_section import (
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia
 from dvrk_drake.dynamics.model_links import model_bodies
-from dvrk_drake.export.sdf import write_sdf
+from dvrk_drake.export.model_writer import write_model
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -51,7 +51,7 @@ def parameters_of(model: IdentifiedModel, regressor: DynamicRegressor) -> np.nda
 
 def load_exported(model: IdentifiedModel, path) -> DynamicRegressor:
     arm, bodies = model.arm, model_bodies(model)
-    write_sdf(arm, bodies.links, path, "a test", bodies.rotors)
+    write_model(arm, bodies.links, path, "a test", bodies.rotors)
     return DynamicRegressor(dataclasses.replace(arm, sdf=(str(path),)))
 
 

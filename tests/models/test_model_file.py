@@ -108,10 +108,10 @@ def test_mjcf_is_read(tmp_path):
 
 
 def test_model_directives_and_sdf_are_read(crane, tmp_path):
-    from dvrk_drake.export.sdf import write_sdf
+    from dvrk_drake.export.model_writer import write_model
 
     arm = load_arm(crane)
-    write_sdf(arm, [], tmp_path / "own.sdf", "a test")
+    write_model(arm, [], tmp_path / "own.sdf", "a test")
     (tmp_path / "package.xml").write_text("<package><name>here</name></package>")
     directives = tmp_path / "scene.dmd.yaml"
     directives.write_text(

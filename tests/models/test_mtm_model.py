@@ -278,3 +278,14 @@ def test_keys_of_an_arm_file_replace_those_of_its_mechanism(tmp_path):
     path.write_text("name: X\nmechanism: mtm\n")
     with pytest.raises(ArmError, match=r"arm\.yaml: sdf is missing; state the path of the model"):
         load_arm(path)
+
+
+def test_stops_of_a_plant_do_not_depend_on_the_recorded_zeros():
+    arm = load_arm("mtmr")
+    plants = [make_arm_plant(one) for one in (arm, arm.with_position_offsets({"outer_yaw": 0.3, "wrist_yaw": -0.2}))]
+    for name in arm.joint_names:
+        limits = [
+            np.concatenate([joint.position_lower_limits(), joint.position_upper_limits()])
+            for joint in (plant.GetJointByName(name) for plant in plants)
+        ]
+        np.testing.assert_allclose(limits[1], limits[0], atol=1e-12)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,12 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
+from dvrk_drake.experiments.ground_truth import with_links
 from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.simulation import samples
-from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
@@ -48,9 +46,7 @@ def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
         if link.link in driven_links:
             mass, inertia = published.FIGURE_7_MASSES[1 + driven_links.index(link.link)], LINK_INERTIA
         links.append(LinkInertia(link.link, np.array([mass, 0, 0, 0, inertia, inertia, inertia, 0, 0, 0])))
-    with atomic_write(path) as stream:
-        stream.write(to_text(with_inertias(arm, links), "The paper's simulated MTM: point masses at the joints."))
-    return replace(arm, sdf=(str(path.resolve()),))
+    return with_links(arm, links, path, "the paper's simulated MTM: point masses at the joints")
 
 
 def simulate_paper_controller(

@@ -1,66 +1,25 @@
-"""Writes the URDF of an arm with identified inertial parameters."""
+"""Finds the collision shapes that a URDF omits, because programs other than Drake ignore collision filters."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.dynamics.inertial_parameters import LinkInertia
-from dvrk_drake.export.sdf import MeshFormat, copy_meshes, redirect_meshes, to_text, with_inertias
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import base_body, package_map, set_arm_positions
 from dvrk_drake.models.sdf_elements import DRAKE
 from dvrk_drake.models.sdf_model import compose_sdf
-from dvrk_drake.models.urdf import to_urdf
 
 #: Number of random poses at which collision shapes are tested.
 _POSES = 500
 #: Enlargement of each shape on all sides [m], because shapes are closer at other poses than at the random poses.
 _MARGIN = 2.5e-3
-
-
-def write_urdf(
-    arm: Arm,
-    links: Sequence[LinkInertia],
-    path: str | Path,
-    origin: str,
-    rotor_inertias: Mapping[str, float] | None = None,
-    meshes: MeshFormat = "gltf",
-) -> None:
-    """Writes the URDF atomically, and copies the meshes into the folder <name>_meshes beside the file.
-
-    Dependent joints of the linkage become mimic joints, because URDF does not support closed loops. A capsule becomes a
-    cylinder and two spheres, because URDF does not support capsules. Rotor inertias, gear ratios, named frames and
-    collision filters are written in Drake's extensions of URDF. Other programs ignore these extensions, so the URDF
-    does not contain `touching_shapes`.
-
-    Args:
-        arm, links, path, origin, rotor_inertias, meshes: Arguments of `write_sdf`.
-
-    Raises:
-        ModelError: An inertia is not physically consistent, or URDF does not support a part of the SDF.
-        DvrkDrakeError: A file cannot be written.
-    """
-    target = Path(path)
-    root = with_inertias(arm, links, rotor_inertias)
-    for link in root.iterfind("model/link"):
-        for shape in link.findall("collision"):
-            if (link.get("name"), shape.get("name")) in touching_shapes(arm):
-                link.remove(shape)
-    copies = redirect_meshes(root, target, meshes)
-    robot = to_urdf(root, arm)
-    copy_meshes(copies)
-    with atomic_write(target) as stream:
-        stream.write(to_text(robot, f"{arm.name}, inertial parameters of {origin}. Written by dvrk-drake export."))
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Writes the SDF of an arm with identified inertial parameters."""
+"""Writes the SDF or URDF of an arm with identified inertial parameters."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 from dvrk_drake.export.gltf import to_obj
+from dvrk_drake.export.touching_shapes import touching_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
+from dvrk_drake.models.plant import arm_sdf
 from dvrk_drake.models.sdf_elements import DRAKE
-from dvrk_drake.models.sdf_elements import inertial_element as spatial_inertia_element
-from dvrk_drake.models.sdf_model import PACKAGE_URL, compose_sdf, local_path
+from dvrk_drake.models.urdf import to_urdf
 
 #: Relative change of a parameter below which a link counts as unchanged.
 _UNCHANGED = 1e-12
@@ -66,62 +67,68 @@ def with_inertias(
     """Returns the SDF of arm and instrument as one model, with the inertias of `links`. Other links are unchanged.
 
     Args:
-        arm: Arm whose SDF is changed.
+        arm: Arm whose model is changed.
         links: Inertias of all or some moving links.
         rotor_inertias: Joint name -> rotor inertia reflected to the joint [kg m^2; kg if prismatic]. The joint must be
-            moved by a single motor. Gear ratios are unchanged. None keeps the rotor inertias of the SDF.
+            moved by a single motor. Gear ratios are unchanged. None keeps the rotor inertias of the arm's model.
 
     Raises:
         ModelError: A link does not belong to the arm, an inertia is not physically consistent, or a rotor inertia is
             negative.
     """
-    root = compose_sdf(arm.sdf)
-    elements = {link.get("name"): link for link in root.iterfind("model/link")}
+    inertias = {}
     for change in changed_links(arm, links):
-        element = elements[change.link]
-        old = element.find("inertial")
-        position = 0 if old is None else list(element).index(old)
-        if old is not None:
-            element.remove(old)
-        element.insert(position, inertial_element(change.after))
+        if not np.linalg.eigvalsh(change.after.pseudo_inertia()).min() > 0:
+            raise ModelError(
+                f"{change.link}: the inertia is not physically consistent; its pseudo-inertia must be positive definite"
+            )
+        inertias[change.link] = change.after.to_spatial_inertia()
+    root = arm_sdf(arm, inertias)
     for joint, inertia in (rotor_inertias or {}).items():
         _set_rotor(root, joint, inertia)
     return root
 
 
-def write_sdf(
+def write_model(
     arm: Arm,
     links: Sequence[LinkInertia],
     path: str | Path,
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
     meshes: MeshFormat = "gltf",
+    format: Literal["sdf", "urdf"] = "sdf",
 ) -> None:
-    """Writes the SDF of `with_inertias` atomically, and copies its meshes into the folder <name>_meshes beside it.
+    """Writes the model of `with_inertias` atomically, and copies its meshes into the folder <name>_meshes beside it.
 
     Args:
         arm, links, rotor_inertias: Arguments of `with_inertias`.
-        path: Path of the SDF.
+        path: Path of the file.
         origin: Source of the inertias, written into a comment at the start of the file.
         meshes: "obj" converts glTF meshes to OBJ, for programs that do not read glTF, such as PyBullet and MuJoCo.
+        format: Format of the file. A URDF does not contain `touching_shapes`, see `to_urdf`.
 
     Raises:
-        ModelError: An argument is invalid, see `with_inertias`.
+        ModelError: An argument is invalid, see `with_inertias`, or URDF does not support a part of the model.
         DvrkDrakeError: A file cannot be written.
     """
     target = Path(path)
     root = with_inertias(arm, links, rotor_inertias)
     copies = redirect_meshes(root, target, meshes)
+    if format == "urdf":
+        for link in root.iterfind("model/link"):
+            for shape in link.findall("collision"):
+                if (link.get("name"), shape.get("name")) in touching_shapes(arm):
+                    link.remove(shape)
+        root = to_urdf(root)
     copy_meshes(copies)
     with atomic_write(target) as stream:
         stream.write(to_text(root, f"{arm.name}, inertial parameters of {origin}. Written by dvrk-drake export."))
 
 
 def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mapping[str, float] | None = None) -> str:
-    """Returns the unified diff from the arm's SDF to the SDF of `with_inertias`, or "" if nothing changes."""
+    """Returns the unified diff between the SDF of the arm and that of `with_inertias`, or "" if nothing changes."""
     before, after = (
-        to_text(root).splitlines(keepends=True)
-        for root in (compose_sdf(arm.sdf), with_inertias(arm, links, rotor_inertias))
+        to_text(root).splitlines(keepends=True) for root in (arm_sdf(arm), with_inertias(arm, links, rotor_inertias))
     )
     return "".join(difflib.unified_diff(before, after, " + ".join(arm.sdf), "exported", n=4))
 
@@ -132,19 +139,6 @@ def to_text(root: ElementTree.Element, comment: str = "") -> str:
     comment = re.sub("-(?=-)", "- ", comment)  # XML does not allow -- in a comment.
     head = '<?xml version="1.0"?>\n' + (f"<!-- {comment} -->\n" if comment else "")
     return head + ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def inertial_element(inertia: LinkInertia) -> ElementTree.Element:
-    """Returns the element `<inertial>` in full precision, with the rotational inertia about the centre of mass.
-
-    Raises:
-        ModelError: The inertia is not physically consistent.
-    """
-    if not np.linalg.eigvalsh(inertia.pseudo_inertia()).min() > 0:
-        raise ModelError(
-            f"{inertia.link}: the inertia is not physically consistent; its pseudo-inertia must be positive definite"
-        )
-    return spatial_inertia_element(inertia.to_spatial_inertia())
 
 
 def _set_rotor(root: ElementTree.Element, joint: str, inertia: float) -> None:
@@ -167,9 +161,6 @@ def _equal_parameters(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
     return all(np.abs(a[p] - b[p]).max() <= _UNCHANGED * np.abs(a[p]).max() for p in parts)
 
 
-_FILE_URL = "file://"
-
-
 def mesh_folder(model_path: Path) -> str:
     """Returns the name of the mesh folder of an exported model."""
     return f"{model_path.stem}_meshes"
@@ -188,8 +179,6 @@ def refuse_existing_meshes(model_path: str | Path, overwrite: bool) -> None:
 def redirect_meshes(root: ElementTree.Element, model_path: Path, meshes: MeshFormat = "gltf") -> dict[Path, Path]:
     """Replaces every mesh `<uri>` in a model by a path in `mesh_folder`, relative to the model file.
 
-    URIs of other packages, and URIs that are not file paths, are not changed.
-
     Args:
         root: Model from `with_inertias`, which is modified.
         model_path: Path of the file to which the model will be written.
@@ -200,15 +189,11 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path, meshes: MeshFor
         target with another suffix than its source must be converted.
 
     Raises:
-        ArmError: A mesh does not exist, or two meshes would have the same target.
+        ArmError: Two meshes would have the same target.
     """
     copies: dict[Path, Path] = {}
     for uri in root.iter("uri"):
-        source = _local_path(uri.text or "")
-        if source is None:
-            continue
-        if not os.path.isfile(source):
-            raise ArmError(f"{source}: the mesh file does not exist")
+        source = Path((uri.text or "").removeprefix("file://"))
         relative = Path(mesh_folder(model_path)) / source.parent.name / source.name
         if meshes == "obj" and source.suffix in (".gltf", ".glb"):
             relative = relative.with_suffix(".obj")
@@ -247,12 +232,6 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
             continue
         with open_input(source, ArmError) as stream, atomic_write(target, "wb") as copy:
             shutil.copyfileobj(stream, copy)
-
-
-def _local_path(uri: str) -> Path | None:
-    if "://" in uri.removeprefix(PACKAGE_URL).removeprefix(_FILE_URL):
-        return None
-    return local_path(uri.removeprefix(_FILE_URL))
 
 
 def _referenced_files(mesh: Path) -> list[str]:
