@@ -28,7 +28,7 @@ from dvrk_drake.processes.collector import CollectionSettings, Collector, approa
 from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, StatusHandler, control, first_status
 from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.processes.motion_player import REHEARSAL_SPEED, MotionPlayer
-from dvrk_drake.processes.recorder import Recorder
+from dvrk_drake.processes.recorder import ArmRecorder, LcmRecorder
 from dvrk_drake.processes.ros_recorder import RosRecorder, bag_path
 from dvrk_drake.processes.teacher import Teacher
 from dvrk_drake.recordings import motion_parts
@@ -251,12 +251,12 @@ class ArmConnection:
             RecordingError: The file cannot be written, or no measurement arrives.
             DvrkDrakeError: The arm is not found on ROS 2.
         """
-        recorder: Recorder | RosRecorder
+        recorder: ArmRecorder
         if self.transport == "ros":
             recorder = RosRecorder(self.arm, path, self.topic, self.domain, self.dialog.report)
         else:
             check_stream_output(path)
-            recorder = Recorder(self.arm, path, open_lcm(self.lcm_url).get_lcm_url(), self.key)
+            recorder = LcmRecorder(self.arm, path, open_lcm(self.lcm_url).get_lcm_url(), self.key)
         self.dialog.report(f"recording {self.arm.name} on {recorder.source}")
         recorder.run(duration, self.dialog.stopped, self.dialog.show)
         self.dialog.report(f"wrote {path}: {recorder.num_rows} rows")

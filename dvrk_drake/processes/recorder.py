@@ -1,8 +1,9 @@
-"""Process that records the status messages of one arm from LCM to a file, started by `dvrk-drake record`."""
+"""Recorders of the measurements of one arm, started by `dvrk-drake record`: common part, and statuses over LCM."""
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
 from dvrk_drake.recordings.reader_lcm import StatusStream
+from dvrk_drake.recordings.writer_mcap import GrowingMcap
 from dvrk_drake.recordings.writer_stream import (
     RecordingFile,
     check_stream_output,
@@ -106,18 +108,117 @@ class MissingMessages:
         self._unchecked.clear()
 
 
-class Recorder:
-    """Appends every status of one arm to a new file in real time.
+class ArmRecorder(ABC):
+    """Writes the measurements of one arm to a new file while they arrive. A subclass receives and writes them.
 
     Attributes:
-        source: Network and its URL, for messages.
+        arm: Recorded arm.
+        path: Path of the new file, which is created at the first measurement.
+        source: Network, for messages.
+    """
+
+    source: str
+
+    def __init__(self, arm: Arm, path: str | Path) -> None:
+        """Creates a recorder without a file."""
+        self.arm, self.path = arm, path
+        self._file: RecordingFile | GrowingMcap | None = None
+        self._rate = Rate()
+
+    @property
+    @abstractmethod
+    def num_rows(self) -> int:
+        """Number of recorded measurements."""
+
+    def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
+        """Records until `stopped` returns true, or until `duration` has elapsed since the first measurement.
+
+        Args:
+            duration: Duration of the recording [s], which may be infinite.
+            stopped: Function that returns whether to stop. It is called at least every 0.1 s.
+            show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
+                function that returns the text of the status line.
+
+        Raises:
+            RecordingError: The arm was not found, no valid measurement arrived within 10 s, the recording ended before
+                the first one, or the file cannot be written.
+        """
+        try:
+            self.subscribe(stopped)
+            end, has_begun = time.monotonic() + FIRST_STATUS, False
+            while not stopped() and time.monotonic() < end:
+                self._wait(_POLL)
+                self.update()
+                if not has_begun and self._file is not None:
+                    end, has_begun = time.monotonic() + duration, True
+                show(self.describe)
+        finally:
+            self.close()
+        if self._file is None:
+            raise RecordingError(self._no_measurement_reason(stopped()))
+
+    @abstractmethod
+    def subscribe(self, stopped: Callable[[], bool]) -> None:
+        """Subscribes to the messages of the arm. `stopped` returns whether to end the search for the arm.
+
+        Raises:
+            RecordingError: The arm was not found.
+        """
+
+    @abstractmethod
+    def update(self) -> None:
+        """Records the messages that have arrived.
+
+        Raises:
+            RecordingError: The messages have other joints, or the file cannot be written.
+        """
+
+    def close(self) -> None:
+        """Ends the file."""
+        if self._file is not None:
+            self._file.close()
+
+    def describe(self) -> str:
+        """Returns the text of the status line: the number of rows, the rate, and details of the transport."""
+        rate = self._rate.per_second(time.monotonic())
+        if self._file is None:
+            return f"waiting for {self._awaited()}"
+        if rate is None:
+            return f"{self.arm.name}: no more messages; {self.num_rows} rows"
+        return ", ".join([f"{self.arm.name}: {self.num_rows} rows", f"{rate} Hz", *self._details()])
+
+    @abstractmethod
+    def notes(self) -> list[str]:
+        """Returns one line for each reason why messages were not recorded, and for missing messages."""
+
+    @abstractmethod
+    def _wait(self, seconds: float) -> None:
+        """Waits for a message, at most `seconds` [s]."""
+
+    @abstractmethod
+    def _awaited(self) -> str:
+        """Returns what the recorder waits for before the first measurement."""
+
+    @abstractmethod
+    def _details(self) -> list[str]:
+        """Returns the end of the status line."""
+
+    @abstractmethod
+    def _no_measurement_reason(self, was_stopped: bool) -> str:
+        """Returns the reason why there was no measurement."""
+
+
+class LcmRecorder(ArmRecorder):
+    """Appends every status of one arm over LCM to a new file in real time.
+
+    Attributes:
         stream: Filter that counts accepted and rejected statuses.
         num_received: Number of messages on the arm's status channel.
         foreign: Number of messages that do not belong to the arm's session and were not recorded, for each reason.
     """
 
     def __init__(self, arm: Arm, path: str | Path, url: str, key: MessageKey | None = None) -> None:
-        """Creates a recorder. The file is created at the first status.
+        """Creates a recorder.
 
         Args:
             arm: Arm whose statuses are recorded.
@@ -129,16 +230,14 @@ class Recorder:
             RecordingError: A new file cannot be created at `path`.
         """
         check_stream_output(path)
+        super().__init__(arm, path)
         self.source = f"LCM {url}"
         self.stream = StatusStream(arm.name, arm.num_joints)
         self.num_received = 0
         self.foreign: Counter[str] = Counter()
         self._filter = StatusFilter(arm.name, arm.num_joints, key, follow_after=_RESTART)
-        self._arm, self._path, self._url = arm, path, url
-        self._channel = status_channel(arm)
-        self._file: RecordingFile | None = None
+        self._url, self._channel = url, status_channel(arm)
         self._other_channels: Counter[str] = Counter()
-        self._rate = Rate()
         self._lcm = lcm.LCM(url)
         # The subscription includes all arms, so that an error message can list the channels with messages.
         self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._receive)
@@ -149,51 +248,11 @@ class Recorder:
         """Number of recorded measurements."""
         return self.stream.num_used
 
-    def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
-        """Records until `stopped` returns true, or until `duration` has elapsed since the first status.
+    def subscribe(self, stopped: Callable[[], bool]) -> None:
+        """Does nothing: the channels are open."""
 
-        Args:
-            duration: Duration of the recording [s], which may be infinite.
-            stopped: Function that returns whether to stop. It is called at least every 0.1 s.
-            show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
-                function that returns the text of the status line.
-
-        Raises:
-            RecordingError: The recording ended before the first status, no status arrived within 10 s, or the file
-                cannot be written.
-        """
-        try:
-            end = time.monotonic() + FIRST_STATUS
-            while not stopped() and self.stream.last is None:
-                if time.monotonic() > end:
-                    raise RecordingError(self._no_status_reason())
-                handle_message(self._lcm, _POLL)
-            if self._file is None:
-                raise RecordingError(
-                    f"{self._path} was not written: the recording ended before the first status of {self._arm.name}"
-                )
-            end = time.monotonic() + duration
-            while not stopped() and time.monotonic() < end:
-                handle_message(self._lcm, _POLL)
-                show(self.describe)
-        finally:
-            if self._file is not None:
-                self._file.close()
-
-    def describe(self) -> str:
-        """Returns the text of the status line: the number of rows, the rate, lost messages and the state of the arm."""
-        status, rate = self.stream.last, self._rate.per_second(time.monotonic())
-        if status is None:
-            return f"waiting for {self._channel}"
-        if rate is None:
-            return f"{self._arm.name}: no more statuses; {self.stream.num_used} rows"
-        parts = [
-            f"{self._arm.name}: {self.stream.num_used} rows",
-            f"{rate} Hz",
-            f"{self.stream.num_lost} lost",
-            describe_state(status.guard_state, status.fault_text),
-        ]
-        return ", ".join(parts)
+    def update(self) -> None:
+        """Does nothing: a status is recorded while the recorder waits."""
 
     def notes(self) -> list[str]:
         """Returns one line for each reason why messages were not recorded, and for lost messages."""
@@ -215,14 +274,28 @@ class Recorder:
         if self._file is None:
             if self.stream.last is None:
                 return
-            self._file = open_recording_file(self._path, self._arm, self.stream)
+            self._file = open_recording_file(self.path, self.arm, self.stream)
+        assert not isinstance(self._file, GrowingMcap)
         self._file.write(data, time.time_ns() // 1000, status)
 
-    def _no_status_reason(self) -> str:
+    def _wait(self, seconds: float) -> None:
+        handle_message(self._lcm, seconds)
+
+    def _awaited(self) -> str:
+        return self._channel
+
+    def _details(self) -> list[str]:
+        status = self.stream.last
+        assert status is not None
+        return [f"{self.stream.num_lost} lost", describe_state(status.guard_state, status.fault_text)]
+
+    def _no_measurement_reason(self, was_stopped: bool) -> str:
+        if was_stopped:
+            return f"{self.path} was not written: the recording ended before the first status of {self.arm.name}"
         where = f"on channel {self._channel} of {self._url}"
         if self.num_received:
             reasons = "; ".join(self.notes())
-            return f"no status of {self._arm.name} within {FIRST_STATUS:.0f} s {where}: {reasons}"
+            return f"no status of {self.arm.name} within {FIRST_STATUS:.0f} s {where}: {reasons}"
         if others := ", ".join(sorted(self._other_channels)):
             return f"no message within {FIRST_STATUS:.0f} s {where}. Channels with messages: {others}"
         return (

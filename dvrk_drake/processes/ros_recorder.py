@@ -13,7 +13,7 @@ import numpy as np
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.processes.recorder import FIRST_STATUS, MissingMessages, Rate
+from dvrk_drake.processes.recorder import FIRST_STATUS, ArmRecorder, MissingMessages
 from dvrk_drake.recordings.reader_rosbag import JOINT_STATE
 from dvrk_drake.recordings.writer_mcap import FrameMessages, GrowingMcap, Topic, joint_state_topics
 from dvrk_drake.recordings.writer_stream import check_stream_output
@@ -25,18 +25,14 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.ros.messages import JointState
     from dvrk_drake.systems.ros.topic import Subscription
 
-#: Longest wait for a message between two checks for a stop [s].
-_POLL = 0.1
 #: Messages of one topic that may arrive while the recorder writes. Older messages are lost.
 _DEPTH = 5000
 
 
-class RosRecorder:
+class RosRecorder(ArmRecorder):
     """Writes the unmodified JointState messages of one arm to a new bag while they arrive, with its transforms.
 
     Attributes:
-        path: Path of the bag.
-        source: Name of the ROS domain, for messages.
         num_rows: Number of recorded valid messages of the arm, without those on a separate topic, e.g. of the jaw.
     """
 
@@ -64,78 +60,33 @@ class RosRecorder:
             DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
         """
         check_stream_output(path, (".mcap",))
-        self._arm, self.path, self._topic = arm, path, topic
-        self._report = report
+        super().__init__(arm, path)
+        self._topic, self._report = topic, report
         self._domain = open_ros_domain(domain) if domain is None or isinstance(domain, int) else domain
         self.source = self._domain.name
-        self.num_rows = 0
+        self._num_valid = 0
         self._num_invalid = 0
-        self._rate = Rate()
         self._subscriptions: list[Subscription[JointState]] = []
         self._silent: set[str] = set()
         self._missing: dict[str, MissingMessages] = {}
-        self._bag: GrowingMcap | None = None
         self._frames: FrameMessages | None = None
         self._positions: dict[str, float] = {}
 
+    @property
+    def num_rows(self) -> int:
+        """Number of recorded valid messages of the arm, without those on a separate topic, e.g. of the jaw."""
+        return self._num_valid
+
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
-        """Records until `stopped` returns true, or until `duration` has elapsed since the first message.
-
-        Args:
-            duration: Duration of the recording [s], which may be infinite.
-            stopped: Function that returns whether to stop. It is called at least every 0.1 s.
-            show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
-                function that returns the text of the status line.
-
-        Raises:
-            RecordingError: The arm was not found, see `find_topic`. No valid message arrived within 10 s, the messages
-                have other joints, or the file cannot be written.
-        """
+        """Records, then leaves the domain; see `ArmRecorder.run`."""
         with closing(self._domain):
-            self.subscribe(stopped)
-            self._record_until(duration, stopped, show)
-        if self._bag is None:
-            raise RecordingError(self._no_message_reason(stopped()))
-
-    def _record_until(
-        self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]
-    ) -> None:
-        end = time.monotonic() + FIRST_STATUS
-        try:
-            while not stopped() and time.monotonic() < end:
-                self._domain.wait(_POLL)
-                before = self._bag
-                self.update()
-                if before is None and self._bag is not None:
-                    end = time.monotonic() + duration
-                show(self.describe)
-        finally:
-            self.close()
+            super().run(duration, stopped, show)
 
     def update(self) -> None:
-        """Records the messages that have arrived.
-
-        Raises:
-            RecordingError: The messages have other joints, or the file cannot be written.
-        """
+        """Records the messages that have arrived."""
         for subscription in self._subscriptions:
             for message, published in subscription.take():
                 self._record(subscription, message, published)
-
-    def close(self) -> None:
-        """Ends the file."""
-        if self._bag is not None:
-            self._bag.close()
-
-    def describe(self) -> str:
-        """Returns the text of the status line: the number of messages, the rate, and missing messages."""
-        rate = self._rate.per_second(time.monotonic())
-        if self._bag is None:
-            return f"waiting for a valid message on {self._subscriptions[0].topic}"
-        if rate is None:
-            return f"{self._arm.name}: no more messages; {self.num_rows} rows"
-        parts = [f"{self._arm.name}: {self.num_rows} rows", f"{rate} Hz", f"{self._num_missing()} missing"]
-        return ", ".join([*parts, *(f"no message on {topic}" for topic in sorted(self._silent))])
 
     def notes(self) -> list[str]:
         """Returns one line each for missing messages, invalid messages, and topics without messages."""
@@ -150,16 +101,12 @@ class RosRecorder:
         return [*lines, *silent]
 
     def subscribe(self, stopped: Callable[[], bool]) -> None:
-        """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one.
-
-        Raises:
-            RecordingError: The arm was not found, see `find_topic`.
-        """
+        """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one."""
         from dvrk_drake.systems.ros.messages import JointState
 
-        main = find_topic(self._domain, self._arm, self._topic, stopped=stopped, report=self._report)
+        main = find_topic(self._domain, self.arm, self._topic, stopped=stopped, report=self._report)
         topics = self._domain.joint_state_topics()
-        others = joint_state_topics(self._arm, main.rpartition("/")[0])[1:]
+        others = joint_state_topics(self.arm, main.rpartition("/")[0])[1:]
         for name in (main, *(topic.name for topic in others)):
             subscription = self._domain.subscribe(name, JointState, depth=_DEPTH, reliable=topics.get(name, True))
             self._subscriptions.append(subscription)
@@ -171,46 +118,56 @@ class RosRecorder:
         is_valid = bool(message.header.stamp.sec or message.header.stamp.nanosec)
         if subscription is self._subscriptions[0]:
             self._num_invalid += not is_valid
-            if self._bag is None and is_valid:
+            if self._file is None and is_valid:
                 self._check_joints(message)
-                self._frames = FrameMessages(self._arm, subscription.topic.rpartition("/")[0])
+                self._frames = FrameMessages(self.arm, subscription.topic.rpartition("/")[0])
                 measured = [Topic(each.topic, JOINT_STATE) for each in self._subscriptions]
-                self._bag = GrowingMcap(self.path, [*measured, *self._frames.topics])
-        if self._bag is None:
+                self._file = GrowingMcap(self.path, [*measured, *self._frames.topics])
+        if self._file is None:
             return
+        assert isinstance(self._file, GrowingMcap)
         # ROS 2 uses version 1 of the CDR encoding.
         arrived = time.time_ns()
-        self._bag.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, arrived)
+        self._file.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, arrived)
         if is_valid:
-            self._write_frames(message, arrived)
+            self._write_frames(self._file, message, arrived)
             self._missing[subscription.topic].add(message.header.nanoseconds)
         self._silent.discard(subscription.topic)
         if subscription is self._subscriptions[0]:
-            self.num_rows += is_valid
+            self._num_valid += is_valid
             self._rate.add(time.monotonic())
 
-    def _write_frames(self, message: JointState, arrived: int) -> None:
+    def _write_frames(self, bag: GrowingMcap, message: JointState, arrived: int) -> None:
         """Writes the transforms at the latest positions of all joints, once all joints have been measured."""
-        assert self._bag is not None and self._frames is not None
+        assert self._frames is not None
         self._positions |= zip(message.name, message.position, strict=False)
-        if all(joint in self._positions for joint in self._arm.joint_names):
-            q = np.array([self._positions[joint] for joint in self._arm.joint_names])
+        if all(joint in self._positions for joint in self.arm.joint_names):
+            q = np.array([self._positions[joint] for joint in self.arm.joint_names])
             stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-            self._frames.write(self._bag, stamp, q, arrived)
+            self._frames.write(bag, stamp, q, arrived)
 
     def _check_joints(self, message: JointState) -> None:
-        needed = [joint for joint in self._arm.joint_names if joint != self._arm.separate_joint]
+        needed = [joint for joint in self.arm.joint_names if joint != self.arm.separate_joint]
         if missing := [joint for joint in needed if joint not in message.name]:
             raise RecordingError(
-                f"{self._subscriptions[0].topic} has the joints {', '.join(message.name) or 'none'}; {self._arm.name} "
+                f"{self._subscriptions[0].topic} has the joints {', '.join(message.name) or 'none'}; {self.arm.name} "
                 f"also needs {', '.join(missing)}. Check --arm, --topic and the instrument."
             )
 
-    def _no_message_reason(self, stopped: bool) -> str:
+    def _wait(self, seconds: float) -> None:
+        self._domain.wait(seconds)
+
+    def _awaited(self) -> str:
+        return f"a valid message on {self._subscriptions[0].topic}"
+
+    def _details(self) -> list[str]:
+        return [f"{self._num_missing()} missing", *(f"no message on {topic}" for topic in sorted(self._silent))]
+
+    def _no_measurement_reason(self, was_stopped: bool) -> str:
         topic = f"{self._subscriptions[0].topic} of {self.source}"
         if self._num_invalid:
             return f"{topic}: all {self._num_invalid} messages have header stamp 0 (invalid data). Home the arm first."
-        if stopped:
+        if was_stopped:
             return f"{self.path} was not written: the recording ended before the first message on {topic}"
         return f"no message within {FIRST_STATUS:.0f} s on {topic}"
 

@@ -9,7 +9,7 @@ from status_logs import ARM, statuses
 
 from dvrk_drake.models.lcm_messages import MessageKey, status_channel
 from dvrk_drake.processes import recorder as module
-from dvrk_drake.processes.recorder import Recorder
+from dvrk_drake.processes.recorder import LcmRecorder
 from dvrk_drake.recordings.reading import read_recording
 
 KEY = MessageKey(bytes(range(32)))
@@ -22,7 +22,7 @@ def recorder(request, tmp_path, monkeypatch):
     monkeypatch.setattr(module.time, "monotonic", lambda: clock.now)
 
     def make(key=None):
-        made = Recorder(ARM, tmp_path / f"a{request.param}", "memq://", key)
+        made = LcmRecorder(ARM, tmp_path / f"a{request.param}", "memq://", key)
         made.path = tmp_path / f"a{request.param}"
 
         def receive(message, seconds):
@@ -84,7 +84,7 @@ def test_key_accepts_only_signed_statuses(recorder):
 
 
 def test_bag_has_the_commands_and_the_transforms(tmp_path):
-    made, sent = Recorder(ARM, tmp_path / "a.mcap", "memq://"), statuses(100)
+    made, sent = LcmRecorder(ARM, tmp_path / "a.mcap", "memq://"), statuses(100)
     for status in sent:
         status.effort_commanded = [2 * effort for effort in status.effort_measured]
         made._receive(status_channel(ARM), status.encode())

@@ -172,6 +172,7 @@ def record(tmp_path, monkeypatch):
     """Records the messages of a substitute domain and returns the recorder and the status lines."""
     monkeypatch.setattr(discovery, "_OTHERS", 0.0)
     monkeypatch.setattr(discovery, "_DISCOVERY", 1.0)
+    monkeypatch.setattr("dvrk_drake.processes.recorder.FIRST_STATUS", 0.5)
     monkeypatch.setattr(module, "FIRST_STATUS", 0.5)
 
     def run(messages, **options):
